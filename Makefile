@@ -1,0 +1,62 @@
+# Palpate. `make` alone prints this help. Each target sets up what it needs by itself.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+RUNTIME := $(VENV)/runtime.done
+DESKTOP := $(VENV)/desktop.done
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check lint types bench bundle wheel lock clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: $(RUNTIME) ## watch simulated sweeps being classified, live
+	$(BIN)/palpate demo
+
+test: $(DESKTOP) ## run the tests (set PALPATE_DATA to the folder of real sweeps to run those as well)
+	$(BIN)/python -m pytest -q
+
+check: lint types test ## lint, types and tests
+
+lint: $(DESKTOP) ## ruff
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(DESKTOP) ## mypy --strict on the appliance
+	$(BIN)/mypy
+
+bench: $(DESKTOP) ## measure this machine; the figures go to build/bench.json
+	@mkdir -p build
+	$(BIN)/palpate bench --json build/bench.json
+
+bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
+	@mkdir -p build
+	$(BIN)/palpate-train fit --set sim:T-REAL --seed 1 --out build/default.npz
+	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 1
+
+wheel: $(DESKTOP) ## build the wheel of the box into dist/
+	$(PIP) wheel --no-deps -w dist .
+
+lock: ## lock the runtime's versions with hashes, for every platform (needs uv)
+	uv pip compile pyproject.toml --universal --generate-hashes --no-header --python-version 3.11 -o appliance/requirements.lock
+
+clean: ## remove what was built, the virtual environment too
+	rm -rf $(VENV) build dist *.egg-info train/*.egg-info
+
+# A virtual environment with the locked runtime and the commands, nothing else.
+$(RUNTIME): appliance/requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Palpate needs Python 3.11 or later; this is `$(PYTHON) --version`. Name another with make PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "installing python3-venv"; \
+	  $$( [ `id -u` = 0 ] || echo sudo ) apt-get install -y -q python3-venv; }
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) install --require-hashes -r appliance/requirements.lock
+	$(PIP) install --no-deps -e .
+	@touch $@
+
+# The same with the desktop's pinned tools: tests, training, export.
+$(DESKTOP): $(RUNTIME) train/pyproject.toml
+	$(PIP) install -e '.[dev]' -e train
+	@touch $@

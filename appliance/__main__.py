@@ -1,0 +1,271 @@
+"""The command `palpate`: the only place where parts are put together. In: arguments and configuration. Out: an exit code.
+
+Simulated parts are chosen by name here and nowhere else, and every sentence they cause says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from . import __version__, bundle, config
+from .box import Box, World
+from .capture import CaptureWriter, Playback
+from .check import check
+from .classifier import Classifier
+from .clock import SystemClock
+from .config import Config
+from .errors import ApplianceError, ConfigError, FormatError
+from .recorder import Recorder
+from .sensor import Sensor, UsbSensor
+from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort, result
+from .sweep import Sweep, SweepFormat, load, save
+from .trigger import GpioTrigger, Lines
+
+EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments; 3 configuration;
+4 bundle; 5 skin; 6 gpio lines; 7 serial port; 8 a file of another form; 130 interrupted"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; its exit code."""
+    args = _parser().parse_args(argv)
+    try:
+        code: int = args.run(args)
+        sys.stdout.flush()
+        return code
+    except ApplianceError as e:
+        print(f"palpate: {e}", file=sys.stderr)
+        return e.exit_code
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # whoever read our output has left; nothing more can be said there, not even at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "palpate", description="Names the material a robot has just touched.", epilog=EXIT_CODES
+    )
+    parser.add_argument("--version", action="version", version=f"palpate {__version__}")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--board", help="board file to use: firmware_config/board-NAME.toml")
+    common.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one value")
+    common.add_argument("--config-dir", type=Path, metavar="DIR", help="where sensor.toml and the board files are")
+    world = argparse.ArgumentParser(add_help=False)
+    world.add_argument(
+        "--sim", metavar="skin|replay:FILE", help="simulated tubes, or a sweep set, instead of the devices"
+    )
+    world.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
+    world.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
+    world.add_argument("--sweeps", type=int, metavar="N", help="stop after N answers")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def add(name: str, run: Callable[[argparse.Namespace], int], text: str, *parents: argparse.ArgumentParser) -> Any:
+        command = commands.add_parser(name, help=text, description=text, parents=[common, *parents], epilog=EXIT_CODES)
+        command.set_defaults(run=run)
+        return command
+
+    run = add("run", run_box, "classify sweeps until SIGTERM", world)
+    run.add_argument("--capture", type=Path, metavar="FILE", help="write everything that comes in to FILE, for replay")
+    run.add_argument("--keep", type=Path, metavar="DIR", help="save the window of each sweep to DIR, for replay")
+    demo = add("demo", run_demo, "watch simulated sweeps being classified", world)
+    demo.add_argument("--raw", action="store_true", help="print the sentences alone")
+    add("check", run_check, "self-test: bundle, golden sweeps, devices", world)
+    add("replay", run_replay, "play a capture or a saved sweep through the same rooms").add_argument("file", type=Path)
+    add("config", run_config, "print each value with its source")
+    bench = add("bench", run_bench, "measure latency, memory, start and processor share on this machine")
+    bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
+    bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")
+    bench.add_argument("--yardsticks", type=Path, default=Path("build/yardsticks"), help="fp32.onnx, paper_int8.onnx")
+    bench.add_argument("--part", choices=("memory", "stream"), help="one part alone, as JSON")
+    return parser
+
+
+def _settings(args: argparse.Namespace) -> tuple[Config, bundle.Bundle]:
+    settings = config.load(args.board, args.set, folder=args.config_dir)
+    return settings, _bundle(settings)
+
+
+def _bundle(settings: Config) -> bundle.Bundle:
+    return bundle.load(Path(settings.classifier.bundle) if settings.classifier.bundle else bundle.DEFAULT)
+
+
+def _world(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> World:
+    """The real devices, or the rig where `--sim` names it; `fmt` tells what the simulated skin has to send."""
+    if args.sim:
+        from .sim import stage
+
+        return stage.named(args.sim, fmt(), seed=args.seed, sweeps=args.sweeps, virtual=args.virtual)
+    if args.virtual:
+        raise ConfigError("--virtual needs --sim: real devices run in real time")
+    import gpiod
+
+    return World(SystemClock(), gpiod)
+
+
+def _log(line: str) -> None:
+    print(f"palpate: {line}", file=sys.stderr, flush=True)
+
+
+def _build(
+    settings: Config, model: bundle.Bundle, world: World, port: Port, stack: ExitStack, *,
+    watch: Callable[[Sensor], Sensor] = lambda sensor: sensor, capture: CaptureWriter | None = None,
+    keep: Callable[[Sweep], None] | None = None, log: Callable[[str], None] = lambda line: None,
+    also: Iterable[ResultSink] = (),
+) -> Box:  # fmt: skip
+    """Put the parts together; `stack` takes them apart again."""
+    settings = world.wire(settings)
+    if not settings.trigger.start:
+        raise ConfigError(
+            "trigger.start names no line, so no sweep can begin; choose a board with --board, or use --sim"
+        )
+    classifier = Classifier(model, world.clock, settings.classifier.fuse)
+    classifier.self_test()
+    trigger = stack.enter_context(GpioTrigger(settings.trigger, world.gpio))
+    lines = stack.enter_context(Lines(settings.output, world.gpio, world.clock))
+    sensor = UsbSensor(settings.sensor, model.format, world.clock, world.backend, capture)
+    stack.callback(sensor.close)
+    stack.callback(port.close)
+    sinks: list[ResultSink] = [port, LineSink(lines, model.manifest.labels)] if settings.output.class_bits else [port]
+    return Box(
+        watch(sensor), trigger, Recorder(model.format, settings.sweep), classifier, world.clock, sinks=[*sinks, *also],
+        port=port, panel=lines, state_s=settings.serial.state_s, source=world.source, log=log,
+        edge_tap=capture.edges if capture else None, keep=keep,
+    )  # fmt: skip
+
+
+def _stop_flag() -> Callable[[], bool]:
+    """True once SIGTERM or SIGINT has come: the loop then ends within one turn."""
+    got: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda n, frame: got.append(n))
+    return lambda: bool(got)
+
+
+def run_box(args: argparse.Namespace) -> int:
+    """`palpate run`: until SIGTERM, or with --sim until the script has ended and everything was answered."""
+    settings, model = _settings(args)
+    world = _world(args, lambda: model.format)
+    stopped = _stop_flag()
+    with ExitStack() as stack:
+        port: Port = StdoutPort(world.source)
+        if settings.serial.port:
+            port = SerialSink(settings.serial, world.clock, world.source)
+        capture = CaptureWriter(args.capture, model.format) if args.capture else None
+        if capture:
+            stack.callback(capture.close)
+        keep = _keeper(args.keep, model.format)
+        box = _build(settings, model, world, port, stack, capture=capture, keep=keep, log=_log)
+
+        def done() -> bool:
+            enough = args.sweeps is not None and box.answered >= args.sweeps
+            return enough or stopped() or world.finished(box.answered)
+
+        box.run(done)
+    return 0
+
+
+def _keeper(folder: Path | None, fmt: SweepFormat) -> Callable[[Sweep], None] | None:
+    """Saves the sweeps that have a window."""
+    if folder is None:
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ConfigError(f"--keep {folder}: {e.strerror}; name a folder that can be written") from e
+    return lambda sweep: save(folder / f"sweep-{sweep.id:06d}.npy", sweep, fmt) if len(sweep.frames) else None
+
+
+def run_demo(args: argparse.Namespace) -> int:
+    """`palpate demo`: a dozen sweeps through a pseudo-terminal, seen from both ends."""
+    from .sim import demo, stage, terminal
+
+    settings, model = _settings(args)
+    sweeps = args.sweeps or 12
+    world = stage.named(args.sim or "skin", model.format, seed=args.seed, sweeps=sweeps, virtual=args.virtual)
+    stopped = _stop_flag()
+    with ExitStack() as stack:
+        far_end, name = stack.enter_context(terminal.pair())
+        port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
+        show = demo.Demo(world.robot.played, far_end, world.clock, sys.stdout, raw=args.raw)
+        box = _build(settings, model, world, port, stack, watch=show.watch)
+        show.run(box.step, sweeps, stopped)
+    return 0
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """`palpate check`: each part by itself, one line each; 1 where any fails."""
+    settings = config.load(args.board, args.set, folder=args.config_dir)
+    world = _world(args, lambda: _bundle(settings).format)
+    findings = list(check(world.wire(settings), lambda: _bundle(settings), world))
+    for f in findings:
+        print(f"{'ok  ' if f.ok else 'FAIL'}  {f.part:<14} {f.detail}")
+    return 0 if all(f.ok for f in findings) else 1
+
+
+def run_replay(args: argparse.Namespace) -> int:
+    """`palpate replay`: the sentences of a capture, or of one saved sweep."""
+    settings, model = _settings(args)
+    if args.file.suffix == ".npy":
+        sweep, fmt = load(args.file)
+        _same(args.file, fmt, model)
+        sys.stdout.buffer.write(result(Classifier(model, SystemClock())(sweep), "replay"))
+        return 0
+    play = Playback(args.file)
+    _same(args.file, play.format, model)
+    classifier = Classifier(model, play, settings.classifier.fuse)
+    port = StdoutPort("replay")
+    Box(play, play, Recorder(model.format, settings.sweep), classifier, play, sinks=[port]).run(lambda: play.finished)
+    return 0
+
+
+def _same(file: Path, fmt: SweepFormat, model: bundle.Bundle) -> None:
+    if fmt != model.format:
+        raise FormatError(
+            f"{file} holds {fmt}, the bundle wants {model.format}; name its bundle with --set classifier.bundle=DIR"
+        )
+
+
+def run_config(args: argparse.Namespace) -> int:
+    """`palpate config`: each value with its source."""
+    print(config.describe(config.load(args.board, args.set, folder=args.config_dir)))
+    return 0
+
+
+def run_bench(args: argparse.Namespace) -> int:
+    """`palpate bench`: see appliance/sim/bench.py."""
+    from .sim import bench, stage, terminal
+
+    settings, model = _settings(args)
+
+    def build(
+        world: stage.SimWorld,
+        stack: ExitStack,
+        also: Iterable[ResultSink] = (),
+        keep: Callable[[Sweep], None] | None = None,
+    ) -> tuple[Box, int]:
+        far_end, name = stack.enter_context(terminal.pair())
+        port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
+        return _build(settings, model, world, port, stack, also=also, keep=keep), far_end
+
+    if args.part:
+        print(json.dumps(bench.part(args.part, model.format, build, args.seed)))
+        return 0
+    figures = bench.run(model, build, args.yardsticks, args.seed, lambda line: print(line, flush=True))
+    if args.json:
+        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,197 @@
+"""The box itself: one thread, one loop. In: sensor, trigger, recorder, classifier, sinks. Out: an answer to every trigger.
+
+Which parts these are is decided elsewhere (`__main__`); nothing here knows whether they are real.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from .classifier import Classifier
+from .clock import Clock
+from .config import Config
+from .errors import ApplianceError
+from .recorder import Recorder
+from .sensor import Sensor
+from .sink import Command, Port, ResultSink, sentence
+from .sweep import Status, Sweep, Verdict
+from .trigger import Edge
+
+TARE_S = 0.5
+"""How much of the latest signal a tare averages."""
+
+
+class EdgeSource(Protocol):
+    """Trigger edges, from GPIO or from a capture."""
+
+    def edges(self, now_ns: int) -> list[Edge]:
+        """Edges that have settled by `now_ns`, in order of time."""
+        ...
+
+
+class Panel(Protocol):
+    """The lines that tell the robot how the box is."""
+
+    def show(self, *, ready: bool, busy: bool, fault: bool) -> None:
+        """Drive READY, BUSY and FAULT."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """What the drivers stand on. These are the real devices; the rig's world says otherwise.
+
+    gpio: the module gpiod or its double. backend: a pyusb backend, None for libusb. source: as sentences name it.
+    """
+
+    clock: Clock
+    gpio: Any
+    backend: Any = None
+    source: str = "usb"
+
+    def wire(self, settings: Config) -> Config:
+        """The configuration as it fits this world."""
+        return settings
+
+    def finished(self, answered: int) -> bool:
+        """True when nothing more will happen; a robot never says so."""
+        return False
+
+
+class Box:
+    """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer, listen.
+
+    port: where commands come from and state sentences go, or None. panel: READY, BUSY, FAULT, or None.
+    edge_tap: called with (now, edges), for captures. keep: called with each sweep, for recordings.
+    """
+
+    def __init__(
+        self, sensor: Sensor, trigger: EdgeSource, recorder: Recorder, classifier: Classifier, clock: Clock, *,
+        sinks: Sequence[ResultSink] = (), port: Port | None = None, panel: Panel | None = None,
+        state_s: float = 1.0, source: str = "usb", log: Callable[[str], None] = lambda line: None,
+        edge_tap: Callable[[int, list[Edge]], None] | None = None, keep: Callable[[Sweep], None] | None = None,
+    ) -> None:  # fmt: skip
+        self.answered = 0
+        self._sensor, self._trigger, self._recorder, self._classifier = sensor, trigger, recorder, classifier
+        self._clock, self._sinks, self._port, self._panel = clock, sinks, port, panel
+        self._state_ns, self._source, self._log = round(state_s * 1e9), source, log
+        self._edge_tap, self._keep = edge_tap, keep
+        self._next_state_ns = clock.now_ns()
+        self._troubles: dict[str, str] = {}
+
+    @property
+    def frames_lost(self) -> int:
+        """Frames that the skin took and the box never got, since the start."""
+        return self._sensor.tally.lost_frames
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Take turns until `stopped()`; what is open then is answered `aborted`."""
+        while not stopped():
+            self.step()
+        self._recorder.interrupt(Status.ABORTED, self._clock.now_ns())
+        self._answer(self._recorder.finished(self._clock.now_ns()))
+
+    def step(self) -> list[Verdict]:
+        """One turn; takes at most the sensor's timeout. The verdicts that were sent."""
+        frames = self._sensor.read()
+        now = self._clock.now_ns()
+        self._recorder.put(frames, now)
+        edges = self._trigger.edges(now)
+        if self._edge_tap and edges:
+            self._edge_tap(now, edges)
+        streaming = self._sensor.state == "streaming"
+        self._recorder.trigger(edges, streaming, now)
+        if not streaming:
+            self._recorder.interrupt(Status.SENSOR_LOST, now)
+        if self._panel:
+            self._panel.show(
+                ready=streaming and not self._recorder.sweeping, busy=self._recorder.sweeping, fault=not streaming
+            )
+        verdicts = self._answer(self._recorder.finished(now))
+        self._report(now)
+        return verdicts
+
+    def _answer(self, sweeps: list[Sweep]) -> list[Verdict]:
+        verdicts = [self._classifier(sweep) for sweep in sweeps]
+        for verdict in verdicts:
+            for sink in self._sinks:
+                sink.send(verdict)
+        if self._keep:
+            for sweep in sweeps:
+                self._keep(sweep)
+        self.answered += len(verdicts)
+        return verdicts
+
+    def _report(self, now_ns: int) -> None:
+        """Log what has changed, answer commands, say the state once in a while."""
+        self._note("skin", str(self._sensor.trouble or ""), "streaming")
+        if not self._port:
+            return
+        for command in self._port.commands():
+            self._port.say(self._obey(command))
+        self._note("serial", self._port.trouble, "open")
+        if now_ns >= self._next_state_ns:
+            self._next_state_ns = now_ns + self._state_ns
+            self._port.say(sentence("STA", *self._state()))
+
+    def _note(self, what: str, trouble: str, fine: str) -> None:
+        if self._troubles.get(what) != trouble:
+            self._troubles[what] = trouble
+            self._log(f"{what}: {trouble or fine}")
+
+    def _state(self) -> list[object]:
+        """Fields of the STA sentence (PROTOCOL.md, part 2)."""
+        tally = self._sensor.tally
+        return [
+            f"{self._clock.now_ns() / 1e9:.3f}", self._sensor.state, int(self._recorder.sweeping), self.answered,
+            tally.frames, tally.lost_frames, tally.garbage_bytes, tally.enumerations,
+            self._port.dropped if self._port else 0, self._classifier.bundle.id, self._source,
+        ]  # fmt: skip
+
+    def _obey(self, command: Command) -> bytes:
+        """Carry out a command; its ANS sentence."""
+        if command.error:
+            return sentence("ANS", command.name, "error", command.error)
+        try:
+            return sentence("ANS", command.name, "ok", *_OBEY[command.name](self))
+        except ApplianceError as e:
+            return sentence("ANS", command.name, "error", e)
+
+    def _identity(self) -> list[object]:
+        m, who = self._classifier.bundle.manifest, self._sensor.identity
+        skin = f"{who.board} {who.serial} {'.'.join(map(str, who.firmware))}" if who else "none"
+        return [m.name, m.version, self._classifier.bundle.id, m.format, skin]
+
+    def _self_test(self) -> list[object]:
+        return [f"{len(self._classifier.bundle.golden)} golden sweeps differ by {self._classifier.self_test():.2g}"]
+
+    def _tare(self) -> list[object]:
+        """Take the mean of the latest signal as the unloaded skin."""
+        frames = self._recorder.latest(max(1, round(TARE_S * self._classifier.bundle.format.rate_hz)))
+        if frames is None or self._recorder.sweeping or self._sensor.state != "streaming":
+            raise ApplianceError(f"tare needs {TARE_S} s of signal without loss and outside a sweep; try again")
+        self._classifier.tare = frames.mean(axis=0, dtype=np.float64)
+        return [f"largest {self._classifier.tare.max():.1f} digits"]
+
+    def _new_object(self) -> list[object]:
+        self._recorder.new_object()
+        return []
+
+    def _abort(self) -> list[object]:
+        if not self._recorder.interrupt(Status.ABORTED, self._clock.now_ns()):
+            raise ApplianceError("no sweep is open, so there is nothing to abort")
+        return []
+
+
+_OBEY: dict[str, Callable[[Box], list[object]]] = {
+    "ID": Box._identity,
+    "STATE": Box._state,
+    "TEST": Box._self_test,
+    "TARE": Box._tare,
+    "NEW": Box._new_object,
+    "ABORT": Box._abort,
+}

@@ -1,0 +1,142 @@
+"""Captures: everything that came in, with its times, in one file. In: transfers, states, edges. Out: the same, played again.
+
+A capture played through the same rooms gives the same verdicts bit for bit, since nothing else enters them.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import asdict
+from enum import IntEnum
+from pathlib import Path
+from typing import IO
+
+from .errors import FormatError, SensorError
+from .sensor import Stream, Tally
+from .sweep import Frames, SweepFormat
+from .trigger import Edge, EdgeKind
+from .wire import Identity
+
+MAGIC = b"PPLPCAP1"
+_RECORD = struct.Struct("<BQI")
+_EDGE = struct.Struct("<QB")
+_KINDS = tuple(EdgeKind)
+
+
+class Kind(IntEnum):
+    """What a record holds."""
+
+    TRANSFER = 0
+    STATE = 1
+    EDGES = 2
+
+
+class CaptureWriter:
+    """Writes a capture as it happens; what a power failure cuts off is at most what the system had not written yet."""
+
+    def __init__(self, path: Path, fmt: SweepFormat) -> None:
+        head = json.dumps(asdict(fmt)).encode()
+        self._file: IO[bytes] = path.open("wb")
+        self._file.write(MAGIC + len(head).to_bytes(4, "little") + head)
+
+    def transfer(self, t_ns: int, data: bytes) -> None:
+        """Note a bulk transfer that ended at `t_ns`."""
+        self._write(Kind.TRANSFER, t_ns, data)
+
+    def state(self, t_ns: int, state: str) -> None:
+        """Note the sensor's new state."""
+        self._write(Kind.STATE, t_ns, state.encode())
+
+    def edges(self, t_ns: int, edges: list[Edge]) -> None:
+        """Note edges that the trigger gave out at `t_ns`."""
+        self._write(Kind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._file.close()
+
+    def _write(self, kind: Kind, t_ns: int, data: bytes) -> None:
+        self._file.write(_RECORD.pack(kind, t_ns, len(data)) + data)
+
+
+class Playback:
+    """Sensor, trigger and clock in one: gives a capture's content to the rooms behind, each piece at its recorded time.
+
+    Raises FormatError where the file cannot be read or is no capture; a last record that was cut off is left out.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            data = path.read_bytes()
+        except OSError as e:
+            raise FormatError(f"{path}: cannot be read: {e.strerror}; name what `palpate run --capture` wrote") from e
+        if not data.startswith(MAGIC):
+            raise FormatError(
+                f"{path}: not a capture (it begins with {data[:8]!r}); `palpate run --capture` writes one"
+            )
+        begin = len(MAGIC) + 4 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 4], "little")
+        try:
+            self.format = SweepFormat(**json.loads(data[len(MAGIC) + 4 : begin]))
+        except (ValueError, TypeError) as e:
+            raise FormatError(f"{path}: the capture's head cannot be read: {e}; capture again") from e
+        self.state = "absent"
+        self.trouble: SensorError | None = None
+        self.identity: Identity | None = None
+        self.tally = Tally()
+        self._stream = Stream(self.format, self.tally)
+        self._records = deque(_records(path, data, begin))
+        self._now_ns = self._records[0][1] if self._records else 0
+
+    @property
+    def finished(self) -> bool:
+        """True when everything was played."""
+        return not self._records
+
+    def now_ns(self) -> int:
+        """Clock: the time of the record that was played last."""
+        return self._now_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Clock: the records alone move time."""
+
+    def read(self) -> Frames:
+        """Sensor: the next transfer's frames, or none where the next record is something else."""
+        frames = Frames.empty(self.format)
+        if self._records:
+            kind, self._now_ns, data = self._records[0]
+            if kind != Kind.EDGES:
+                self._records.popleft()
+            if kind == Kind.TRANSFER:
+                frames = self._stream.feed(data, self._now_ns)
+            elif kind == Kind.STATE:
+                self._change(data.decode())
+        return frames
+
+    def edges(self, now_ns: int) -> list[Edge]:
+        """Trigger: the edges that the box was given at this moment."""
+        edges = []
+        while self._records and self._records[0][0] == Kind.EDGES and self._records[0][1] <= now_ns:
+            edges += [Edge(_KINDS[k], t) for t, k in _EDGE.iter_unpack(self._records.popleft()[2])]
+        return edges
+
+    def _change(self, state: str) -> None:
+        self.state = state
+        if state == "streaming":
+            if self.tally.enumerations:
+                self._stream.restart()
+            self.tally.enumerations += 1
+
+
+def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[Kind, int, bytes]]:
+    """(kind, host ns, content) one after another."""
+    while at + _RECORD.size <= len(data):
+        kind, t_ns, size = _RECORD.unpack_from(data, at)
+        body = data[at + _RECORD.size : at + _RECORD.size + size]
+        if kind >= len(Kind) or (kind == Kind.EDGES and size % _EDGE.size):
+            raise FormatError(f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture again")
+        if len(body) == size:
+            yield Kind(kind), t_ns, body
+        at += _RECORD.size + size

@@ -1,0 +1,256 @@
+"""UsbSensor: frames from pyusb, through unplug and replug. In: a pyusb backend and a clock. Out: Frames, state, trouble.
+
+`read` never raises for what a bus can do: it gives no frames, says why in `state` and `trouble`, and tries again.
+"""
+
+from __future__ import annotations
+
+import errno
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import usb.core
+
+from . import link, wire
+from .clock import Clock, DeviceClock
+from .config import SensorConfig
+from .errors import FormatError, SensorError, SensorMismatch, SensorSilent
+from .sweep import EPOCH_BITS, Frames, SweepFormat
+
+RATE_TOLERANCE = 0.01
+"""How far a board's rate may be from the bundle's: one per cent, as crystals and timers differ."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """What was counted since the program started, in the unit of each name."""
+
+    frames: int = 0
+    lost_frames: int = 0
+    stale_frames: int = 0
+    garbage_bytes: int = 0
+    overflows: int = 0
+    fifo_overflows: int = 0
+    enumerations: int = 0
+
+
+class Sensor(Protocol):
+    """What the box asks of a skin."""
+
+    @property
+    def state(self) -> str:
+        """`streaming`, or what keeps it from that (PROTOCOL.md, states of the skin)."""
+        ...
+
+    @property
+    def trouble(self) -> SensorError | None:
+        """Why it is not streaming, and what to do."""
+        ...
+
+    @property
+    def identity(self) -> wire.Identity | None:
+        """Who the board says it is, once it was asked."""
+        ...
+
+    @property
+    def tally(self) -> Tally:
+        """What was counted since the start."""
+        ...
+
+    def read(self) -> Frames:
+        """The frames since the last call; none after a bounded wait."""
+        ...
+
+
+class Tap(Protocol):
+    """Takes note of what comes in, for captures."""
+
+    def transfer(self, t_ns: int, data: bytes) -> None:
+        """A bulk transfer has ended."""
+        ...
+
+    def state(self, t_ns: int, state: str) -> None:
+        """The sensor's state has changed; `streaming` means a new enumeration."""
+        ...
+
+
+class Stream:
+    """Bytes of one board -> Frames with unwrapped numbers and host times; no I/O. What is not intact is counted."""
+
+    def __init__(self, fmt: SweepFormat, tally: Tally) -> None:
+        self._format, self._tally = fmt, tally
+        self._place = wire.Place(-1)
+        self.restart()
+
+    def restart(self) -> None:
+        """A new enumeration: numbers get the next epoch, the device's clock starts anew."""
+        self._place = wire.Place(self._place.epoch + 1)
+        self._device = DeviceClock()
+        self._leftover = b""
+
+    def forget(self) -> None:
+        """A transfer was lost: what was begun will not be continued."""
+        self._leftover = b""
+
+    def feed(self, data: bytes, arrival_ns: int) -> Frames:
+        """Frames of a transfer that ended at `arrival_ns`. Raises SensorMismatch where they have another form."""
+        got = wire.unpack(self._leftover + data)
+        self._leftover = got.leftover
+        self._tally.garbage_bytes += got.garbage
+        f = self._format
+        for p in got.packets:
+            if (*p.taxels.shape[1:], p.taxels.dtype) != (f.rows, f.cols, f.digits):
+                raise SensorMismatch(f"the skin sent {p.taxels.shape[1:]} {p.taxels.dtype}, but it had announced {f}")
+            self._tally.fifo_overflows += wire.Flag.OVERFLOW in p.flags
+        fresh, place, lost, stale = wire.follow(got.packets, self._place)
+        if place.epoch != self._place.epoch:
+            self._device = DeviceClock()
+        self._place = place
+        self._tally.lost_frames += lost
+        self._tally.stale_frames += stale
+        return self._stamp([item for item in fresh if item[0] >> EPOCH_BITS == place.epoch], arrival_ns)
+
+    def _stamp(self, fresh: list[tuple[int, wire.Packet]], arrival_ns: int) -> Frames:
+        """Put numbers and host times to packets [(first number, packet)] of one epoch."""
+        if not fresh:
+            return Frames.empty(self._format)
+        counts = [len(p.taxels) for _, p in fresh]
+        period = self._format.period_ns
+        starts = [self._device.unwrap(p.t_us) * 1000 for _, p in fresh]
+        self._device.update(round(starts[-1] + (counts[-1] - 1) * period), arrival_ns)
+        host = [self._device.to_host_ns(s) for s in starts]
+        within = np.concatenate([np.arange(n) for n in counts])
+        self._tally.frames += len(within)
+        return Frames(
+            np.repeat(host, counts) + (within * period).astype(np.int64),
+            np.repeat([first for first, _ in fresh], counts) + within,
+            np.concatenate([p.taxels for _, p in fresh]),
+        )
+
+
+class UsbSensor:
+    """The skin's readout board on USB (PROTOCOL.md, part 1).
+
+    States: `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent` with `trouble` saying what to do, or `streaming`.
+    A board that comes back is a new enumeration: its frames get a new epoch in `seq` and a new device clock.
+    """
+
+    def __init__(
+        self, config: SensorConfig, fmt: SweepFormat, clock: Clock, backend: Any = None, tap: Tap | None = None
+    ) -> None:
+        self.state = "absent"
+        self.trouble: SensorError | None = None
+        self.identity: wire.Identity | None = None
+        self.tally = Tally()
+        self._config, self._format, self._clock, self._backend, self._tap = config, fmt, clock, backend, tap
+        self._stream = Stream(fmt, self.tally)
+        self._link: link.VendorLink | None = None
+        self._retry_ns = self._heard_ns = clock.now_ns()
+
+    def read(self) -> Frames:
+        """Frames that came since the last call; waits `timeout_ms` at most for them."""
+        if self._link is None and not self._connect():
+            return Frames.empty(self._format)
+        data = self._transfer()
+        now = self._clock.now_ns()
+        if data:
+            if self._tap:
+                self._tap.transfer(now, data)
+            return self._frames(data, now)
+        self._check_silence(now)
+        return Frames.empty(self._format)
+
+    def close(self) -> None:
+        """Stop the board and let it go."""
+        if self._link:
+            board, self._link = self._link, None
+            board.close()
+
+    def _connect(self) -> bool:
+        """Find, open, check and start the board; False and a state where that fails."""
+        now = self._clock.now_ns()
+        if now < self._retry_ns:
+            self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
+            return False
+        try:
+            self._link = link.open_board(self._config, self._backend)
+            self.identity = self._check(self._link)
+            self._link.request(wire.Request.START, 0)
+        except SensorError as e:
+            self._drop(e)
+            return False
+        except usb.core.USBError as e:
+            self._drop(link.explain(e))
+            return False
+        if self.tally.enumerations:
+            self._stream.restart()
+        self.tally.enumerations += 1
+        self._heard_ns = self._clock.now_ns()
+        self._set_state("streaming", None)
+        return True
+
+    def _check(self, board: link.VendorLink) -> wire.Identity:
+        """Compare the board's identity and format with what this box and its bundle can use."""
+        try:
+            who = wire.unpack_identity(board.request(wire.Request.IDENTITY, 64))
+            if who.protocol != wire.VERSION:
+                raise SensorMismatch(
+                    f"the skin's firmware {'.'.join(map(str, who.firmware))} speaks protocol {who.protocol}, "
+                    f"this box speaks {wire.VERSION}; update the older of them"
+                )
+            skin = wire.unpack_format(board.request(wire.Request.FORMAT, 64))
+        except FormatError as e:
+            raise SensorMismatch(f"the skin does not answer as PROTOCOL.md says: {e}") from e
+        f = self._format
+        if (skin.rows, skin.cols, skin.dtype) != f.skin or abs(skin.rate_hz / f.rate_hz - 1) > RATE_TOLERANCE:
+            raise SensorMismatch(
+                f"the skin sends {skin.rows}x{skin.cols} {skin.dtype} at {skin.rate_hz:g} Hz, the bundle wants {f}; "
+                "plug in the skin that it was trained for, or deploy a bundle for this one"
+            )
+        return who
+
+    def _transfer(self) -> bytes:
+        """One bulk transfer; b"" where nothing came, and a dropped link where the board has failed."""
+        assert self._link
+        try:
+            return self._link.read(self._config.read_bytes, self._config.timeout_ms)
+        except usb.core.USBTimeoutError:
+            return b""
+        except usb.core.USBError as e:
+            if e.errno == errno.EOVERFLOW:
+                # more bytes than were asked for: this transfer is gone, the sequence numbers will say what was in it
+                self.tally.overflows += 1
+                self._stream.forget()
+            else:
+                self._drop(link.explain(e))
+            return b""
+
+    def _frames(self, data: bytes, now_ns: int) -> Frames:
+        try:
+            frames = self._stream.feed(data, now_ns)
+        except SensorMismatch as e:
+            self._drop(e)
+            return Frames.empty(self._format)
+        if len(frames):
+            self._heard_ns = now_ns
+        else:
+            self._check_silence(now_ns)
+        return frames
+
+    def _check_silence(self, now_ns: int) -> None:
+        """Start a board anew that is there but has sent no whole packet for `silence_ms`."""
+        quiet_ms = (now_ns - self._heard_ns) // 1_000_000
+        if self._link and quiet_ms > self._config.silence_ms:
+            self._drop(SensorSilent(f"the skin is there but sent no frame for {quiet_ms} ms; starting it again"))
+
+    def _drop(self, why: SensorError) -> None:
+        """Let the board go, remember why, and try again after `retry_ms`."""
+        self.close()
+        self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000
+        self._set_state(why.state, why)
+
+    def _set_state(self, state: str, trouble: SensorError | None) -> None:
+        if self._tap and state != self.state:
+            self._tap.state(self._clock.now_ns(), state)
+        self.state, self.trouble = state, trouble

@@ -1,0 +1,254 @@
+"""What `palpate bench` measures: latency, inference, memory, start, processor share, on the rig and this machine.
+
+In: a way to build a box on the rig. Out: one line a figure, and all of them as JSON under plain keys.
+Memory, start and processor share are taken in processes of their own, so that no part of the bench is in them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import onnxruntime as ort
+
+from ..box import Box
+from ..bundle import Bundle
+from ..classifier import Classifier, session
+from ..clock import Clock, SystemClock
+from ..errors import BundleError
+from ..sink import ResultSink
+from ..sweep import Status, Sweep, SweepFormat, Verdict
+from . import rig, script, skin, stage
+from .stage import SimWorld
+
+SWEEPS, MEMORY_SWEEPS, STREAM_S, STARTS, ROUNDS = 60, 1000, 15.0, 7, 400
+PARTS = ("memory", "stream")
+"""Figures that are taken in a process of their own."""
+
+
+class Build(Protocol):
+    """Builds a box on a world; `stack` takes it apart. The box, and the far end of its serial line to be read."""
+
+    def __call__(
+        self,
+        world: SimWorld,
+        stack: ExitStack,
+        also: Iterable[ResultSink] = (),
+        keep: Callable[[Sweep], None] | None = None,
+    ) -> tuple[Box, int]:
+        """Build it."""
+        ...
+
+
+def part(name: str, fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
+    """One of PARTS, measured in this process."""
+    return {"memory": _memory, "stream": _stream}[name](fmt, build, seed)
+
+
+def run(bundle: Bundle, build: Build, yardsticks: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """All figures; `say` gets each as soon as it is there."""
+    figures: dict[str, Any] = {"commit": _commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id}
+
+    def add(more: dict[str, Any]) -> None:
+        figures.update(more)
+        for key, value in more.items():
+            say(f"{key:<24} {json.dumps(value)}")
+
+    add({k: figures[k] for k in ("commit", "seed", "machine", "bundle")})
+    add(_whole_way(bundle.format, build, seed))
+    add({"inference_ms": _inference(bundle, yardsticks, seed)})
+    for name in PARTS:
+        add(_child(name, seed))
+    add(_cold_start())
+    return figures
+
+
+def wilson(right: int, total: int) -> list[float]:
+    """The 95 % Wilson interval of a share."""
+    z = 1.96
+    p, n = right / total, total
+    middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return [round(float((middle + d) / (1 + z * z / n)), 4) for d in (-half, half)]
+
+
+def _percentiles(values: list[float]) -> dict[str, float]:
+    return {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)} | {"n": len(values)}
+
+
+def _drain(far_end: int) -> None:
+    with suppress(BlockingIOError):
+        os.read(far_end, 65536)
+
+
+class _Watch:
+    """A sink behind the serial port: when it gets a verdict, the port has the sentence."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.verdicts: list[Verdict] = []
+        self.answered_ms: list[float] = []
+        self.seen_ms: list[float] = []
+        self._clock = clock
+
+    def send(self, verdict: Verdict) -> None:
+        in_hand_ns = verdict.time_ns - verdict.latency_ns
+        self.verdicts.append(verdict)
+        self.answered_ms.append((self._clock.now_ns() - in_hand_ns) / 1e6)
+
+    def keep(self, sweep: Sweep) -> None:
+        self.seen_ms.append((sweep.complete_ns - sweep.stop_ns) / 1e6)
+
+
+def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
+    """SWEEPS sweeps on skin positions of their own, USB bytes to sentence; work takes its time, waiting is skipped.
+
+    edge_to_sentence_ms: from stop edge and last frame of the window in hand to the sentence at the port.
+    edge_seen_ms: from the kernel's stamp of the stop edge to its being in hand (glitch filter, rest of a packet).
+    """
+    clock = rig.SkippingClock()
+    watch = _Watch(clock)
+    world = stage.build(fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim")
+    with ExitStack() as stack:
+        box, far_end = build(world, stack, [watch], watch.keep)
+        while not world.finished(box.answered):
+            box.step()
+            _drain(far_end)
+        lost = box.frames_lost + sum(v.lost for v in watch.verdicts)
+    pairs = zip(watch.verdicts, world.robot.played, strict=True)
+    right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
+    return {
+        "accuracy": {"right": right, "total": SWEEPS, "interval": wilson(right, SWEEPS)},
+        "frames_lost": lost,
+        "edge_to_sentence_ms": _percentiles(watch.answered_ms),
+        "edge_seen_ms": _percentiles(watch.seen_ms),
+    }
+
+
+def _inference(bundle: Bundle, yardsticks: Path, seed: int) -> dict[str, Any]:
+    """The bundle beside the same network in float and the paper's in int8, taken in turns in one run."""
+    rng = np.random.default_rng(seed)
+    window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.digits)
+    calls: dict[str, Callable[[], object]] = {}
+    int8 = Classifier(bundle, SystemClock())
+    calls["int8"] = lambda: int8.logits(window)
+    _make_yardsticks(yardsticks)
+    for name in ("fp32", "paper_int8"):
+        path = yardsticks / f"{name}.onnx"
+        if path.is_file():
+            calls[name] = partial(session(path.read_bytes()).run, None, {"sweep": window[None]})
+    took_ms: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(ROUNDS):
+        for name, call in calls.items():
+            start = time.perf_counter_ns()
+            call()
+            took_ms[name].append((time.perf_counter_ns() - start) / 1e6)
+    return {name: _percentiles(values[ROUNDS // 10 :]) for name, values in took_ms.items()}
+
+
+def _make_yardsticks(folder: Path) -> None:
+    """Have the desktop's tools build the networks to compare with, where they are installed beside this program."""
+    tool = Path(sys.executable).with_name("palpate-train")
+    if folder.is_dir() or not tool.exists():
+        return
+    done = subprocess.run([tool, "yardsticks", "--out", str(folder)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise BundleError(f"palpate-train yardsticks failed: {done.stderr.strip()[-300:]}")
+
+
+def _memory(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
+    """Resident memory of a box after MEMORY_SWEEPS sweeps, and what the last nine tenths of them added."""
+    world = stage.build(fmt, itertools.cycle(list(script.tubes(seed, 6))), rig.VirtualClock(), "sim")
+    rss_mb = {}
+    with ExitStack() as stack:
+        box, far_end = build(world, stack)
+        while box.answered < MEMORY_SWEEPS:
+            if box.step() and box.answered in (MEMORY_SWEEPS // 10, MEMORY_SWEEPS):
+                rss_mb[box.answered] = _rss_mb()
+            _drain(far_end)
+            world.robot.played.clear()
+    before, after = rss_mb.values()
+    return {"rss_mb": {"after_1000": round(after, 2), "growth_last_900": round(after - before, 2)}}
+
+
+def _rss_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGESIZE") / 1e6
+
+
+def _stream(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
+    """Share of one core while streaming in real time, without the simulated board's own share, and with it."""
+    world = stage.build(fmt, itertools.cycle(list(script.tubes(seed, 6))), SystemClock(), "sim")
+    board_ns = 0
+    real_read = world.backend.bulk_read
+
+    def timed_read(*args: Any) -> int:
+        nonlocal board_ns
+        start = time.thread_time_ns()
+        try:
+            return real_read(*args)
+        finally:
+            board_ns += time.thread_time_ns() - start
+
+    world.backend.bulk_read = timed_read  # type: ignore[assignment]
+    with ExitStack() as stack:
+        box, far_end = build(world, stack)
+        box.step()
+        board_ns, wall_ns, cpu_ns = 0, -time.monotonic_ns(), -time.process_time_ns()
+        while time.monotonic_ns() + wall_ns < STREAM_S * 1e9:
+            box.step()
+            _drain(far_end)
+        wall_ns, cpu_ns = wall_ns + time.monotonic_ns(), cpu_ns + time.process_time_ns()
+    box_ns = cpu_ns - board_ns
+    return {
+        "cpu_share_streaming": round(box_ns / wall_ns, 4),
+        "cpu_share_with_simulated_board": round(cpu_ns / wall_ns, 4),
+    }
+
+
+def _child(name: str, seed: int) -> dict[str, Any]:
+    """A part in a fresh process."""
+    command = [sys.executable, "-m", "appliance", "bench", "--part", name, "--seed", str(seed)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+def _cold_start() -> dict[str, Any]:
+    """Seconds from the start of the process to READY with a streaming skin: the first state sentence says so."""
+    took = []
+    for _ in range(STARTS):
+        start = time.monotonic()
+        with subprocess.Popen(
+            [sys.executable, "-m", "appliance", "run", "--sim", "skin"], stdout=subprocess.PIPE
+        ) as box:
+            assert box.stdout
+            while b",streaming," not in box.stdout.readline():
+                pass
+            took.append(time.monotonic() - start)
+            box.terminate()
+    return {"cold_start_s": round(statistics.median(took), 3), "cold_start_worst_s": round(max(took), 3)}
+
+
+def _commit() -> str:
+    where = Path(__file__).parent
+    try:
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=where, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return "unknown"
+    return done.stdout.strip() or "unknown"
+
+
+def _machine() -> dict[str, Any]:
+    versions = {"python": platform.python_version(), "numpy": np.__version__, "onnxruntime": ort.__version__}
+    return {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()} | versions

@@ -1,0 +1,159 @@
+"""GPIO without GPIO: a double of the module gpiod (libgpiod v2) on the rig's timeline, under the real trigger room.
+
+In: levels of named inputs, each at its moment. Out: edge events as the kernel queues and drops them, and a list of what
+was written to outputs. Enums, settings, events and errors are gpiod's own.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from itertools import count
+from types import SimpleNamespace
+
+import gpiod
+from gpiod.line import Bias, Direction, Edge, Value
+
+from ..clock import Clock
+
+RISE, FALL = gpiod.EdgeEvent.Type.RISING_EDGE, gpiod.EdgeEvent.Type.FALLING_EDGE
+MAX_QUEUE = 1024
+"""The kernel grants no larger queue: 16 events for each of at most 64 lines."""
+
+
+class SimGpio:
+    """Stands where `import gpiod` would. chips: path (/dev/gpiochip0 and so on) -> its line names, '' for none.
+
+    written: (t_ns, name, level) of everything that was driven, in order. requests: the lines that are held now.
+    refuse: path -> errno with which a chip refuses from now on: 13 permission denied, 19 pulled out.
+    """
+
+    __version__ = "sim"
+    LineSettings = gpiod.LineSettings
+    EdgeEvent = gpiod.EdgeEvent
+    line = gpiod.line
+
+    def __init__(self, clock: Clock, chips: Mapping[str, Sequence[str]]) -> None:
+        self.written: list[tuple[int, str, bool]] = []
+        self.requests: list[SimRequest] = []
+        self.refuse: dict[str, int] = {}
+        self._clock = clock
+        self._chips = chips
+        self._driven: dict[str, bool] = {}
+        self._plan: list[tuple[int, int, str, bool]] = []
+        self._order = count()
+
+    def drive(self, name: str, level: bool, t_ns: int) -> None:
+        """Set the input line `name` to `level` at `t_ns`; seen from then on, by whoever looks, with that time stamp."""
+        if not any(name in names for names in self._chips.values()):
+            raise ValueError(f"no simulated gpio line is named {name!r}; add it to chips")
+        heapq.heappush(self._plan, (t_ns, next(self._order), name, bool(level)))
+
+    def is_gpiochip_device(self, path: str) -> bool:
+        """As gpiod's."""
+        return path in self._chips
+
+    def Chip(self, path: str) -> nullcontext[SimpleNamespace]:
+        """As gpiod's, with what it takes to look for lines by name."""
+        self.check(path)
+        names = self._chips[path]
+        info = gpiod.ChipInfo(os.path.basename(path), "palpate-sim", len(names))
+        return nullcontext(
+            SimpleNamespace(get_info=lambda: info, get_line_info=lambda offset: SimpleNamespace(name=names[offset]))
+        )
+
+    def request_lines(
+        self,
+        path: str,
+        config: Mapping[Iterable[int], gpiod.LineSettings],
+        consumer: str = "",
+        event_buffer_size: int = 0,
+    ) -> SimRequest:
+        """As gpiod's; lines are given by their offsets."""
+        self.now_ns()
+        self.check(path)
+        settings = {offset: of_all for offsets, of_all in config.items() for offset in offsets}
+        names = {offset: self._chips[path][offset] for offset in settings}
+        if any(request.path == path and request.names.keys() & names.keys() for request in self.requests):
+            raise OSError(16, os.strerror(16))
+        size = min(event_buffer_size or 16 * len(names), MAX_QUEUE)
+        levels = {o: self._driven.get(name, settings[o].bias is Bias.PULL_UP) for o, name in names.items()}
+        self.requests.append(SimRequest(self, path, names, settings, levels, 1 << (size - 1).bit_length()))
+        return self.requests[-1]
+
+    def now_ns(self) -> int:
+        """The time, when everything that was to happen until now has happened."""
+        now_ns = self._clock.now_ns()
+        while self._plan and self._plan[0][0] <= now_ns:
+            t_ns, _, name, level = heapq.heappop(self._plan)
+            self._driven[name] = level
+            for request in self.requests:
+                request.notice(name, level, t_ns)
+        return now_ns
+
+    def check(self, path: str) -> None:
+        """Raise OSError where the chip refuses."""
+        if path in self.refuse:
+            raise OSError(self.refuse[path], os.strerror(self.refuse[path]), path)
+
+
+class SimRequest:
+    """As gpiod's LineRequest. queue: the kernel's, which drops its oldest event when it is full."""
+
+    def __init__(
+        self, gpio: SimGpio, path: str, names: dict[int, str], settings: dict[int, gpiod.LineSettings],
+        levels: dict[int, bool], size: int,
+    ) -> None:  # fmt: skip
+        self.path, self.names, self.settings = path, names, settings
+        self.queue: deque[gpiod.EdgeEvent] = deque(maxlen=size)
+        self._gpio, self._levels = gpio, levels
+        self._seqno, self._line_seqno = count(1), {offset: count(1) for offset in names}
+
+    def notice(self, name: str, level: bool, t_ns: int) -> None:
+        """An input has been driven: an event, if that is an edge which was asked for."""
+        for offset in (o for o, n in self.names.items() if n == name and self._levels[o] != level):
+            self._levels[offset] = level
+            rise = level != self.settings[offset].active_low
+            if self.settings[offset].edge_detection in (Edge.BOTH, Edge.RISING if rise else Edge.FALLING):
+                numbers = next(self._seqno), next(self._line_seqno[offset])
+                self.queue.append(gpiod.EdgeEvent((RISE if rise else FALL).value, t_ns, offset, *numbers))
+
+    def wait_edge_events(self, timeout: float) -> bool:
+        """As gpiod's with timeout 0: whether there is an event to read."""
+        self._now_ns()
+        return bool(self.queue)
+
+    def read_edge_events(self, max_events: int) -> list[gpiod.EdgeEvent]:
+        """As gpiod's, but says so where that would wait for ever."""
+        self._now_ns()
+        if not self.queue:
+            raise RuntimeError("reading from an empty queue blocks; ask wait_edge_events(0) before")
+        return [self.queue.popleft() for _ in range(min(max_events, len(self.queue)))]
+
+    def get_values(self, lines: Iterable[int]) -> list[Value]:
+        """As gpiod's."""
+        self._now_ns()
+        return [Value.ACTIVE if self._levels[o] != self.settings[o].active_low else Value.INACTIVE for o in lines]
+
+    def set_values(self, values: Mapping[int, Value]) -> None:
+        """As gpiod's."""
+        now_ns = self._now_ns()
+        for offset, value in values.items():
+            self._levels[offset] = (value is Value.ACTIVE) != self.settings[offset].active_low
+            self._gpio.written.append((now_ns, self.names[offset], self._levels[offset]))
+
+    def release(self) -> None:
+        """As gpiod's; an output becomes an input, and its pull-down takes it low."""
+        self._gpio.requests.remove(self)
+        for offset, name in self.names.items():
+            if self.settings[offset].direction is Direction.OUTPUT and self._levels[offset]:
+                self._gpio.written.append((self._gpio.now_ns(), name, False))
+
+    def _now_ns(self) -> int:
+        if self not in self._gpio.requests:
+            raise gpiod.RequestReleasedError
+        self._gpio.check(self.path)
+        return self._gpio.now_ns()

@@ -1,0 +1,180 @@
+"""The rig: one timeline for a robot's script, the trigger edges and a readout board. Under it, clocks that can skip.
+
+In: Acts (frames of one sweep and where its edges lie). Out: packets of PROTOCOL.md and edges, each at its moment.
+`usb` puts the board under pyusb, `gpio` the edges under gpiod.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import wire
+from ..clock import Clock
+from ..sweep import SweepFormat
+
+PULSE_NS = 20_000_000
+"""Length of the robot's pulses."""
+
+
+class VirtualClock:
+    """Time that passes only when somebody sleeps: minutes of world in a fraction of a second, always the same."""
+
+    def __init__(self, start_ns: int = 1_000_000_000) -> None:
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        """The world's time in nanoseconds."""
+        return self._now_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Jump to `t_ns`."""
+        self._now_ns = max(self._now_ns, t_ns)
+
+
+class SkippingClock:
+    """Real time without the waiting: work takes the time it takes, sleep takes none. For measuring the box's own share."""
+
+    def __init__(self) -> None:
+        self._skipped_ns = 0
+
+    def now_ns(self) -> int:
+        """Monotonic nanoseconds plus everything that was skipped."""
+        return time.monotonic_ns() + self._skipped_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Skip to `t_ns`."""
+        self._skipped_ns += max(0, t_ns - self.now_ns())
+
+
+@dataclass(frozen=True, slots=True)
+class Act:
+    """One sweep of the robot: frames [n, R, C] of digits, and the frames at which its start and stop edges come."""
+
+    frames: NDArray[Any]
+    start: int
+    stop: int
+    label: str
+    new_object: bool = False
+
+
+class EdgeLines(Protocol):
+    """Where the robot's edges go."""
+
+    def drive(self, name: str, level: bool, t_ns: int) -> None:
+        """Set the input line `name` to `level` at `t_ns`."""
+        ...
+
+
+class Robot:
+    """Plays a script of acts: drives start, stop and NEW OBJECT at the right frames. `played` keeps what it did, for scoring."""
+
+    def __init__(self, script: Iterator[Act], lines: EdgeLines, *, start: str, stop: str, new_object: str = "") -> None:
+        self.played: list[Act] = []
+        self.finished = False
+        self._script, self._lines = script, lines
+        self._start, self._stop, self._new_object = start, stop, new_object
+
+    def next_act(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
+        """The next act, its edges scheduled; it begins with frame `first`, and `frame_ns` tells when a frame is taken.
+
+        None when the script has ended.
+        """
+        act = next(self._script, None)
+        if act is None:
+            self.finished = True
+            return None
+        self.played.append(act)
+        begin_ns, start_ns, stop_ns = (frame_ns(first + i) for i in (0, act.start, act.stop))
+        if act.new_object and self._new_object:
+            self._pulse(self._new_object, begin_ns, begin_ns + PULSE_NS)
+        if self._stop:
+            self._pulse(self._start, start_ns, start_ns + PULSE_NS)
+            self._pulse(self._stop, stop_ns, stop_ns + PULSE_NS)
+        else:
+            self._pulse(self._start, start_ns, stop_ns)
+        return act
+
+    def _pulse(self, name: str, up_ns: int, down_ns: int) -> None:
+        self._lines.drive(name, True, up_ns)
+        self._lines.drive(name, False, down_ns)
+
+
+class Board:
+    """A readout board that speaks PROTOCOL.md: samples the script at its own rate, holds frames in a FIFO, sends packets.
+
+    ppm: error of its crystal. latency: draws the nanoseconds from a packet's last frame to its arrival.
+    """
+
+    def __init__(
+        self, fmt: SweepFormat, robot: Robot, clock: Clock, *, packet_frames: int = 4, fifo_frames: int = 750,
+        ppm: float = 0.0, latency: Callable[[], int] = lambda: 150_000, serial: str = "SIM0001", first_seq: int = 0,
+    ) -> None:  # fmt: skip
+        self.identity = wire.Identity(wire.VERSION, (1, 0, 0), "palpate-sim", serial)
+        self.skin = wire.SkinFormat(fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames)
+        self.present = True
+        self.running = False
+        self._robot, self._clock, self._latency = robot, clock, latency
+        self._rate = 1 + ppm * 1e-6
+        self._period_ns = fmt.period_ns / self._rate
+        self._origin_ns = clock.now_ns()
+        self._first_seq = first_seq
+        self._next = 0  # frame that is sent next
+        self._arrival_ns: int | None = None  # of the packet that begins there, once drawn
+        self._frames = np.zeros((1, fmt.rows, fmt.cols), fmt.digits)
+        self._base = 0  # number of the first frame in _frames
+
+    def frame_ns(self, i: int) -> int:
+        """Host time at which frame `i` is taken."""
+        return self._origin_ns + round((i + 1) * self._period_ns)
+
+    def request(self, request: int) -> bytes | None:
+        """Answer a control request; None where it is unknown."""
+        now = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
+        match request:
+            case wire.Request.IDENTITY:
+                return wire.pack_identity(self.identity)
+            case wire.Request.FORMAT:
+                return wire.pack_format(self.skin)
+            case wire.Request.START:
+                if not self.running:
+                    self.running, self._next, self._arrival_ns = True, now, None
+                return b""
+            case wire.Request.STOP:
+                self.running = False
+                return b""
+        return None
+
+    def due_ns(self) -> int | None:
+        """When the next packet will be on the bus; None while nothing is being sent."""
+        if not self.running:
+            return None
+        if self._arrival_ns is None:
+            self._arrival_ns = self.frame_ns(self._next + self.skin.packet_frames - 1) + self._latency()
+        return self._arrival_ns
+
+    def take(self) -> bytes:
+        """The packet that is due; the oldest frames are gone where the FIFO has overflowed."""
+        n, fifo = self.skin.packet_frames, self.skin.fifo_frames
+        taken = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
+        late = max(0, taken - fifo - self._next)
+        first = self._next + late
+        self._next, self._arrival_ns = first + n, None
+        device_us = round((self.frame_ns(first) - self._origin_ns) * self._rate / 1000)
+        flags = wire.Flag.OVERFLOW if late else 0
+        return wire.pack(self._first_seq + first, device_us, self._block(first, n), flags)
+
+    def _block(self, first: int, n: int) -> NDArray[Any]:
+        """Frames `first` to `first + n` of the script; after its end the last frame is held."""
+        while first + n > self._base + len(self._frames):
+            act = self._robot.next_act(self._base + len(self._frames), self.frame_ns)
+            more = self._frames[-1:].repeat(4096, axis=0) if act is None else act.frames
+            keep = max(0, min(first - self._base, len(self._frames) - 1))
+            self._frames = np.concatenate([self._frames[keep:], more])
+            self._base += keep
+        return self._frames[max(0, first - self._base) :][:n]

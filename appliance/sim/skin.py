@@ -1,0 +1,299 @@
+"""The room of the simulated world that stands in for the real skin: a soft finger slides along a tube.
+
+In: the name of a material, where the skin sits on the finger, a random generator. Out: digits uint8 [n, 4, 4], 750 Hz.
+The finger's pad is a bed of springs pressed on the tube. Whatever else a taxel sees is one small function named in
+`EFFECTS`; each draws from its own random stream, so that `World(off=...)` takes one away and leaves the others as they
+were. Rows lie along the direction of sliding (x), columns across the tube (y); row 3 leads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from ..errors import ConfigError
+from ..sweep import SweepFormat
+
+Array = NDArray[np.float64]
+Whole = NDArray[np.int64]
+Digits = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+SweepSet = tuple[Digits, Whole, Whole]
+SetName = Literal["T-LAB", "T-REAL", "T-HARD"]
+
+FORMAT = SweepFormat(4, 4, 750.0, 1500, "uint8")
+PITCH_MM, TAXEL_MM, TUBE_RADIUS_MM = 4.0, 2.5, 25.0
+STEP_MM = 30.0 / FORMAT.rate_hz  # slid from one frame to the next, at 3 cm/s
+FORCE_LIMIT = 0.2  # the controller's precision: no force is further off, as a share of the wanted one
+SETS = {"T-LAB": (1, 40), "T-REAL": (9, 10), "T-HARD": (1, 10)}  # positions, sweeps of a tube at each
+EFFECTS = ("position", "attachment", "drift", "spot", "texture", "vibration", "noise")
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """A tube. Pitch and vibration_hz are centres of bumps in the spectrum, `_octaves` their standard deviations."""
+
+    name: str
+    softness_mm_per_kpa: float
+    texture_mm: float  # rms height
+    pitch_mm: float
+    pitch_octaves: float
+    vibration: float  # rms, as a share of the pressure
+    vibration_hz: float
+    vibration_octaves: float
+
+
+TUBES = (
+    Material("metal", 0.00, 0.005, 12.0, 1.2, 0.028, 155.0, 0.45),
+    Material("wood", 0.00, 0.010, 7.0, 1.0, 0.034, 120.0, 0.60),
+    Material("paper", 0.03, 0.050, 7.0, 0.8, 0.055, 70.0, 0.50),
+    Material("plastic rough", 0.01, 0.100, 4.5, 0.4, 0.080, 45.0, 0.70),
+    Material("plastic smooth", 0.00, 0.006, 10.0, 1.2, 0.034, 150.0, 0.90),
+    Material("foam", 0.20, 0.040, 6.0, 1.0, 0.040, 20.0, 0.60),
+)
+MATERIALS = tuple(tube.name for tube in TUBES)
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """Everything of the scene that is neither the skin's place nor drawn at random. `off`: EFFECTS to leave out.
+
+    A spread is a standard deviation, of the natural logarithm where nothing else is said.
+    Raises ConfigError where `off` names an effect that does not exist.
+    """
+
+    off: frozenset[str] = frozenset()
+    tubes: tuple[Material, ...] = TUBES
+    force_n: float = 1.0
+    force_spread: float = 0.10  # share of the force
+    pad_kpa_per_mm: float = 4.0
+    pad_half_mm: float = 8.5  # along the tube; beyond it the pad bends away
+    digits_per_kpa: float = 15.0
+    noise_digits: float = 0.6
+    gain_spread: float = 0.18  # per attachment, once for all taxels and once for each
+    bedding_mm: float = 0.05  # spread of the height of tape and pad under a taxel, per attachment
+    colour_spread: float = 0.40  # of how tape and glove pass vibrations, per attachment and octave
+    damping_hz: float = 120.0  # above it the pad swallows vibrations,
+    damping_octaves_per_mm: float = -0.50  # and sooner towards the finger's tip
+    spot_spread: float = 0.20  # of height and vibration from one spot of a tube to another
+    spot_octaves: float = 0.12  # spread of pitch and rate likewise
+
+    def __post_init__(self) -> None:
+        if unknown := self.off - set(EFFECTS):
+            raise ConfigError(f"effect {min(unknown)!r} cannot be switched off; use some of {', '.join(EFFECTS)}")
+
+    def tube(self, name: str) -> Material:
+        """The tube of that name. Raises ConfigError where there is none."""
+        known = {tube.name: tube for tube in self.tubes}
+        if name not in known:
+            raise ConfigError(f"material {name!r} is unknown; use one of {', '.join(known)}")
+        return known[name]
+
+
+WORLD = World()
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where the skin's centre sits on the pad, along sliding and across, and its turn. `seed` draws its attachment."""
+
+    dx_mm: float = 0.0
+    dy_mm: float = 0.0
+    turn_deg: float = 0.0
+    seed: int = 0
+
+
+def band(
+    n: int, tracks: int, centre: float, octaves: float, rate: float, rng: Generator, passed: Array | float = 1.0
+) -> Array:
+    """Noise [tracks, n]: its amplitude spectrum is a bump on a logarithmic axis, its rms 1 before the gain `passed`.
+
+    centre and rate (samples) are both per second or both per mm; passed [n // 2 + 1] over rfft's bins.
+    """
+    amplitude = np.exp(-0.5 * (np.log2(np.fft.rfftfreq(n, 1 / rate)[1:] / centre) / octaves) ** 2)
+    amplitude *= n / 2 / np.sqrt(np.sum(amplitude**2))
+    bins = np.zeros((tracks, n // 2 + 1), complex)
+    bins[:, 1:] = amplitude * rng.standard_normal((tracks, len(amplitude), 2)).view(complex)[..., 0]
+    return np.fft.irfft(bins * passed, n)
+
+
+def position(placement: Placement, world: World) -> tuple[Array, Array]:
+    """Effect: where the taxels' centres lie on the pad, x and y [4, 4] in mm; without it the skin is centred."""
+    sits = Placement() if "position" in world.off else placement
+    step = (np.arange(4) - 1.5) * PITCH_MM
+    place = complex(sits.dx_mm, sits.dy_mm) + (step[:, None] + 1j * step) * np.exp(1j * np.deg2rad(sits.turn_deg))
+    return place.real, place.imag
+
+
+def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]:
+    """Effect: what taping the skin on has changed: gains [4, 4], bedding [4, 4] in mm, colour of vibrations [7].
+
+    The colour is the logarithm of a gain at 6 Hz and each octave above it, up to 375 Hz.
+    """
+    if "attachment" in world.off:
+        return np.ones((4, 4)), np.zeros((4, 4)), np.zeros(7)
+    rng = np.random.default_rng(placement.seed)
+    gain = np.exp(world.gain_spread * (rng.standard_normal() + rng.standard_normal((4, 4))))
+    return gain, world.bedding_mm * rng.standard_normal((4, 4)), world.colour_spread * rng.standard_normal(7)
+
+
+def drift(n: int, rng: Generator, world: World) -> Array:
+    """Effect: contact force [n] in N; half of the controller's error stays for the sweep, half wanders at .5 Hz."""
+    if "drift" in world.off:
+        return np.full(n, world.force_n)
+    wander = band(max(n, FORMAT.window), 1, 0.5, 1.0, FORMAT.rate_hz, rng)[0, :n]
+    error: Array = np.sqrt(0.5) * world.force_spread * (rng.standard_normal() + wander)
+    return world.force_n + world.force_n * FORCE_LIMIT * np.tanh(error / FORCE_LIMIT)
+
+
+def spot(tube: Material, rng: Generator, world: World) -> Material:
+    """Effect: the tube was turned, and here it is a little rougher, finer or squeaks otherwise than elsewhere."""
+    if "spot" in world.off:
+        return tube
+    height, squeak = np.exp(world.spot_spread * rng.standard_normal(2))
+    pitch, rate = np.exp2(world.spot_octaves * rng.standard_normal(2))
+    return replace(
+        tube,
+        texture_mm=tube.texture_mm * height,
+        pitch_mm=tube.pitch_mm * pitch,
+        vibration=tube.vibration * squeak,
+        vibration_hz=tube.vibration_hz * rate,
+    )
+
+
+def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World) -> Array:
+    """Effect: height [n, 4, 4] in mm under the taxels, averaged over their length. `slid` [n]: frames slid so far.
+
+    Each column runs over a track of its own, on which the rows follow one another at the speed of sliding.
+    """
+    if "texture" in world.off:
+        return np.zeros((1, 4, 4))
+    lead = np.rint((x - x.min()) / STEP_MM).astype(np.int64)
+    n = 500 * int(np.ceil((slid[-1] + lead.max() + 1) / 500))  # a length that the FFT likes
+    blur = np.sinc(np.fft.rfftfreq(n, STEP_MM) * TAXEL_MM)
+    track = tube.texture_mm * band(n, 4, 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM, rng, blur)
+    height: Array = track[np.arange(4), slid[:, None, None] + lead]
+    return height
+
+
+def vibration(tube: Material, x: Array, colour: Array, moving: Flags, rng: Generator, world: World) -> Array:
+    """Effect: friction shakes all that touches in time, [n, 1, 1] as a share of the pressure, while `moving` [n]."""
+    if "vibration" in world.off:
+        return np.zeros((1, 1, 1))
+    n = len(moving)
+    hz = np.fft.rfftfreq(n, 1 / FORMAT.rate_hz)
+    octave = np.log2(np.maximum(hz, 1) * 2 / FORMAT.rate_hz) + len(colour) - 1
+    damping = np.hypot(1, hz / (world.damping_hz * np.exp2(world.damping_octaves_per_mm * x.mean())))
+    passed = np.exp(np.interp(octave, np.arange(len(colour)), colour)) / damping
+    shake = band(n, 1, tube.vibration_hz, tube.vibration_octaves, FORMAT.rate_hz, rng, passed)[0]
+    return (tube.vibration * shake * moving)[:, None, None]
+
+
+def noise(n: int, rng: Generator, world: World) -> Array:
+    """Effect: white noise of the readout, [n, 4, 4] digits."""
+    return rng.standard_normal((n, 4, 4)) * (0.0 if "noise" in world.off else world.noise_digits)
+
+
+def gap(x: Array, y: Array | float, world: World) -> Array:
+    """Distance in mm of the unloaded pad from a tube that it just touches: the tube falls off, then the pad ends."""
+    ends: Array = (x / world.pad_half_mm) ** 6
+    return y**2 / (2 * TUBE_RADIUS_MM) + ends
+
+
+def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
+    """How deep [n] in mm the pad is pressed in by `force_n` [n]: the springs of the whole patch carry the force."""
+    x = np.linspace(-1.5, 1.5, 61) * world.pad_half_mm
+    depth = np.linspace(0, 8, 161)
+    pressed = np.maximum(depth[:, None] - gap(x, 0.0, world), 0)
+    across = 4 / 3 * np.sqrt(2 * TUBE_RADIUS_MM * pressed) * pressed  # the springs of one x, integrated over y
+    newton = kpa_per_mm * across.sum(axis=1) * (x[1] - x[0]) / 1000
+    return np.interp(force_n, newton, depth)
+
+
+def digitize(signal: Array) -> Digits:
+    """The converter: digits 0..255."""
+    return np.clip(np.rint(signal), 0, 255).astype(np.uint8)
+
+
+def _touch(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Digits:
+    """Digits [n, 4, 4] of a finger in contact that has slid `slid` [n] frames along the tube."""
+    of_drift, of_spot, of_texture, of_vibration, of_noise = rng.spawn(5)
+    x, y = position(placement, world)
+    gain, bedding, colour = attachment(placement, world)
+    tube = spot(tube, of_spot, world)
+    kpa_per_mm = 1 / (1 / world.pad_kpa_per_mm + tube.softness_mm_per_kpa)
+    depth = indentation(drift(len(slid), of_drift, world), kpa_per_mm, world)[:, None, None]
+    height = bedding + texture(tube, x, slid, of_texture, world)
+    pressure_kpa = kpa_per_mm * np.maximum(depth - gap(x, y, world) + height, 0)
+    pressure_kpa *= 1 + vibration(tube, x, colour, moving, of_vibration, world)
+    return digitize(world.digits_per_kpa * gain * pressure_kpa + noise(len(slid), of_noise, world))
+
+
+def sweep(
+    material: str,
+    placement: Placement,
+    rng: Generator,
+    world: World = WORLD,
+    *,
+    rest_s: float = 0.3,
+    slide_s: float = 3.0,
+    after_s: float = 0.3,
+) -> Digits:
+    """Digits uint8 [n, 4, 4] of a finger that rests on the tube, slides along it and rests again.
+
+    The slide is in frames [rest_s * 750, (rest_s + slide_s) * 750). Raises ConfigError for an unknown material.
+    """
+    rest, slide, after = (round(s * FORMAT.rate_hz) for s in (rest_s, slide_s, after_s))
+    frame = np.arange(rest + slide + after) - rest
+    return _touch(world.tube(material), placement, rng, world, frame.clip(0, slide), (frame >= 0) & (frame < slide))
+
+
+def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Digits:
+    """The middle two seconds of a slide, uint8 [1500, 4, 4]. Raises ConfigError for an unknown material."""
+    n = FORMAT.window
+    return _touch(world.tube(material), placement, rng, world, np.arange(n), np.ones(n, bool))
+
+
+def idle(n: int, rng: Generator, world: World = WORLD) -> Digits:
+    """Digits uint8 [n, 4, 4] of a skin that touches nothing."""
+    return digitize(noise(n, rng, world))
+
+
+def _set_rng(name: SetName, seed: int) -> Generator:
+    """The random stream of a set; sets of one seed share nothing. Raises ConfigError for an unknown set."""
+    if name not in SETS:
+        raise ConfigError(f"sweep set {name!r} is unknown; use one of {', '.join(SETS)}")
+    return np.random.default_rng([seed, *name.encode()])
+
+
+def placements(name: SetName, seed: int) -> list[Placement]:
+    """Where the skin sits in a set: within 1 mm of the middle, in T-HARD a row (4 mm) ahead; turned by 2 degrees rms.
+
+    Raises ConfigError for an unknown set.
+    """
+    rng = _set_rng(name, seed)
+    places = []
+    for _ in range(SETS[name][0]):
+        aside = np.sqrt(rng.random()) * np.exp(2j * np.pi * rng.random())  # evenly over a disc of 1 mm
+        dx_mm = PITCH_MM if name == "T-HARD" else float(aside.real)
+        places.append(Placement(dx_mm, float(aside.imag), 2 * rng.standard_normal(), int(rng.integers(2**32))))
+    return places
+
+
+def sweep_set(name: SetName, seed: int, per_material: int | None = None, world: World = WORLD) -> SweepSet:
+    """A set of the paper: windows uint8 [N, 1500, 4, 4], labels int64 [N] into MATERIALS, positions int64 [N].
+
+    per_material: windows of each tube at each position; None stands for the paper's count.
+    Raises ConfigError for an unknown set.
+    """
+    places = placements(name, seed)
+    each = SETS[name][1] if per_material is None else per_material
+    position_of, label_of = np.divmod(np.arange(len(places) * len(MATERIALS) * each) // each, len(MATERIALS))
+    samples = np.empty((len(label_of), FORMAT.window, FORMAT.rows, FORMAT.cols), np.uint8)
+    for i, rng in enumerate(_set_rng(name, seed).spawn(len(samples))):
+        samples[i] = window(MATERIALS[label_of[i]], places[position_of[i]], rng, world)
+    return samples, label_of, position_of

@@ -1,0 +1,66 @@
+"""Puts the rig together: a world under the real drivers, chosen by name. In: `skin` or `replay:FILE`. Out: a SimWorld."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+from ..box import World
+from ..clock import Clock, SystemClock
+from ..config import Config
+from ..errors import ConfigError, FormatError
+from ..sweep import SweepFormat
+from . import gpio, rig, script, skin, usb
+
+SETS = "replay:"
+READY, BUSY, RESULT_VALID, FAULT = "READY", "BUSY", "RESULT-VALID", "FAULT"
+START, STOP, NEW_OBJECT = "START", "STOP", "NEW-OBJECT"
+BITS = tuple(f"CLASS-{i}" for i in range(8))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimWorld(World):
+    """The rig: its own lines and its own skin, and a robot that knows what it did."""
+
+    gpio: gpio.SimGpio
+    backend: usb.RigBackend
+    robot: rig.Robot
+
+    def wire(self, settings: Config) -> Config:
+        """The configuration with the rig's lines and skin."""
+        ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": ""}
+        sensor = replace(settings.sensor, **ids, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
+        trigger = replace(
+            settings.trigger, mode="two-lines", start=START, stop=STOP, new_object=NEW_OBJECT, active_low=False
+        )
+        output = replace(
+            settings.output, ready=READY, busy=BUSY, result_valid=RESULT_VALID, fault=FAULT, class_bits=BITS
+        )
+        return replace(settings, sensor=sensor, trigger=trigger, output=output)
+
+    def finished(self, answered: int) -> bool:
+        """True when the script has ended and everything in it was answered."""
+        return self.robot.finished and answered >= len(self.robot.played)
+
+
+def named(name: str, fmt: SweepFormat, *, seed: int, sweeps: int | None, virtual: bool) -> SimWorld:
+    """The world that `--sim` names. Raises ConfigError for another name, FormatError where the bundle wants another skin."""
+    clock = rig.VirtualClock() if virtual else SystemClock()
+    if name == "skin":
+        if fmt != skin.FORMAT:
+            raise FormatError(f"the simulated skin sends {skin.FORMAT}, the bundle wants {fmt}; use --sim replay:FILE")
+        return build(fmt, islice(script.tubes(seed), sweeps), clock, "sim")
+    if name.startswith(SETS):
+        return build(fmt, islice(script.replay(Path(name.removeprefix(SETS)), fmt), sweeps), clock, "replay")
+    raise ConfigError(f"--sim {name} is unknown; use skin, or replay:FILE with a sweep set")
+
+
+def build(fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False) -> SimWorld:
+    """A world that plays `acts`: the same drivers above, nothing real below."""
+    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, READY, BUSY, RESULT_VALID, FAULT, *BITS]})
+    robot = rig.Robot(iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT)
+    board = rig.Board(fmt, robot, clock)
+    backend = usb.RigBackend(board, clock, acm=acm)
+    return SimWorld(clock=clock, gpio=lines, backend=backend, source=source, robot=robot)

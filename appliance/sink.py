@@ -1,0 +1,237 @@
+"""Verdict -> sentence on the serial line, code on GPIO lines. Commands come back in over the serial line.
+
+Sentences are formed and read by pure functions (PROTOCOL.md, part 2); the port is never waited for: a peer that does
+not read costs dropped and counted sentences, and not one frame.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import xor
+from typing import Any, Protocol
+
+import serial
+
+from .clock import Clock
+from .config import SerialConfig
+from .errors import ConfigError
+from .sweep import Status, Verdict
+from .trigger import Lines
+
+TALKER = "PPLP"
+COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT")
+MAX_LINE = 128
+RETRY_NS = 1_000_000_000
+"""How often a port that is gone is tried again."""
+_UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
+
+
+class ResultSink(Protocol):
+    """Whatever takes verdicts."""
+
+    def send(self, verdict: Verdict) -> None:
+        """Pass a verdict on without waiting."""
+        ...
+
+
+class Port(ResultSink, Protocol):
+    """A line to the robot controller: verdicts and other sentences out, commands in."""
+
+    dropped: int
+    trouble: str
+
+    def say(self, line: bytes) -> None:
+        """Send a sentence without waiting."""
+        ...
+
+    def commands(self) -> list[Command]:
+        """Commands that have come in since the last call."""
+        ...
+
+    def close(self) -> None:
+        """Let the line go."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A line from the robot controller: one of COMMANDS, or `error` saying why it is none."""
+
+    name: str
+    error: str = ""
+
+
+def checksum(body: str) -> str:
+    """NMEA 0183: exclusive or of the characters between $ and *, two hex digits."""
+    return f"{reduce(xor, body.encode('ascii'), 0):02X}"
+
+
+def sentence(kind: str, *fields: object) -> bytes:
+    """`$PPLP,KIND,field,…*hh` with CR and LF. Characters that NMEA reserves become spaces; too long a last field is cut."""
+    body = ",".join([TALKER, kind, *(_UNSAFE.sub(" ", str(f)) for f in fields)])[: MAX_LINE - 6]
+    return f"${body}*{checksum(body)}\r\n".encode("ascii")
+
+
+def result(v: Verdict, source: str) -> bytes:
+    """The RES sentence of a verdict; `source` says where the frames came from (usb, sim, replay)."""
+    return sentence(
+        "RES", v.sweep, f"{v.time_ns / 1e9:.3f}", v.status, v.label, f"{v.probability:.3f}", f"{v.margin:.3f}",
+        v.fused, v.lost, f"{v.latency_ns / 1e6:.2f}", v.bundle, source, v.detail,
+    )  # fmt: skip
+
+
+def parse(data: bytes) -> tuple[list[Command], bytes]:
+    """Commands in `data` and the unfinished rest. A checksum may be left out by a person, but not be wrong."""
+    *lines, rest = re.split(rb"[\r\n]+", data)
+    commands = [_command(line) for line in lines if line]
+    if len(rest) > MAX_LINE:
+        return [*commands, Command("", f"line of over {MAX_LINE} characters without an end")], b""
+    return commands, rest
+
+
+def _command(line: bytes) -> Command:
+    match = re.fullmatch(r"\$?PPLP,([^*,]*)(?:\*([0-9A-Fa-f]{2}))?", line.decode("ascii", "replace").strip())
+    if not match:
+        return Command("", f"not a command; send for example $PPLP,ID*{checksum('PPLP,ID')}")
+    name, given = match.groups()
+    if given and given.upper() != checksum(f"{TALKER},{name}"):
+        return Command(name, f"checksum {given} should be {checksum(f'{TALKER},{name}')}")
+    if name not in COMMANDS:
+        return Command(name, f"unknown command; known are {' '.join(COMMANDS)}")
+    return Command(name)
+
+
+class StdoutPort:
+    """Sentences on standard output, where no serial port is configured; nobody can command there."""
+
+    def __init__(self, source: str) -> None:
+        self.dropped, self.trouble, self._source = 0, "", source
+
+    def send(self, verdict: Verdict) -> None:
+        """Print a verdict's sentence."""
+        self.say(result(verdict, self._source))
+
+    def say(self, line: bytes) -> None:
+        """Print a sentence."""
+        sys.stdout.buffer.write(line)
+        sys.stdout.buffer.flush()
+
+    def commands(self) -> list[Command]:
+        """None: standard output is one-way."""
+        return []
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class SerialSink:
+    """Sentences out of and commands into a serial port that may come and go.
+
+    opener: makes a `serial.Serial`; passed in so that a test can refuse. dropped: sentences that nobody took.
+    """
+
+    def __init__(
+        self, config: SerialConfig, clock: Clock, source: str, opener: Callable[..., Any] = serial.Serial
+    ) -> None:
+        self.dropped = 0
+        self.trouble = ""
+        self._config, self._clock, self._source, self._opener = config, clock, source, opener
+        self._port: Any = None
+        self._retry_ns = clock.now_ns()
+        self._queue: deque[bytes] = deque()
+        self._begun = 0  # bytes of the first sentence in the queue that are out already
+        self._rest = b""
+
+    def send(self, verdict: Verdict) -> None:
+        """Queue a verdict's sentence and hand over what the port takes."""
+        self.say(result(verdict, self._source))
+
+    def say(self, line: bytes) -> None:
+        """Queue a sentence; with a full queue the oldest that has not begun is dropped and counted."""
+        if len(self._queue) >= self._config.queue:
+            del self._queue[1 if self._begun else 0]
+            self.dropped += 1
+        self._queue.append(line)
+        self._flush()
+
+    def commands(self) -> list[Command]:
+        """Hand over what waits, and the commands that have come in since the last call."""
+        self._flush()
+        if not self._port:
+            return []
+        try:
+            self._rest += os.read(self._port.fileno(), 4096)
+        except BlockingIOError:
+            return []
+        except OSError as e:
+            self._lose(e)
+            return []
+        found, self._rest = parse(self._rest)
+        return found
+
+    def close(self) -> None:
+        """Close the port; what it has not taken is dropped."""
+        if self._port:
+            port, self._port = self._port, None
+            with contextlib.suppress(OSError):  # a port that is gone cannot be closed properly
+                port.close()
+
+    def _flush(self) -> None:
+        if not self._port and not self._open():
+            return
+        while self._queue:
+            try:
+                # not Serial.write: with write_timeout=0 pyserial 3.5 spins for as long as the peer does not read
+                self._begun += os.write(self._port.fileno(), self._queue[0][self._begun :])
+            except BlockingIOError:
+                return
+            except OSError as e:
+                self._lose(e)
+                return
+            if self._begun == len(self._queue[0]):
+                self._queue.popleft()
+                self._begun = 0
+
+    def _open(self) -> bool:
+        now = self._clock.now_ns()
+        if now < self._retry_ns:
+            return False
+        self._retry_ns = now + RETRY_NS
+        try:
+            self._port = self._opener(self._config.port, self._config.baud, timeout=0, write_timeout=0, exclusive=True)
+        except (OSError, ValueError) as e:  # SerialException is an OSError
+            self.trouble = f"serial port {self._config.port} cannot be opened: {e}; check serial.port and group dialout"
+            return False
+        self.trouble = ""
+        self._rest = b""
+        return True
+
+    def _lose(self, e: OSError) -> None:
+        self.trouble = f"serial port {self._config.port} failed: {e}; it is opened again when it is back"
+        self.close()
+        self._begun = 0
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
+
+
+class LineSink:
+    """The verdict as a code on GPIO: 0 where there is no sure label, else 1 + its place in the manifest."""
+
+    def __init__(self, lines: Lines, labels: Sequence[str]) -> None:
+        if lines.capacity <= len(labels):
+            raise ConfigError(
+                f"{len(labels)} labels and the code 0 do not fit output.class_bits, which tell {lines.capacity} apart; "
+                "wire more lines, or none"
+            )
+        self._lines = lines
+        self._code = {label: i + 1 for i, label in enumerate(labels)}
+
+    def send(self, verdict: Verdict) -> None:
+        """Show the code and raise RESULT VALID."""
+        self._lines.result(self._code[verdict.label] if verdict.status is Status.OK else 0)

@@ -1,0 +1,206 @@
+"""The room of sweep sets. In: a file of the user's, or the name of a simulated set. Out: a checked SweepSet.
+
+A set knows which sweeps belong together (`groups`), can be narrowed to some of them and split so that no recording is
+on both sides. A broken file is refused by name: no later room looks at shapes again.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.errors import FormatError
+from appliance.sim import skin
+from appliance.sweep import DIGITS, SweepFormat
+
+Array = NDArray[Any]
+SIMULATED = re.compile(r"sim:(?P<name>[^:]+)(:(?P<seed>\d+))?(:(?P<each>[1-9]\d*))?")
+CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)\s*(-?\d+)\s*")
+COMPARE: dict[str, Callable[[Array, int], Array]] = {"=": np.equal, "<=": np.less_equal, ">=": np.greater_equal}
+
+
+@dataclass(frozen=True)
+class SweepSet:
+    """N sweeps of at least two materials, with what is known of them.
+
+    samples: digits [N, T, R, C] of one of DIGITS. labels: int [N], index into `materials`.
+    groups: int [N] each; sweeps with the same number of `recording` are pieces of one recording.
+    Raises FormatError naming `source` and what is wrong.
+    """
+
+    samples: Array
+    labels: Array
+    materials: tuple[str, ...]
+    rate_hz: float
+    groups: dict[str, Array] = field(default_factory=dict)
+    source: str = "sweep set"
+
+    def __post_init__(self) -> None:
+        x, n = self.samples, len(self.materials)
+        if x.ndim != 4 or 0 in x.shape:
+            raise self._error(
+                f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], none empty"
+            )
+        if x.dtype.name not in DIGITS:
+            raise self._error(f"samples are {x.dtype}; use one of {', '.join(DIGITS)}")
+        if x.dtype.kind == "f" and not np.isfinite(x).all():
+            at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
+            raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
+        for name, values in {"labels": self.labels, **{f"group_{k}": v for k, v in self.groups.items()}}.items():
+            if values.shape != (len(x),) or values.dtype.kind not in "iu":
+                what = f"{values.dtype} {list(values.shape)}"
+                raise self._error(f"{name} holds {what}; give one whole number for each of {len(x)} sweeps")
+        outside = np.flatnonzero((self.labels < 0) | (self.labels >= n))
+        if len(outside):
+            i = outside[0]
+            raise self._error(
+                f"label {self.labels[i]} of sweep {i} is out of range; there are {n} materials, from 0 on"
+            )
+        if len(set(self.materials)) < n:
+            raise self._error(f"materials {list(self.materials)} name one twice; give each its own name")
+        if len(present := np.unique(self.labels)) < 2:
+            raise self._error(f"only one class, {self.materials[present[0]]!r}; a classifier needs two")
+        if not 0 < self.rate_hz < np.inf:
+            raise self._error(f"rate_hz is {self.rate_hz}; give frames per second")
+
+    def _error(self, why: str) -> FormatError:
+        return FormatError(f"{self.source}: {why}")
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def format(self) -> SweepFormat:
+        """The form of each sweep."""
+        _, window, rows, cols = self.samples.shape
+        return SweepFormat(rows, cols, self.rate_hz, window, self.samples.dtype.name)
+
+    def group(self, name: str) -> Array:
+        """Group `name`, int [N]; where nothing is known of recordings each sweep is one. Raises FormatError."""
+        if name in self.groups:
+            return self.groups[name]
+        if name == "recording":
+            return np.arange(len(self))
+        raise self._error(f"no group {name!r}; it has {', '.join(sorted(self.groups)) or 'none'}")
+
+    def take(self, index: Array) -> SweepSet:
+        """The sweeps `index` (mask or numbers) with all materials, so that labels keep their meaning."""
+        groups = {k: v[index] for k, v in self.groups.items()}
+        return replace(self, samples=self.samples[index], labels=self.labels[index], groups=groups)
+
+    def select(self, conditions: Sequence[str]) -> SweepSet:
+        """The sweeps for which all conditions hold ("direction=0", "force<=180"), without materials left over.
+
+        Raises FormatError where a condition cannot be read, its group is unknown, or less than two classes remain.
+        """
+        keep = np.ones(len(self), bool)
+        for text in conditions:
+            if not (found := CONDITION.fullmatch(text)):
+                raise self._error(f"condition {text!r} cannot be read; write a group, one of = <= >=, a whole number")
+            name, how, value = found.groups()
+            keep &= COMPARE[how](self.group(name), int(value))
+        if not keep.any():
+            raise self._error(f"no sweep fulfils {' and '.join(conditions)}; it has {', '.join(sorted(self.groups))}")
+        part = self.take(keep)
+        present, labels = np.unique(part.labels, return_inverse=True)
+        return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))
+
+    def split(self, by: str, share: float, seed: int) -> tuple[SweepSet, SweepSet]:
+        """Two parts, of which the first has about `share` of each material's groups `by`; no group is on both sides.
+
+        Raises FormatError where a recording or the lack of groups forbids it, or the first part would lack a material.
+        """
+        if not 0 < share < 1:
+            raise self._error(f"a share of {share} splits nothing; use more than 0 and less than 1")
+        rng, group = np.random.default_rng(seed), self.group(by)
+        names, member = np.unique(group, return_inverse=True)
+        counts = np.zeros((len(names), len(self.materials)), int)
+        np.add.at(counts, (member, self.labels), 1)
+        first = np.zeros(len(names), bool)
+        for label in np.unique(main := counts.argmax(axis=1)):
+            those = rng.permutation(np.flatnonzero(main == label))
+            n = round(share * len(those))
+            first[those[: min(max(n, 1), max(len(those) - 1, 1))]] = True
+        inside = first[member]
+        if set(self.group("recording")[inside]) & set(self.group("recording")[~inside]):
+            raise self._error(f"groups {by!r} cut recordings in two; split by recording instead")
+        if inside.all() or len(missing := np.setdiff1d(self.labels, self.labels[inside])):
+            lacks = "is everything" if inside.all() else f"lacks {self.materials[missing[0]]!r}"
+            raise self._error(f"split by {by!r}: the first part {lacks}; it has {len(names)} groups, use a finer one")
+        return self.take(inside), self.take(~inside)
+
+    def save(self, path: Path) -> None:
+        """Write the set as a compressed .npz, which `load` reads."""
+        groups = {f"group_{k}": v for k, v in self.groups.items()}
+        arrays = {"samples": self.samples, "labels": self.labels, "materials": np.array(self.materials)} | groups
+        with path.open("wb") as f:
+            np.savez_compressed(f, rate_hz=np.float64(self.rate_hz), **arrays)
+
+
+def load(spec: str, seed: int = 0) -> SweepSet:
+    """The set that `spec` names: a file PATH.npz, or sim:NAME[:SEED[:SWEEPS]] with SWEEPS per material and position.
+
+    seed: of a simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
+    """
+    return _simulated(spec, seed) if spec.startswith("sim:") else _file(Path(spec))
+
+
+def join(sets: Sequence[SweepSet]) -> SweepSet:
+    """One set of several with the same format and materials; groups that all have, numbered on.
+
+    Raises FormatError where they do not fit.
+    """
+    head, *others = sets
+    for s in others:
+        if (s.format, s.materials) != (head.format, head.materials):
+            raise FormatError(
+                f"{s.source} ({s.format}) and {head.source} ({head.format}) are not of one kind; use one of them"
+            )
+    groups: dict[str, Array] = {}
+    for name in set.intersection(*(set(s.groups) for s in sets)):
+        offsets = np.cumsum([0] + [int(s.groups[name].max()) + 1 for s in sets])
+        groups[name] = np.concatenate([s.groups[name] + int(o) for s, o in zip(sets, offsets, strict=False)])
+    return SweepSet(
+        np.concatenate([s.samples for s in sets]), np.concatenate([s.labels for s in sets]), head.materials, head.rate_hz,
+        groups, " + ".join(s.source for s in sets),
+    )  # fmt: skip
+
+
+def _simulated(spec: str, seed: int) -> SweepSet:
+    found = SIMULATED.fullmatch(spec)
+    known = get_args(skin.SetName)
+    if not found or found["name"] not in known:
+        raise FormatError(
+            f"set {spec!r} is unknown; use sim:NAME, sim:NAME:SEED or sim:NAME:SEED:SWEEPS with {', '.join(known)}"
+        )
+    each = int(found["each"]) if found["each"] else None
+    samples, labels, position = skin.sweep_set(found["name"], int(found["seed"] or seed), each)
+    return SweepSet(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, {"position": position}, spec)
+
+
+def _file(path: Path) -> SweepSet:
+    try:
+        with np.load(path, allow_pickle=False) as z:
+            held = {k: z[k] for k in z.files}
+    except (OSError, ValueError, EOFError, AttributeError) as e:
+        raise FormatError(
+            f"{path.name}: not a sweep set ({e}); it is an .npz of samples, labels, materials, rate_hz"
+        ) from e
+    missing = {"samples", "labels", "materials", "rate_hz"} - set(held)
+    if missing:
+        raise FormatError(
+            f"{path.name}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, materials, rate_hz"
+        )
+    if held["materials"].ndim != 1 or held["materials"].dtype.kind != "U":
+        raise FormatError(f"{path.name}: materials hold {held['materials'].dtype}; give a list of names")
+    if held["rate_hz"].size != 1 or held["rate_hz"].dtype.kind not in "iuf":
+        raise FormatError(f"{path.name}: rate_hz holds {held['rate_hz']!r}; give one number, frames per second")
+    groups = {k.removeprefix("group_"): v for k, v in held.items() if k.startswith("group_")}
+    materials = tuple(str(m) for m in held["materials"])
+    return SweepSet(held["samples"], held["labels"], materials, held["rate_hz"].item(), groups, path.name)
