@@ -24,11 +24,12 @@ from .classifier import Classifier
 from .clock import SystemClock
 from .config import Config
 from .errors import ApplianceError, ConfigError, FormatError
+from .lines import Lines
 from .recorder import Recorder
 from .sensor import Sensor, UsbSensor
 from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort, result
 from .sweep import Sweep, SweepFormat, load, save
-from .trigger import GpioTrigger, Lines
+from .trigger import GpioTrigger
 
 EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments; 3 configuration;
 4 bundle; 5 skin; 6 gpio lines; 7 serial port; 8 a file of another form; 130 interrupted"""
@@ -117,7 +118,7 @@ def _log(line: str) -> None:
     print(f"palpate: {line}", file=sys.stderr, flush=True)
 
 
-def _build(
+def build(
     settings: Config, model: bundle.Bundle, world: World, port: Port, stack: ExitStack, *,
     watch: Callable[[Sensor], Sensor] = lambda sensor: sensor, capture: CaptureWriter | None = None,
     keep: Callable[[Sweep], None] | None = None, log: Callable[[str], None] = lambda line: None,
@@ -125,9 +126,10 @@ def _build(
 ) -> Box:  # fmt: skip
     """Put the parts together; `stack` takes them apart again."""
     settings = world.wire(settings)
-    if not settings.trigger.start:
+    missing = next((k for k in ("start", "stop") if not getattr(settings.trigger, k)), None)
+    if missing == "start" or (missing and settings.trigger.mode == "two-lines"):
         raise ConfigError(
-            "trigger.start names no line, so no sweep can begin; choose a board with --board, or use --sim"
+            f"trigger.{missing} names no line, so no sweep can be cut; choose a board with --board, or use --sim"
         )
     classifier = Classifier(model, world.clock, settings.classifier.fuse)
     classifier.self_test()
@@ -165,7 +167,7 @@ def run_box(args: argparse.Namespace) -> int:
         if capture:
             stack.callback(capture.close)
         keep = _keeper(args.keep, model.format)
-        box = _build(settings, model, world, port, stack, capture=capture, keep=keep, log=_log)
+        box = build(settings, model, world, port, stack, capture=capture, keep=keep, log=_log)
 
         def done() -> bool:
             enough = args.sweeps is not None and box.answered >= args.sweeps
@@ -198,7 +200,7 @@ def run_demo(args: argparse.Namespace) -> int:
         far_end, name = stack.enter_context(terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
         show = demo.Demo(world.robot.played, far_end, world.clock, sys.stdout, raw=args.raw)
-        box = _build(settings, model, world, port, stack, watch=show.watch)
+        box = build(settings, model, world, port, stack, watch=show.watch)
         show.run(box.step, sweeps, stopped)
     return 0
 
@@ -248,7 +250,7 @@ def run_bench(args: argparse.Namespace) -> int:
 
     settings, model = _settings(args)
 
-    def build(
+    def staged(
         world: stage.SimWorld,
         stack: ExitStack,
         also: Iterable[ResultSink] = (),
@@ -256,12 +258,12 @@ def run_bench(args: argparse.Namespace) -> int:
     ) -> tuple[Box, int]:
         far_end, name = stack.enter_context(terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
-        return _build(settings, model, world, port, stack, also=also, keep=keep), far_end
+        return build(settings, model, world, port, stack, also=also, keep=keep), far_end
 
     if args.part:
-        print(json.dumps(bench.part(args.part, model.format, build, args.seed)))
+        print(json.dumps(bench.part(args.part, model.format, staged, args.seed)))
         return 0
-    figures = bench.run(model, build, args.yardsticks, args.seed, lambda line: print(line, flush=True))
+    figures = bench.run(model, staged, args.yardsticks, args.seed, lambda line: print(line, flush=True))
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
     return 0

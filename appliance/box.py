@@ -19,18 +19,10 @@ from .recorder import Recorder
 from .sensor import Sensor
 from .sink import Command, Port, ResultSink, sentence
 from .sweep import Status, Sweep, Verdict
-from .trigger import Edge
+from .trigger import Edge, Trigger
 
 TARE_S = 0.5
 """How much of the latest signal a tare averages."""
-
-
-class EdgeSource(Protocol):
-    """Trigger edges, from GPIO or from a capture."""
-
-    def edges(self, now_ns: int) -> list[Edge]:
-        """Edges that have settled by `now_ns`, in order of time."""
-        ...
 
 
 class Panel(Protocol):
@@ -70,7 +62,7 @@ class Box:
     """
 
     def __init__(
-        self, sensor: Sensor, trigger: EdgeSource, recorder: Recorder, classifier: Classifier, clock: Clock, *,
+        self, sensor: Sensor, trigger: Trigger, recorder: Recorder, classifier: Classifier, clock: Clock, *,
         sinks: Sequence[ResultSink] = (), port: Port | None = None, panel: Panel | None = None,
         state_s: float = 1.0, source: str = "usb", log: Callable[[str], None] = lambda line: None,
         edge_tap: Callable[[int, list[Edge]], None] | None = None, keep: Callable[[Sweep], None] | None = None,
@@ -103,14 +95,12 @@ class Box:
         edges = self._trigger.edges(now)
         if self._edge_tap and edges:
             self._edge_tap(now, edges)
-        streaming = self._sensor.state == "streaming"
-        self._recorder.trigger(edges, streaming, now)
-        if not streaming:
+        able = self._sensor.state == "streaming" and not self._trigger.blind
+        self._recorder.trigger(edges, able, now)
+        if self._sensor.state != "streaming":
             self._recorder.interrupt(Status.SENSOR_LOST, now)
         if self._panel:
-            self._panel.show(
-                ready=streaming and not self._recorder.sweeping, busy=self._recorder.sweeping, fault=not streaming
-            )
+            self._panel.show(ready=able and not self._recorder.sweeping, busy=self._recorder.sweeping, fault=not able)
         verdicts = self._answer(self._recorder.finished(now))
         self._report(now)
         return verdicts

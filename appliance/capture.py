@@ -102,6 +102,11 @@ class Playback:
     def sleep_until(self, t_ns: int) -> None:
         """Clock: the records alone move time."""
 
+    @property
+    def blind(self) -> bool:
+        """Trigger: a capture holds what was told, so nothing is unknown."""
+        return False
+
     def read(self) -> Frames:
         """Sensor: the next transfer's frames, or none where the next record is something else."""
         frames = Frames.empty(self.format)

@@ -13,9 +13,10 @@ from .bundle import Bundle
 from .classifier import Classifier
 from .config import Config
 from .errors import ApplianceError, PortError, SensorError
+from .lines import Lines
 from .sensor import UsbSensor
 from .sink import SerialSink
-from .trigger import GpioTrigger, Lines
+from .trigger import GpioTrigger
 
 LISTEN_S = 1.0
 """How long the skin is listened to."""

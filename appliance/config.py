@@ -73,7 +73,7 @@ class TriggerConfig:
 
 @dataclass(frozen=True, slots=True)
 class OutputConfig:
-    """The box's lines to the robot (PROTOCOL.md, part 3), named as the kernel names them; "" is not wired.
+    """The box's lines to the robot: ready, busy, result_valid, fault as in PROTOCOL.md, part 3. "" is not wired.
 
     class_bits: the answer's code, lowest bit first. settle_us: how long they stand before `result_valid` rises.
     """

@@ -153,9 +153,8 @@ def _clean(bins: float) -> float:
 def _bins(band: tuple[float, float], frames: int, rate_hz: float) -> tuple[int, int]:
     """First and last bin inside `band`, by the two rules of this room."""
     low, high = (_clean(min(edge * frames / rate_hz, frames / 2)) for edge in band)
-    top = frames // 2
-    first = min(math.ceil(low), top)
-    return first, max(first, min(math.floor(high), top))
+    first = min(math.ceil(low), frames // 2)
+    return first, max(first, math.floor(high))
 
 
 def _centroid(power: Array, weights: Array, band: tuple[float, float], frames: int, rate_hz: float) -> float:

@@ -22,8 +22,8 @@ import serial
 from .clock import Clock
 from .config import SerialConfig
 from .errors import ConfigError
+from .lines import Lines
 from .sweep import Status, Verdict
-from .trigger import Lines
 
 TALKER = "PPLP"
 COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT")

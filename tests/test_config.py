@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import configparser
 import contextlib
 import dataclasses
 import json
@@ -68,7 +67,7 @@ def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder: Path
 
 
 def test_without_a_board_and_files_no_line_is_wired(tmp_path: Path) -> None:
-    """A missing sensor.toml is no error: the defaults of the code hold, and every line is unwired."""
+    """A missing sensor.toml is no error: the code's defaults hold, and no line is wired."""
     (tmp_path / "palpate.toml").write_text("")
     c = _load(tmp_path)
     assert set(c.sources.values()) == {"code"}
@@ -96,15 +95,13 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
         ("sensor = 5", "sensor = 5", "write [sensor], its keys below"),
         ("[trigger]\nglitch_us = 0", "trigger.glitch_us = 0", "a whole number from 1 to 1000000"),
         ("[trigger]\nglitch_us = true", "trigger.glitch_us = True", "a whole number from 1"),
-        ("[trigger]\nglitch_us = 1.5", "trigger.glitch_us = 1.5", "a whole number from 1"),
         ("[trigger]\nactive_low = 1", "trigger.active_low = 1", "true or false"),
         ("[trigger]\nmode = 'both'", "trigger.mode = 'both'", 'one of "two-lines", "one-line"'),
         ("[trigger]\nbias = ['pull-up']", "trigger.bias = ['pull-up']", 'one of "pull-down", "pull-up"'),
         ("[trigger]\nstart = 17", "trigger.start = 17", "a string in quotes"),
         ("[output]\nclass_bits = 'GPIO16'", "output.class_bits = 'GPIO16'", 'names such as ["GPIO16"]'),
-        ("[output]\nclass_bits = ['GPIO16', '']", "output.class_bits", 'names such as ["GPIO16"]'),
+        ("[output]\nclass_bits = ['A', '']", "output.class_bits = ['A', '']", 'names such as ["GPIO16"]'),
         ("[sweep]\nlongest_s = nan", "sweep.longest_s = nan", "a number from 0.1 to 3600.0"),
-        ("[sweep]\nlongest_s = -1", "sweep.longest_s = -1", "a number from 0.1 to 3600.0"),
         ("[sensor]\nread_bytes = 1000", "sensor.read_bytes = 1000", "a multiple of 512 from 512 to 1048576"),
         ("[sensor]\nproduct_id = 0x10000", "sensor.product_id = 65536", "a whole number from 1 to 65535"),
         ("[sensor\nserial = 1", "not TOML", "line 1"),
@@ -131,15 +128,12 @@ def test_a_wrong_file_names_itself_the_key_and_what_is_allowed(
         ("serial.baud=fast", "--set: serial.baud = 'fast'", "a whole number from 1200 to 4000000"),
         ("sensor.serial=1234", "--set: sensor.serial = 1234", "a string in quotes"),
         ("glitch_us=3", "--set glitch_us=3", "use --set section.key=value"),
-        ("trigger.glitch_us", "--set trigger.glitch_us", "use --set section.key=value"),
     ],
 )
 def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint: str) -> None:
     """--set goes through the same checks as a file."""
-    with pytest.raises(ConfigError) as e:
+    with pytest.raises(ConfigError, match=f"^{re.escape(name)}.*{re.escape(hint)}"):
         _load(folder, None, option)
-    assert name in str(e.value)
-    assert hint in str(e.value)
 
 
 @pytest.mark.parametrize(
@@ -148,9 +142,7 @@ def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint:
         ("trigger.start=GPIO5", "trigger", "start", "GPIO5"),
         ("trigger.start=", "trigger", "start", ""),
         ('sensor.serial="1234"', "sensor", "serial", "1234"),
-        ("sensor.product_id=0x7ac8", "sensor", "product_id", 0x7AC8),
         ("sweep.longest_s=3", "sweep", "longest_s", 3.0),
-        ("trigger.active_low=true", "trigger", "active_low", True),
         ('output.class_bits=["A", "B"]', "output", "class_bits", ("A", "B")),
         ("serial.port=/dev/ttyS0 # not a comment", "serial", "port", "/dev/ttyS0 # not a comment"),
         ('serial.port="a"\nx=1', "serial", "port", '"a"\nx=1'),
@@ -176,7 +168,7 @@ def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> N
 def test_only_the_site_file_may_choose_the_board(folder: Path) -> None:
     """`board` in sensor.toml would be read too late."""
     (folder / "sensor.toml").write_text('board = "a"\n')
-    with pytest.raises(ConfigError, match=r"sensor\.toml: board is unknown"):
+    with pytest.raises(ConfigError, match=r"sensor\.toml: board is unknown; known are sensor"):
         _load(folder)
 
 
@@ -213,23 +205,21 @@ def test_any_set_text_is_a_value_or_a_config_error(text: str, name: str) -> None
 
 def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path) -> None:
     """The printed text is a palpate.toml with the same settings."""
-    sets = ["output.class_bits=['A', 'B']", "sensor.serial=Ü \\", "sweep.longest_s=3", "trigger.active_low=true"]
+    sets = ["output.class_bits=['A', 'B']", "sensor.serial=Ü𝄞 \\", "sweep.longest_s=3", "trigger.active_low=true"]
     c = _load(folder, "a", *sets)
     lines = config.describe(c).splitlines()
     assert len(lines) == len(c.sources)
-    assert re.fullmatch(r'board = "a" +# --board', lines[0])
-    assert re.fullmatch(r"sensor\.vendor_id = 0x1209 +# code", lines[1])
-    assert any(re.fullmatch(r'trigger\.start = "L1" +# board-a\.toml', line) for line in lines)
+    shown = {" ".join(line.split()) for line in lines}
+    assert shown > {'board = "a" # --board', "sensor.vendor_id = 0x1209 # code", 'trigger.start = "L1" # board-a.toml'}
     (folder / "palpate.toml").write_text("\n".join(lines))
     assert _load(folder) == c
 
 
 @pytest.mark.parametrize("section", [n for n in config.Config.__slots__ if n not in ("board", "sources")])
 def test_each_field_is_explained(section: str) -> None:
-    """Every field's name stands in the docstring of its group, but for the obvious line names of OutputConfig."""
+    """Every field's name stands in the docstring of its group."""
     group = type(getattr(_shipped(), section))
-    missing = [f.name for f in dataclasses.fields(group) if f.name not in group.__doc__]
-    assert missing == (["ready", "busy", "fault"] if section == "output" else [])
+    assert [f.name for f in dataclasses.fields(group) if not re.search(rf"\b{f.name}\b", group.__doc__)] == []
 
 
 def test_sensor_toml_shows_every_sensor_setting_as_the_code_has_it() -> None:
@@ -248,26 +238,29 @@ HEADER = {
 }  # fmt: skip
 
 
+def _page(board: str) -> str:
+    return (FIRMWARE / f"board-{board}.toml").read_text()
+
+
 def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
     """What the comment of a board file draws: {pin: name}, {role: name}, a role with its arrow as seen from the box."""
     rows = re.findall(
         r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w ]+))?$",
-        (FIRMWARE / f"board-{board}.toml").read_text(),
+        _page(board),
         re.MULTILINE,
     )
     pins, roles = {}, {}
     for left_role, left_way, left, odd, even, right, right_way, right_role in rows:
         pins |= {int(odd): left, int(even): right}
-        if left_role:
-            roles[f"{'in' if left_way == '>' else 'out'} {left_role}"] = left
-        if right_role:
-            roles[f"{'out' if right_way == '>' else 'in'} {right_role}"] = right
+        for role, way, inward, line in ((left_role, left_way, ">", left), (right_role, right_way, "<", right)):
+            if role:
+                roles[f"{'in' if way == inward else 'out'} {role}"] = line
     return pins, roles
 
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str) -> None:
-    """Each pin is drawn where the 40-pin header has it, and each role at the line that the file's values give it."""
+    """Each pin is where the 40-pin header has it, in the drawing and beside the values; each role is at its line."""
     c = _shipped(board)
     pins, roles = _drawing(board)
     assert pins == HEADER
@@ -275,34 +268,22 @@ def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str)
     wired |= {f"out {name}": getattr(c.output, name) for name in ("ready", "busy", "result_valid", "fault")}
     wired |= {f"out class_bits {i}": name for i, name in enumerate(c.output.class_bits)}
     assert roles == wired | {"out serial TXD": "GPIO14", "in serial RXD": "GPIO15"}
-
-
-@pytest.mark.parametrize("board", BOARDS)
-def test_the_pins_beside_the_values_are_those_of_the_header(board: str) -> None:
-    """`start = "GPIO17"  # pin 11` and its like."""
-    text = (FIRMWARE / f"board-{board}.toml").read_text()
-    told = [
-        (name, int(pin))
-        for names, pins in re.findall(r"^\w+ = (.*GPIO.*?)\s+# pins? ([\d, ]+)", text, re.MULTILINE)
-        for name, pin in zip(re.findall(r"GPIO\d+", names), re.findall(r"\d+", pins), strict=True)
-    ]
-    assert len(told) == 11
-    assert all(HEADER[pin] == name for name, pin in told)
+    beside = re.findall(r"^\w+ = (.*GPIO.*)# pins? ([\d, ]+)", _page(board), re.MULTILINE)
+    names, numbers = (re.findall(r"\w+", " ".join(column)) for column in zip(*beside, strict=True))
+    assert names == [HEADER[int(pin)] for pin in numbers] == list(wired.values())
 
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_dead_program_is_not_ready(board: str) -> None:
     """READY rests on a line that is low from power-on, and the page asks for strict_gpiod and the pull-down."""
-    text = (FIRMWARE / f"board-{board}.toml").read_text()
     assert int(_shipped(board).output.ready.removeprefix("GPIO")) >= 9
     for words in ("\n#     dtparam=strict_gpiod\n", "10 kohm pull-down on READY", "6117", "6150"):
-        assert words in text
+        assert words in _page(board)
 
 
 def test_one_cable_fits_both_boards() -> None:
     """The Raspberry Pi 4 and 5 files agree on every value."""
-    assert BOARDS == ["rpi4", "rpi5"]
-    four, five = map(_shipped, BOARDS)
+    four, five = map(_shipped, ("rpi4", "rpi5"))
     assert dataclasses.replace(four, board="rpi5") == five
 
 
@@ -311,10 +292,7 @@ def test_rules_and_unit_agree_with_the_settings() -> None:
     sensor = config.SensorConfig()
     rules = (FIRMWARE / "70-palpate.rules").read_text()
     assert rules.count(f'=="{sensor.vendor_id:04x}"') == rules.count(f'=="{sensor.product_id:04x}"') == 2
-    unit = configparser.RawConfigParser(strict=False, delimiters="=", comment_prefixes="#")
-    unit.optionxform = str  # type: ignore[assignment,method-assign]
-    unit.read(REPOSITORY / "systemd" / "palpate.service")
-    groups = set(unit["Service"]["SupplementaryGroups"].split())
-    made = re.findall(r"^g (\w+)", (REPOSITORY / "systemd" / "palpate.sysusers").read_text(), re.MULTILINE)
-    assert groups == set(made)
+    unit, users = ((REPOSITORY / "systemd" / f"palpate.{kind}").read_text() for kind in ("service", "sysusers"))
+    groups = set(re.findall(r"^SupplementaryGroups=(.*)$", unit, re.MULTILINE)[0].split())
+    assert groups == set(re.findall(r"^g (\w+)", users, re.MULTILINE))
     assert set(re.findall(r'GROUP="(\w+)"', rules)) <= groups

@@ -177,6 +177,13 @@ def test_a_silent_or_saturated_skin_has_plain_answers(level: int) -> None:
     assert not features.h_features(x, RATE).any()
 
 
+def test_a_band_without_a_bin_keeps_the_one_above_its_lower_edge() -> None:
+    """Ten frames at 750 Hz have bins 75 Hz apart, none of them from 2 to 20 Hz; at 30 Hz none lies above 15 Hz."""
+    x = _sweep(10)
+    assert features.l_features(x, RATE)[2] == pytest.approx(75)
+    assert features.l_features(x, 30.0)[1] == pytest.approx(15)
+
+
 def test_one_frame_gives_l_features_but_no_h_features() -> None:
     """L-features of a single frame are finite; H-features name the least number of frames."""
     x = np.full((1, 4, 4), 9, np.uint8)

@@ -12,12 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance import trigger as room
+from appliance import lines as room
 from appliance.config import OutputConfig, TriggerConfig
 from appliance.errors import LineError
+from appliance.lines import Lines, check_binding, find_lines
 from appliance.sim.gpio import SimGpio, SimRequest
 from appliance.sim.rig import VirtualClock
-from appliance.trigger import EdgeKind, GpioTrigger, Lines, check_binding, find_lines
+from appliance.trigger import EdgeKind, GpioTrigger
 
 US, MS = 1_000, 1_000_000
 GLITCH = 500 * US
@@ -119,6 +120,7 @@ def test_both_edges_undebounced() -> None:
     world = World()
     (request,) = world.gpio.requests
     settings = request.settings[1]
+    assert settings.direction is gpiod.line.Direction.INPUT
     assert settings.edge_detection is gpiod.line.Edge.BOTH
     assert settings.event_clock is gpiod.line.Clock.MONOTONIC
     assert not settings.debounce_period
@@ -218,6 +220,20 @@ def test_interrupts_overtake() -> None:
     assert world.trigger.lost_events == 0
 
 
+def test_waiting_for_the_overtaken() -> None:
+    """While an event is missing that might only be late, edges of other chips that could be younger wait for it."""
+    world = World({CHIP0: ("START", "NEW"), CHIP1: ("STOP",)}, new_object="NEW")
+    world.drive("START", MS)
+    world.drive("STOP", MS + 2 * US, MS + 602 * US)
+    world.drive("NEW", MS + 105 * US)
+    world.clock.sleep_until(world.t0 + MS + 105 * US)
+    world.gpio.now_ns()
+    late = world.gpio.requests[0].queue.popleft()
+    assert world.poll(MS + 603 * US) == []
+    world.gpio.requests[0].queue.append(late)
+    assert world.poll(2 * MS) == [(START, MS), (STOP, MS + 2 * US), (NEW_OBJECT, MS + 105 * US)]
+
+
 def test_far_too_late() -> None:
     """An event that turns up after it was taken for lost changes nothing any more."""
     world = World()
@@ -267,6 +283,16 @@ def test_blind_until_quiet() -> None:
     assert world.poll(30 * MS) == [(STOP, 20 * MS)]
 
 
+def test_loss_upon_loss() -> None:
+    """A loss is told at once where it must be one, and losses that follow before it is quiet are only counted."""
+    world = World(queue=32)
+    world.drive("START", *(10 * MS + i * US for i in range(100)))
+    assert world.poll(10 * MS + 49 * US) == [(LOST, 10 * MS + 18 * US)]
+    assert world.trigger.lost_events == 50 - 32
+    assert world.run(20 * MS) == []
+    assert world.trigger.lost_events == 100 - 32 - 32
+
+
 def test_loss_ends_what_is_open() -> None:
     """A loss drops bursts that are still open; an edge that only waited for them had settled, and comes before it."""
     world = World({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
@@ -281,7 +307,7 @@ def test_nothing_between_loss_and_quiet() -> None:
     """An edge of another chip that came after the loss is not told: its STOP might be among what is lost."""
     world = World({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
     world.drive("STOP", *(t * MS for t in range(10, 15)))
-    world.drive("START", 15 * MS)
+    world.drive("START", 15 * MS, 17 * MS)
     assert world.poll(20 * MS) == [(LOST, 11 * MS)]
     assert world.run(30 * MS) == []
 
@@ -308,7 +334,7 @@ def test_storm_between_two_calls() -> None:
     """Of 10,000 edges between two calls the kernel keeps the last 1024: one LOST, and all the others counted."""
     world = World()
     world.drive("START", *(10 * MS + i * US for i in range(10_000)))
-    assert world.poll(20 * MS) == [(LOST, 10 * MS + 8976 * US)]  # at once
+    assert world.poll(50 * MS) == [(LOST, 10 * MS + 8976 * US)]
     assert world.trigger.lost_events == 8976
     world.drive("START", 60 * MS)
     assert world.run(70 * MS) == [(START, 60 * MS)]
@@ -333,6 +359,22 @@ def test_unread_rest_of_a_burst() -> None:
     assert [edge for edges in told for edge in edges] == [(START, 10 * MS), (STOP, 11 * MS)]
     assert told[0] == told[1] == []
     assert world.trigger.glitches == 0
+
+
+def test_unread_edges_of_another_chip() -> None:
+    """While one chip's queue is being worked off, edges come out as they become certain, and later ones wait."""
+    world = World({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2)  # one event of each chip a call
+    world.drive("START", 10 * MS, 20 * MS)
+    world.drive("STOP", *(t * MS for t in (1, 2, 3, 4)))
+    told = [world.poll((50 + i) * MS) for i in range(6)]
+    assert told == [[], [(STOP, 1 * MS)], [], [(STOP, 3 * MS)], [(START, 10 * MS)], []]
+
+
+def test_three_chips() -> None:
+    """Each chip is read in each call, however few edges make a storm."""
+    world = World({CHIP0: ("START",), CHIP1: ("STOP",), "/dev/gpiochip2": ("NEW",)}, new_object="NEW", storm_edges=2)
+    world.drive("START", MS)
+    assert world.run(5 * MS) == [(START, MS)]
 
 
 def test_chip_pulled_out() -> None:
@@ -634,6 +676,7 @@ def test_close_of_a_dead_chip(panel: tuple[SimGpio, VirtualClock, Lines]) -> Non
     with pytest.raises(LineError, match=r"cannot write gpio lines READY: .*errno 19"):
         lines.close()
     assert gpio.requests == []
+    lines.close()
 
 
 # ---------------------------------------------------------------- the double itself
@@ -649,3 +692,27 @@ def test_double_releases_low(panel: tuple[SimGpio, VirtualClock, Lines]) -> None
     assert gpio.written == [(0, "READY", True), (MS, "READY", False)]
     with pytest.raises(gpiod.RequestReleasedError):
         lines.show(ready=False, busy=False, fault=False)
+
+
+@pytest.mark.parametrize(("asked", "granted"), [(0, 32), (5, 8), (64, 64), (5000, 1024)])
+def test_double_queues_as_the_kernel(asked: int, granted: int) -> None:
+    """16 events a line unless asked otherwise, rounded up to a power of two, at most 1024; the oldest is dropped."""
+    clock = VirtualClock(0)
+    gpio = SimGpio(clock, {CHIP0: INPUTS})
+    request = gpio.request_lines(CHIP0, {(1, 2): gpiod.LineSettings(edge_detection=gpiod.line.Edge.RISING)}, "", asked)
+    for t_ns in range(2 * granted + 2):
+        gpio.drive("START", t_ns % 2 == 0, t_ns)
+    clock.sleep_until(MS)
+    events = request.read_edge_events(5000)
+    assert [(e.timestamp_ns, e.global_seqno, e.line_seqno) for e in events] == [
+        (2 * i, i + 1, i + 1) for i in range(1, granted + 1)
+    ]
+
+
+def test_double_never_waits() -> None:
+    """Reading from an empty queue, where gpiod would wait for ever, and driving an unknown line are mistakes."""
+    gpio = SimGpio(VirtualClock(), {CHIP0: INPUTS})
+    with pytest.raises(RuntimeError, match="empty queue"):
+        gpio.request_lines(CHIP0, {(1,): gpiod.LineSettings()}).read_edge_events(1)
+    with pytest.raises(ValueError, match="no simulated gpio line is named 'START1'"):
+        gpio.drive("START1", True, 0)

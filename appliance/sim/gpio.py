@@ -19,9 +19,8 @@ from gpiod.line import Bias, Direction, Edge, Value
 
 from ..clock import Clock
 
-RISE, FALL = gpiod.EdgeEvent.Type.RISING_EDGE, gpiod.EdgeEvent.Type.FALLING_EDGE
-MAX_QUEUE = 1024
-"""The kernel grants no larger queue: 16 events for each of at most 64 lines."""
+Kind = gpiod.EdgeEvent.Type
+Config = Mapping[Iterable[int], gpiod.LineSettings]  # offsets of a chip -> how to request them
 
 
 class SimGpio:
@@ -40,11 +39,9 @@ class SimGpio:
         self.written: list[tuple[int, str, bool]] = []
         self.requests: list[SimRequest] = []
         self.refuse: dict[str, int] = {}
-        self._clock = clock
-        self._chips = chips
+        self._clock, self._chips = clock, chips
         self._driven: dict[str, bool] = {}
-        self._plan: list[tuple[int, int, str, bool]] = []
-        self._order = count()
+        self._plan, self._order = list[tuple[int, int, str, bool]](), count()
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
         """Set the input line `name` to `level` at `t_ns`; seen from then on, by whoever looks, with that time stamp."""
@@ -61,17 +58,10 @@ class SimGpio:
         self.check(path)
         names = self._chips[path]
         info = gpiod.ChipInfo(os.path.basename(path), "palpate-sim", len(names))
-        return nullcontext(
-            SimpleNamespace(get_info=lambda: info, get_line_info=lambda offset: SimpleNamespace(name=names[offset]))
-        )
+        lines = [SimpleNamespace(name=name) for name in names]
+        return nullcontext(SimpleNamespace(get_info=lambda: info, get_line_info=lines.__getitem__))
 
-    def request_lines(
-        self,
-        path: str,
-        config: Mapping[Iterable[int], gpiod.LineSettings],
-        consumer: str = "",
-        event_buffer_size: int = 0,
-    ) -> SimRequest:
+    def request_lines(self, path: str, config: Config, consumer: str = "", event_buffer_size: int = 0) -> SimRequest:
         """As gpiod's; lines are given by their offsets."""
         self.now_ns()
         self.check(path)
@@ -79,9 +69,8 @@ class SimGpio:
         names = {offset: self._chips[path][offset] for offset in settings}
         if any(request.path == path and request.names.keys() & names.keys() for request in self.requests):
             raise OSError(16, os.strerror(16))
-        size = min(event_buffer_size or 16 * len(names), MAX_QUEUE)
         levels = {o: self._driven.get(name, settings[o].bias is Bias.PULL_UP) for o, name in names.items()}
-        self.requests.append(SimRequest(self, path, names, settings, levels, 1 << (size - 1).bit_length()))
+        self.requests.append(SimRequest(self, path, names, settings, levels, event_buffer_size))
         return self.requests[-1]
 
     def now_ns(self) -> int:
@@ -108,7 +97,8 @@ class SimRequest:
         levels: dict[int, bool], size: int,
     ) -> None:  # fmt: skip
         self.path, self.names, self.settings = path, names, settings
-        self.queue: deque[gpiod.EdgeEvent] = deque(maxlen=size)
+        size = min(size or 16 * len(names), 1024)  # so much the kernel grants, and rounds it up to a power of two
+        self.queue: deque[gpiod.EdgeEvent] = deque(maxlen=1 << (size - 1).bit_length())
         self._gpio, self._levels = gpio, levels
         self._seqno, self._line_seqno = count(1), {offset: count(1) for offset in names}
 
@@ -118,8 +108,9 @@ class SimRequest:
             self._levels[offset] = level
             rise = level != self.settings[offset].active_low
             if self.settings[offset].edge_detection in (Edge.BOTH, Edge.RISING if rise else Edge.FALLING):
+                kind = Kind.RISING_EDGE if rise else Kind.FALLING_EDGE
                 numbers = next(self._seqno), next(self._line_seqno[offset])
-                self.queue.append(gpiod.EdgeEvent((RISE if rise else FALL).value, t_ns, offset, *numbers))
+                self.queue.append(gpiod.EdgeEvent(kind.value, t_ns, offset, *numbers))
 
     def wait_edge_events(self, timeout: float) -> bool:
         """As gpiod's with timeout 0: whether there is an event to read."""
@@ -128,8 +119,7 @@ class SimRequest:
 
     def read_edge_events(self, max_events: int) -> list[gpiod.EdgeEvent]:
         """As gpiod's, but says so where that would wait for ever."""
-        self._now_ns()
-        if not self.queue:
+        if not self.wait_edge_events(0):
             raise RuntimeError("reading from an empty queue blocks; ask wait_edge_events(0) before")
         return [self.queue.popleft() for _ in range(min(max_events, len(self.queue)))]
 

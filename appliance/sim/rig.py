@@ -126,7 +126,7 @@ class Board:
         self._first_seq = first_seq
         self._next = 0  # frame that is sent next
         self._arrival_ns: int | None = None  # of the packet that begins there, once drawn
-        self._frames = np.zeros((1, fmt.rows, fmt.cols), fmt.digits)
+        self._frames = np.zeros((0, fmt.rows, fmt.cols), fmt.digits)
         self._base = 0  # number of the first frame in _frames
 
     def frame_ns(self, i: int) -> int:
@@ -170,11 +170,11 @@ class Board:
         return wire.pack(self._first_seq + first, device_us, self._block(first, n), flags)
 
     def _block(self, first: int, n: int) -> NDArray[Any]:
-        """Frames `first` to `first + n` of the script; after its end the last frame is held."""
+        """Frames `first` to `first + n` of the script; after its end nothing touches the skin."""
         while first + n > self._base + len(self._frames):
             act = self._robot.next_act(self._base + len(self._frames), self.frame_ns)
-            more = self._frames[-1:].repeat(4096, axis=0) if act is None else act.frames
-            keep = max(0, min(first - self._base, len(self._frames) - 1))
+            more = np.zeros((4096, *self._frames.shape[1:]), self._frames.dtype) if act is None else act.frames
+            keep = max(0, min(first - self._base, len(self._frames)))
             self._frames = np.concatenate([self._frames[keep:], more])
             self._base += keep
-        return self._frames[max(0, first - self._base) :][:n]
+        return self._frames[first - self._base :][:n]

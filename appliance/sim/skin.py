@@ -189,8 +189,8 @@ def vibration(tube: Material, x: Array, colour: Array, moving: Flags, rng: Gener
     octave = np.log2(np.maximum(hz, 1) * 2 / FORMAT.rate_hz) + len(colour) - 1
     damping = np.hypot(1, hz / (world.damping_hz * np.exp2(world.damping_octaves_per_mm * x.mean())))
     passed = np.exp(np.interp(octave, np.arange(len(colour)), colour)) / damping
-    shake = band(n, 1, tube.vibration_hz, tube.vibration_octaves, FORMAT.rate_hz, rng, passed)[0]
-    return (tube.vibration * shake * moving)[:, None, None]
+    shake = tube.vibration * band(n, 1, tube.vibration_hz, tube.vibration_octaves, FORMAT.rate_hz, rng, passed)
+    return (shake * moving).reshape(n, 1, 1)
 
 
 def noise(n: int, rng: Generator, world: World) -> Array:

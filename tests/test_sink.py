@@ -1,0 +1,271 @@
+"""The sinks: sentences that others can read, a port that is never waited for, class bits that settle first."""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pynmea2
+import pytest
+import serial
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.config import OutputConfig, SerialConfig
+from appliance.errors import ConfigError
+from appliance.lines import Lines
+from appliance.sim import gpio, rig, terminal
+from appliance.sink import (
+    COMMANDS,
+    MAX_LINE,
+    Command,
+    LineSink,
+    SerialSink,
+    StdoutPort,
+    checksum,
+    parse,
+    result,
+    sentence,
+)
+from appliance.sweep import Status, Verdict
+
+PROTOCOL = (Path(__file__).parent.parent / "firmware_config" / "PROTOCOL.md").read_text()
+
+
+def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: str = "") -> Verdict:
+    """A verdict as the classifier makes it."""
+    return Verdict(
+        7, 5_021_384_000_000, status, label, 0.987, 0.981, np.array([0.987, 0.013]), 1, 0, 410_000, "9f3c2a1b", detail
+    )
+
+
+def test_result_is_the_documents_example():
+    """The RES sentence in PROTOCOL.md is what the code sends, with the checksum that belongs there."""
+    line = result(verdict(), "usb").decode().strip()
+    assert f"`{line[:-2]}hh`" in PROTOCOL
+
+
+def test_every_status_is_documented():
+    """PROTOCOL.md's table lists exactly the statuses that there are."""
+    table = PROTOCOL.split("| status | meaning")[1].split("\n\n")[0]
+    assert re.findall(r"^\| `([a-z-]+)` \|", table, re.M) == [str(s) for s in Status]
+
+
+def test_every_command_is_documented():
+    """PROTOCOL.md's table lists exactly the commands that there are."""
+    table = PROTOCOL.split("| command | does |")[1].split("\n\n")[0]
+    assert tuple(re.findall(r"^\| `([A-Z]+)` \|", table, re.M)) == COMMANDS
+
+
+@given(st.text(max_size=200), st.text(max_size=40), st.sampled_from(list(Status)))
+def test_pynmea2_parses_every_sentence(detail: str, label: str, status: Status):
+    """Whatever the texts are, an independent parser accepts the checksum and finds the fields in their places."""
+    line = result(verdict(label, status, detail), "sim").decode("ascii")
+    assert len(line) <= MAX_LINE
+    parsed = pynmea2.parse(line.strip(), check=True)
+    assert isinstance(parsed, pynmea2.ProprietarySentence)
+    assert parsed.manufacturer == "PLP"
+    assert parsed.data[1:3] == ["RES", "7"]
+    assert parsed.data[4] == status
+
+
+@given(st.text(alphabet=st.characters(codec="latin-1")))
+def test_checksums_agree(text: str):
+    """Ours and pynmea2's exclusive or are the same."""
+    body = sentence("ANS", text).decode("ascii")[1:-5]
+    assert int(checksum(body), 16) == pynmea2.NMEASentence.checksum(body)
+
+
+@pytest.mark.parametrize(
+    ("line", "want"),
+    [
+        (b"$PPLP,ID*" + checksum("PPLP,ID").encode(), Command("ID")),
+        (b"$PPLP,TARE", Command("TARE")),
+        (b"PPLP,NEW", Command("NEW")),
+        (b"$PPLP,ABORT*" + checksum("PPLP,ABORT").lower().encode(), Command("ABORT")),
+    ],
+)
+def test_commands_are_read(line: bytes, want: Command):
+    """With checksum or without, as a program or a person sends it."""
+    assert parse(line + b"\r\n") == ([want], b"")
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        (b"$PPLP,ID*00", "checksum 00 should be"),
+        (b"$PPLP,JUMP", "known are ID"),
+        (b"$GPGGA,1,2", "not a command"),
+        (b"hello", "send for example"),
+        (b"\xff\xfe\x00", "not a command"),
+    ],
+)
+def test_bad_commands_are_answered(line: bytes, hint: str):
+    """A wrong checksum, an unknown command, another protocol, noise: an error that says what to send."""
+    (command,), rest = parse(line + b"\n")
+    assert hint in command.error
+    assert rest == b""
+
+
+def test_a_line_without_end_is_dropped():
+    """Noise without a line end does not pile up."""
+    (command,), rest = parse(b"x" * (MAX_LINE + 1))
+    assert "without an end" in command.error
+    assert rest == b""
+
+
+@given(st.binary(max_size=300), st.lists(st.integers(0, 300), max_size=5))
+def test_parse_never_raises_and_splits_anywhere(data: bytes, cuts: list[int]):
+    """Any bytes, cut anywhere, give the same commands as at once."""
+    if len(data) > MAX_LINE:
+        data = data[:MAX_LINE]
+    edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
+    rest, got = b"", []
+    for a, b in zip(edges, edges[1:], strict=False):
+        found, rest = parse(rest + data[a:b])
+        got += found
+    assert (got, rest) == parse(data)
+
+
+def sink_on(name: str, clock=None, **settings) -> SerialSink:
+    """A sink on a port."""
+    return SerialSink(SerialConfig(port=name, **settings), clock or rig.VirtualClock(), "sim")
+
+
+def test_sentences_come_out_at_the_other_end():
+    """What is sent is read, byte by byte."""
+    with terminal.pair() as (far, name):
+        sink = sink_on(name)
+        sink.send(verdict())
+        assert os.read(far, 4096) == result(verdict(), "sim")
+        os.write(far, b"$PPLP,ID\r\n$PPLP,STA")
+        assert sink.commands() == [Command("ID")]
+        os.write(far, b"TE\r\n")
+        assert sink.commands() == [Command("STATE")]
+        sink.close()
+
+
+def test_a_peer_that_does_not_read_costs_sentences_only():
+    """The line fills up: sends return at once, the oldest sentences are dropped and counted, what comes out is whole."""
+    with terminal.pair() as (far, name):
+        sink = sink_on(name, queue=8)
+        total = 2000
+        for i in range(total):
+            sink.say(sentence("ANS", i))
+        assert sink.dropped > 0
+        heard = b""
+        for _ in range(100):
+            try:
+                heard += os.read(far, 65536)
+            except BlockingIOError:
+                break
+            sink.commands()
+        lines = heard.decode("ascii").split("\r\n")
+        assert lines.pop() == ""
+        numbers = [int(pynmea2.parse(line, check=True).data[-1]) for line in lines]
+        assert numbers == sorted(numbers)
+        assert len(numbers) + sink.dropped == total
+        assert numbers[-1] == total - 1
+        sink.close()
+
+
+def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
+    """A missing port is named with what to do, sentences wait up to the queue's length, and it is opened when it comes."""
+    clock = rig.VirtualClock()
+    sink = sink_on(str(tmp_path / "ttyUSB0"), clock)
+    sink.send(verdict())
+    assert "ttyUSB0 cannot be opened" in sink.trouble
+    assert "group dialout" in sink.trouble
+    with terminal.pair() as (far, name):
+        (tmp_path / "ttyUSB0").symlink_to(name)
+        assert sink.commands() == []
+        assert sink.trouble
+        clock.sleep_until(clock.now_ns() + 1_500_000_000)
+        sink.commands()
+        assert sink.trouble == ""
+        assert os.read(far, 4096) == result(verdict(), "sim")
+        sink.close()
+
+
+def test_a_port_that_goes_away_while_open():
+    """The other end closes (an adapter is pulled): trouble is told, nothing is raised, the next port is opened."""
+    clock = rig.VirtualClock()
+    with terminal.pair() as (_, name):
+        sink = sink_on(name, clock)
+        assert sink.commands() == []
+    sink.send(verdict())
+    sink.commands()
+    assert "failed" in sink.trouble or "cannot be opened" in sink.trouble
+    sink.close()
+
+
+def test_a_port_that_another_program_holds():
+    """A second program on the port: the error is told, not raised."""
+    with terminal.pair() as (_, name):
+        first, second = sink_on(name), sink_on(name)
+        first.commands()
+        second.commands()
+        # root may open a port that is held exclusively (TIOCEXCL), so flock has to tell
+        assert second.trouble
+        first.close()
+
+
+def test_an_opener_that_refuses():
+    """pyserial's own errors become trouble."""
+
+    def refuse(*args, **kwargs):
+        raise serial.SerialException(13, "permission denied")
+
+    sink = SerialSink(SerialConfig(port="/dev/x"), rig.VirtualClock(), "sim", refuse)
+    sink.say(b"x")
+    assert "permission denied" in sink.trouble
+
+
+def test_stdout_port_prints(capsysbinary: pytest.CaptureFixture[bytes]):
+    """Without a port the sentences are printed."""
+    port = StdoutPort("sim")
+    port.send(verdict())
+    assert capsysbinary.readouterr().out == result(verdict(), "sim")
+    assert port.commands() == []
+
+
+LABELS = ("metal", "wood", "plastic rough")
+
+
+def lines_on(bits: int) -> tuple[Lines, gpio.SimGpio]:
+    """Output lines on a simulated chip."""
+    names = tuple(f"C{i}" for i in range(bits))
+    clock = rig.VirtualClock()
+    chip = gpio.SimGpio(clock, {"/dev/gpiochip0": ["VALID", *names]})
+    return Lines(OutputConfig(result_valid="VALID", class_bits=names), chip, clock), chip
+
+
+def levels(chip: gpio.SimGpio) -> dict[str, bool]:
+    """Where the lines are now."""
+    return {name: level for _, name, level in chip.written}
+
+
+def test_class_bits_settle_before_result_valid():
+    """The code stands before RESULT VALID rises, by the configured time."""
+    lines, chip = lines_on(2)
+    LineSink(lines, LABELS).send(verdict())
+    assert levels(chip) == {"VALID": True, "C0": True, "C1": True}
+    when = {name: t for t, name, level in chip.written if level}
+    assert when["VALID"] - max(when["C0"], when["C1"]) >= 200_000
+
+
+@pytest.mark.parametrize("status", [Status.UNSURE, Status.NO_CONTACT, Status.SENSOR_LOST])
+def test_what_is_not_ok_is_code_zero(status: Status):
+    """An unsure or refused sweep raises RESULT VALID with code 0."""
+    lines, chip = lines_on(2)
+    sink = LineSink(lines, LABELS)
+    sink.send(verdict())
+    sink.send(verdict("metal" if status is Status.UNSURE else "", status))
+    assert levels(chip) == {"VALID": True, "C0": False, "C1": False}
+
+
+def test_too_few_class_bits():
+    """Labels that do not fit the bits are refused at start, with the numbers."""
+    lines, _ = lines_on(1)
+    with pytest.raises(ConfigError, match="3 labels and the code 0 do not fit"):
+        LineSink(lines, LABELS)
