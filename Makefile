@@ -37,6 +37,7 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 1
 
 wheel: $(DESKTOP) ## build the wheel of the box into dist/
+	rm -rf build/lib build/bdist.* # setuptools would put what an older build left behind into the wheel
 	$(PIP) wheel --no-deps -w dist .
 
 lock: ## lock the runtime's versions with hashes, for every platform (needs uv)

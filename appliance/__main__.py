@@ -13,8 +13,9 @@ import sys
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from . import __version__, bundle, config
 from .box import Box, World
@@ -30,6 +31,9 @@ from .sensor import Sensor, UsbSensor
 from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort, result
 from .sweep import Sweep, SweepFormat, load, save
 from .trigger import GpioTrigger
+
+if TYPE_CHECKING:
+    from .sim.stage import SimWorld
 
 EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments; 3 configuration;
 4 bundle; 5 skin; 6 gpio lines; 7 serial port; 8 a file of another form; 130 interrupted"""
@@ -88,7 +92,8 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
     bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")
     bench.add_argument("--yardsticks", type=Path, default=Path("build/yardsticks"), help="fp32.onnx, paper_int8.onnx")
-    bench.add_argument("--part", choices=("memory", "stream"), help="one part alone, as JSON")
+    bench.add_argument("--part", choices=("memory", "stream"), help="one part alone, as JSON, playing --acts")
+    bench.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
     return parser
 
 
@@ -104,14 +109,20 @@ def _bundle(settings: Config) -> bundle.Bundle:
 def _world(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> World:
     """The real devices, or the rig where `--sim` names it; `fmt` tells what the simulated skin has to send."""
     if args.sim:
-        from .sim import stage
-
-        return stage.named(args.sim, fmt(), seed=args.seed, sweeps=args.sweeps, virtual=args.virtual)
+        return _simulated(args.sim, fmt(), args)
     if args.virtual:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
     import gpiod
 
     return World(SystemClock(), gpiod)
+
+
+def _simulated(name: str, fmt: SweepFormat, args: argparse.Namespace) -> SimWorld:
+    from .sim import rig, script, stage
+
+    acts, source = script.named(name, fmt, args.seed)
+    clock = rig.VirtualClock() if args.virtual else SystemClock()
+    return stage.build(fmt, islice(acts, args.sweeps), clock, source)
 
 
 def _log(line: str) -> None:
@@ -138,9 +149,11 @@ def build(
     sensor = UsbSensor(settings.sensor, model.format, world.clock, world.backend, capture)
     stack.callback(sensor.close)
     stack.callback(port.close)
-    sinks: list[ResultSink] = [port, LineSink(lines, model.manifest.labels)] if settings.output.class_bits else [port]
+    sinks: list[ResultSink] = [port, *also]
+    if settings.output.class_bits:
+        sinks.append(LineSink(lines, model.manifest.labels))
     return Box(
-        watch(sensor), trigger, Recorder(model.format, settings.sweep), classifier, world.clock, sinks=[*sinks, *also],
+        watch(sensor), trigger, Recorder(model.format, settings.sweep), classifier, world.clock, sinks=sinks,
         port=port, panel=lines, state_s=settings.serial.state_s, source=world.source, log=log,
         edge_tap=capture.edges if capture else None, keep=keep,
     )  # fmt: skip
@@ -190,18 +203,18 @@ def _keeper(folder: Path | None, fmt: SweepFormat) -> Callable[[Sweep], None] | 
 
 def run_demo(args: argparse.Namespace) -> int:
     """`palpate demo`: a dozen sweeps through a pseudo-terminal, seen from both ends."""
-    from .sim import demo, stage, terminal
+    from .sim import demo, terminal
 
     settings, model = _settings(args)
-    sweeps = args.sweeps or 12
-    world = stage.named(args.sim or "skin", model.format, seed=args.seed, sweeps=sweeps, virtual=args.virtual)
+    args.sweeps = args.sweeps or 12
+    world = _simulated(args.sim or "skin", model.format, args)
     stopped = _stop_flag()
     with ExitStack() as stack:
         far_end, name = stack.enter_context(terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
         show = demo.Demo(world.robot.played, far_end, world.clock, sys.stdout, raw=args.raw)
         box = build(settings, model, world, port, stack, watch=show.watch)
-        show.run(box.step, sweeps, stopped)
+        show.run(box.step, args.sweeps, stopped)
     return 0
 
 
@@ -246,12 +259,12 @@ def run_config(args: argparse.Namespace) -> int:
 
 def run_bench(args: argparse.Namespace) -> int:
     """`palpate bench`: see appliance/sim/bench.py."""
-    from .sim import bench, stage, terminal
+    from .sim import parts, terminal
 
     settings, model = _settings(args)
 
     def staged(
-        world: stage.SimWorld,
+        world: SimWorld,
         stack: ExitStack,
         also: Iterable[ResultSink] = (),
         keep: Callable[[Sweep], None] | None = None,
@@ -261,8 +274,10 @@ def run_bench(args: argparse.Namespace) -> int:
         return build(settings, model, world, port, stack, also=also, keep=keep), far_end
 
     if args.part:
-        print(json.dumps(bench.part(args.part, model.format, staged, args.seed)))
+        print(json.dumps(parts.measure(args.part, model.format, staged, args.acts)))
         return 0
+    from .sim import bench
+
     figures = bench.run(model, staged, args.yardsticks, args.seed, lambda line: print(line, flush=True))
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")

@@ -7,7 +7,6 @@ float32 [1, K]; all scaling is inside it. Golden sweeps come with the logits tha
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import re
@@ -20,6 +19,11 @@ from numpy.typing import NDArray
 
 from .errors import BundleError, FormatError
 from .sweep import SweepFormat
+
+try:  # not from hashlib: that loads OpenSSL, 4 MB for a function which Python has by itself
+    from _sha2 import sha256  # type: ignore[import-not-found,unused-ignore]
+except ImportError:  # Python 3.11
+    from _sha256 import sha256  # type: ignore[import-not-found,unused-ignore]
 
 SCHEMA = 1
 DEFAULT = Path(__file__).with_name("default_bundle")
@@ -116,7 +120,7 @@ class Bundle:
 
 def file_entry(data: bytes) -> dict[str, Any]:
     """sha256 and size of one file, as the manifest holds them."""
-    return {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+    return {"sha256": sha256(data).hexdigest(), "bytes": len(data)}
 
 
 def load(folder: Path) -> Bundle:
@@ -128,7 +132,7 @@ def load(folder: Path) -> Bundle:
     manifest = Manifest.parse(text)
     model, golden = (_checked(folder, manifest, name) for name in (MODEL, GOLDEN))
     samples, logits = _golden(golden, manifest)
-    return Bundle(manifest, hashlib.sha256(text).hexdigest()[:8], model, samples, logits)
+    return Bundle(manifest, sha256(text).hexdigest()[:8], model, samples, logits)
 
 
 def _checked(folder: Path, manifest: Manifest, name: str) -> bytes:

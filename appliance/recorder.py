@@ -60,8 +60,11 @@ class Recorder:
             return
         if self._newest >= 0 and frames.seq[-1] >> EPOCH_BITS != self._newest >> EPOCH_BITS:
             self.interrupt(Status.SENSOR_LOST, now_ns)
-        frames = Frames(*(a[-self._size :] for a in (frames.t_ns, frames.seq, frames.taxels)))
-        slots = frames.seq % self._size
+        n = len(frames)
+        at = int(frames.seq[0]) % self._size
+        slots: slice | NDArray[np.int64] = slice(at, at + n)
+        if at + n > self._size or frames.seq[-1] - frames.seq[0] != n - 1:
+            slots = frames.seq % self._size
         self._seq[slots], self._t_ns[slots], self._taxels[slots] = frames.seq, frames.t_ns, frames.taxels
         self._newest = int(frames.seq[-1])
 
@@ -161,8 +164,7 @@ class Recorder:
 
     def _seq_at(self, t_ns: float) -> int:
         """Number of the frame taken nearest to `t_ns`, reckoned from the nearest frame that is there."""
-        same = self._seq >> EPOCH_BITS == self._newest >> EPOCH_BITS
-        k = int(np.argmin(np.where(same, np.abs(self._t_ns - t_ns), np.inf)))
+        k = int(np.abs(self._t_ns - round(t_ns)).argmin())
         return int(self._seq[k]) + round((t_ns - int(self._t_ns[k])) / self._format.period_ns)
 
 

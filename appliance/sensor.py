@@ -22,6 +22,9 @@ RATE_TOLERANCE = 0.01
 """How far a board's rate may be from the bundle's: one per cent, as crystals and timers differ."""
 
 
+_COUNT = np.arange(wire.MAX_FRAMES, dtype=np.int64)
+
+
 @dataclass(slots=True)
 class Tally:
     """What was counted since the program started, in the unit of each name."""
@@ -80,6 +83,7 @@ class Stream:
 
     def __init__(self, fmt: SweepFormat, tally: Tally) -> None:
         self._format, self._tally = fmt, tally
+        self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(np.int64)
         self._place = wire.Place(-1)
         self.restart()
 
@@ -115,18 +119,14 @@ class Stream:
         """Put numbers and host times to packets [(first number, packet)] of one epoch."""
         if not fresh:
             return Frames.empty(self._format)
-        counts = [len(p.taxels) for _, p in fresh]
-        period = self._format.period_ns
         starts = [self._device.unwrap(p.t_us) * 1000 for _, p in fresh]
-        self._device.update(round(starts[-1] + (counts[-1] - 1) * period), arrival_ns)
-        host = [self._device.to_host_ns(s) for s in starts]
-        within = np.concatenate([np.arange(n) for n in counts])
-        self._tally.frames += len(within)
-        return Frames(
-            np.repeat(host, counts) + (within * period).astype(np.int64),
-            np.repeat([first for first, _ in fresh], counts) + within,
-            np.concatenate([p.taxels for _, p in fresh]),
-        )
+        self._device.update(starts[-1] + int(self._within_ns[len(fresh[-1][1].taxels) - 1]), arrival_ns)
+        runs = []
+        for start, (first, p) in zip(starts, fresh, strict=True):
+            n = len(p.taxels)
+            self._tally.frames += n
+            runs.append(Frames(self._device.to_host_ns(start) + self._within_ns[:n], first + _COUNT[:n], p.taxels))
+        return runs[0] if len(runs) == 1 else Frames.joined(runs)
 
 
 class UsbSensor:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -113,6 +114,11 @@ class Frames:
         """No frames of this format."""
         none = np.empty(0, np.int64)
         return cls(none, none, np.empty((0, fmt.rows, fmt.cols), fmt.digits))
+
+    @classmethod
+    def joined(cls, runs: Sequence[Frames]) -> Frames:
+        """Several runs as one."""
+        return cls(*(np.concatenate([getattr(run, name) for run in runs]) for name in cls.__slots__))
 
 
 @dataclass(frozen=True, slots=True)

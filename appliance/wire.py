@@ -22,6 +22,7 @@ VERSION = 1
 HEADER = struct.Struct("<2sBBHBBBBBxII")
 CRC = struct.Struct("<I")
 MAX_PAYLOAD = 4096
+MAX_FRAMES = 255
 RECENT = 1 << 16
 """A packet at most this many frames behind the newest is a repetition; one further behind means that the count restarted."""
 
@@ -120,7 +121,7 @@ def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
     n, rows, cols = taxels.shape
     digit = _DTYPES.index(taxels.dtype.newbyteorder("<"))
     payload = taxels.astype(_DTYPES[digit], copy=False).tobytes()
-    if not 0 < n < 256 or len(payload) > MAX_PAYLOAD:
+    if not 0 < n <= MAX_FRAMES or len(payload) > MAX_PAYLOAD:
         raise FormatError(
             f"{n} frames of {rows} x {cols} taxels do not fit a packet of {MAX_PAYLOAD} bytes; send fewer"
         )

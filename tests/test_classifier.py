@@ -193,11 +193,13 @@ def test_altered_and_missing_files_are_named(tmp_path: Path, name: str):
     data = bytearray((folder / name).read_bytes())
     data[len(data) // 2] ^= 1
     (folder / name).write_bytes(data)
-    with pytest.raises(BundleError, match=f"{name} was altered"):
+    with pytest.raises(BundleError, match="was altered") as e:
         bundle.load(folder)
+    assert name in str(e.value)
     (folder / name).unlink()
-    with pytest.raises(BundleError, match=f"{name} cannot be read"):
+    with pytest.raises(BundleError, match="cannot be read") as e:
         bundle.load(folder)
+    assert name in str(e.value)
 
 
 @pytest.mark.parametrize(
@@ -247,7 +249,7 @@ def test_pickles_are_not_opened(tmp_path: Path):
     manifest = json.loads((folder / bundle.MANIFEST).read_text())
     entry = bundle.file_entry((folder / bundle.GOLDEN).read_bytes())
     edit(folder, files=manifest["files"] | {bundle.GOLDEN: entry})
-    with pytest.raises(BundleError, match="golden.npz cannot be read"):
+    with pytest.raises(BundleError, match=r"golden\.npz cannot be read"):
         bundle.load(folder)
 
 

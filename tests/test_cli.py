@@ -16,7 +16,7 @@ from conftest import numbered
 
 from appliance import bundle
 from appliance.__main__ import main
-from appliance.sim import bench, demo, skin, terminal
+from appliance.sim import bench, demo, parts, script, skin, terminal
 from appliance.sweep import Frames
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
@@ -245,13 +245,14 @@ def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "edge_to_sentence_ms" in capsys.readouterr().out
 
 
-def test_bench_parts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_bench_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """Memory and processor share, in short."""
-    monkeypatch.setattr(bench, "MEMORY_SWEEPS", 20)
-    monkeypatch.setattr(bench, "STREAM_S", 0.5)
-    assert main(["bench", "--part", "memory"]) == 0
+    monkeypatch.setattr(parts, "MEMORY_SWEEPS", 20)
+    monkeypatch.setattr(parts, "STREAM_S", 0.5)
+    parts.write_acts(tmp_path / "acts.npz", script.tubes(1, 2))
+    assert main(["bench", "--part", "memory", "--acts", str(tmp_path / "acts.npz")]) == 0
     assert json.loads(capsys.readouterr().out)["rss_mb"]["after_1000"] > 10
-    assert main(["bench", "--part", "stream"]) == 0
+    assert main(["bench", "--part", "stream", "--acts", str(tmp_path / "acts.npz")]) == 0
     shares = json.loads(capsys.readouterr().out)
     assert 0 < shares["cpu_share_streaming"] < shares["cpu_share_with_simulated_board"]
 

@@ -36,14 +36,17 @@ class Bench:
         self.now = 10 * SECOND
 
     def put(self, some: Frames) -> None:
+        """Frames arrive 0.2 ms after the last of them was taken."""
         self.now = max(self.now, int(some.t_ns[-1]) + 200_000)
         self.recorder.put(some, self.now)
 
     def edge(self, kind: EdgeKind, frame: float, ready: bool = True) -> None:
+        """An edge at a frame's time."""
         self.now = max(self.now, t_ns(frame))
         self.recorder.trigger([Edge(kind, t_ns(frame))], ready, self.now)
 
     def done(self, after_s: float = 0) -> list[Sweep]:
+        """The answers that are due some time later."""
         self.now += round(after_s * SECOND)
         return self.recorder.finished(self.now)
 

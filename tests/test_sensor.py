@@ -30,7 +30,7 @@ def read_for(sensor: UsbSensor, world: SimWorld, seconds: float) -> Frames:
     parts = []
     while world.clock.now_ns() < end_ns:
         parts.append(sensor.read())
-    return Frames(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("t_ns", "seq", "taxels")))
+    return Frames.joined(parts)
 
 
 def check_content(frames: Frames) -> None:

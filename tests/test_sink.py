@@ -1,5 +1,6 @@
 """The sinks: sentences that others can read, a port that is never waited for, class bits that settle first."""
 
+import itertools
 import os
 import re
 from pathlib import Path
@@ -121,7 +122,7 @@ def test_parse_never_raises_and_splits_anywhere(data: bytes, cuts: list[int]):
         data = data[:MAX_LINE]
     edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
     rest, got = b"", []
-    for a, b in zip(edges, edges[1:], strict=False):
+    for a, b in itertools.pairwise(edges):
         found, rest = parse(rest + data[a:b])
         got += found
     assert (got, rest) == parse(data)

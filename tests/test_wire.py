@@ -1,5 +1,6 @@
 """The wire: whatever comes, intact frames come out exactly and everything else is counted."""
 
+import itertools
 import struct
 import zlib
 from pathlib import Path
@@ -69,7 +70,7 @@ def test_any_split_gives_the_same(cuts: list[int], data: st.DataObject):
     whole = b"".join(stream(8, first=data.draw(st.integers(0, 2**32 - 1))))
     edges = sorted({0, *(c % len(whole) for c in cuts), len(whole)})
     packets, rest = [], b""
-    for a, b in zip(edges, edges[1:], strict=False):
+    for a, b in itertools.pairwise(edges):
         got = wire.unpack(rest + whole[a:b])
         packets, rest = packets + got.packets, got.leftover
         assert got.garbage == 0

@@ -6,55 +6,32 @@ Memory, start and processor share are taken in processes of their own, so that n
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import platform
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
 
-from ..box import Box
 from ..bundle import Bundle
 from ..classifier import Classifier, session
 from ..clock import Clock, SystemClock
 from ..errors import BundleError
-from ..sink import ResultSink
 from ..sweep import Status, Sweep, SweepFormat, Verdict
-from . import rig, script, skin, stage
-from .stage import SimWorld
+from . import parts, rig, script, skin, stage
+from .parts import Build, drain
 
-SWEEPS, MEMORY_SWEEPS, STREAM_S, STARTS, ROUNDS = 60, 1000, 15.0, 7, 400
-PARTS = ("memory", "stream")
-"""Figures that are taken in a process of their own."""
-
-
-class Build(Protocol):
-    """Builds a box on a world; `stack` takes it apart. The box, and the far end of its serial line to be read."""
-
-    def __call__(
-        self,
-        world: SimWorld,
-        stack: ExitStack,
-        also: Iterable[ResultSink] = (),
-        keep: Callable[[Sweep], None] | None = None,
-    ) -> tuple[Box, int]:
-        """Build it."""
-        ...
-
-
-def part(name: str, fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
-    """One of PARTS, measured in this process."""
-    return {"memory": _memory, "stream": _stream}[name](fmt, build, seed)
+SWEEPS, STARTS, ROUNDS = 60, 7, 400
 
 
 def run(bundle: Bundle, build: Build, yardsticks: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
@@ -69,7 +46,7 @@ def run(bundle: Bundle, build: Build, yardsticks: Path, seed: int, say: Callable
     add({k: figures[k] for k in ("commit", "seed", "machine", "bundle")})
     add(_whole_way(bundle.format, build, seed))
     add({"inference_ms": _inference(bundle, yardsticks, seed)})
-    for name in PARTS:
+    for name in parts.NAMES:
         add(_child(name, seed))
     add(_cold_start())
     return figures
@@ -85,11 +62,6 @@ def wilson(right: int, total: int) -> list[float]:
 
 def _percentiles(values: list[float]) -> dict[str, float]:
     return {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)} | {"n": len(values)}
-
-
-def _drain(far_end: int) -> None:
-    with suppress(BlockingIOError):
-        os.read(far_end, 65536)
 
 
 class _Watch:
@@ -123,7 +95,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
         box, far_end = build(world, stack, [watch], watch.keep)
         while not world.finished(box.answered):
             box.step()
-            _drain(far_end)
+            drain(far_end)
         lost = box.frames_lost + sum(v.lost for v in watch.verdicts)
     pairs = zip(watch.verdicts, world.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
@@ -140,8 +112,7 @@ def _inference(bundle: Bundle, yardsticks: Path, seed: int) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.digits)
     calls: dict[str, Callable[[], object]] = {}
-    int8 = Classifier(bundle, SystemClock())
-    calls["int8"] = lambda: int8.logits(window)
+    calls["int8"] = partial(Classifier(bundle, SystemClock()).logits, window)
     _make_yardsticks(yardsticks)
     for name in ("fp32", "paper_int8"):
         path = yardsticks / f"{name}.onnx"
@@ -166,60 +137,13 @@ def _make_yardsticks(folder: Path) -> None:
         raise BundleError(f"palpate-train yardsticks failed: {done.stderr.strip()[-300:]}")
 
 
-def _memory(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
-    """Resident memory of a box after MEMORY_SWEEPS sweeps, and what the last nine tenths of them added."""
-    world = stage.build(fmt, itertools.cycle(list(script.tubes(seed, 6))), rig.VirtualClock(), "sim")
-    rss_mb = {}
-    with ExitStack() as stack:
-        box, far_end = build(world, stack)
-        while box.answered < MEMORY_SWEEPS:
-            if box.step() and box.answered in (MEMORY_SWEEPS // 10, MEMORY_SWEEPS):
-                rss_mb[box.answered] = _rss_mb()
-            _drain(far_end)
-            world.robot.played.clear()
-    before, after = rss_mb.values()
-    return {"rss_mb": {"after_1000": round(after, 2), "growth_last_900": round(after - before, 2)}}
-
-
-def _rss_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGESIZE") / 1e6
-
-
-def _stream(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
-    """Share of one core while streaming in real time, without the simulated board's own share, and with it."""
-    world = stage.build(fmt, itertools.cycle(list(script.tubes(seed, 6))), SystemClock(), "sim")
-    board_ns = 0
-    real_read = world.backend.bulk_read
-
-    def timed_read(*args: Any) -> int:
-        nonlocal board_ns
-        start = time.thread_time_ns()
-        try:
-            return real_read(*args)
-        finally:
-            board_ns += time.thread_time_ns() - start
-
-    world.backend.bulk_read = timed_read  # type: ignore[assignment]
-    with ExitStack() as stack:
-        box, far_end = build(world, stack)
-        box.step()
-        board_ns, wall_ns, cpu_ns = 0, -time.monotonic_ns(), -time.process_time_ns()
-        while time.monotonic_ns() + wall_ns < STREAM_S * 1e9:
-            box.step()
-            _drain(far_end)
-        wall_ns, cpu_ns = wall_ns + time.monotonic_ns(), cpu_ns + time.process_time_ns()
-    box_ns = cpu_ns - board_ns
-    return {
-        "cpu_share_streaming": round(box_ns / wall_ns, 4),
-        "cpu_share_with_simulated_board": round(cpu_ns / wall_ns, 4),
-    }
-
-
 def _child(name: str, seed: int) -> dict[str, Any]:
     """A part in a fresh process."""
-    command = [sys.executable, "-m", "appliance", "bench", "--part", name, "--seed", str(seed)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    with tempfile.TemporaryDirectory() as folder:
+        acts = Path(folder) / "acts.npz"
+        parts.write_acts(acts, script.tubes(seed, 6))
+        command = [sys.executable, "-m", "appliance", "bench", "--part", name, "--acts", str(acts)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
     result: dict[str, Any] = json.loads(done.stdout)
     return result
 

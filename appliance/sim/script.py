@@ -13,17 +13,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError
+from ..errors import ConfigError, FormatError
 from ..sweep import DIGITS, SweepFormat
 from . import skin
 from .rig import Act
 
-PAUSE_S = 0.25
-"""The finger is off the tube between two sweeps."""
+SETS = "replay:"
+PAUSE_S = 0.1, 0.14
+"""The finger is off the tube so long before and after it; drawn anew each time, so that edges meet packets anywhere."""
 SLIDE_S, REST_S = 3.0, 0.1
 """The slide (paper, sec. II.B), and the finger at rest on the tube before and after it."""
 MARGIN = 8
 """Frames held before and after a recorded window, so that edges have room; its first and last frames are repeated."""
+
+
+def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
+    """The script that `--sim` names, and the source that its sentences name.
+
+    Raises ConfigError for another name, FormatError where the bundle wants another skin.
+    """
+    if name == "skin":
+        if fmt != skin.FORMAT:
+            raise FormatError(f"the simulated skin sends {skin.FORMAT}, the bundle wants {fmt}; use --sim replay:FILE")
+        return tubes(seed), "sim"
+    if name.startswith(SETS):
+        return replay(Path(name.removeprefix(SETS)), fmt), "replay"
+    raise ConfigError(f"--sim {name} is unknown; use skin, or replay:FILE with a sweep set")
 
 
 def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = ()) -> Iterator[Act]:
@@ -40,7 +55,7 @@ def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement]
         if not tubes_left:
             tubes_left, place = [str(m) for m in rng.permutation(skin.MATERIALS)], next(rounds)
         label = tubes_left.pop()
-        off = skin.idle(round(PAUSE_S * rate / 2), rng, world)
+        off = skin.idle(round(rng.uniform(*PAUSE_S) * rate), rng, world)
         on = skin.sweep(label, place, rng, world, rest_s=REST_S, slide_s=SLIDE_S, after_s=REST_S)
         start = len(off) + round(REST_S * rate)
         yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)

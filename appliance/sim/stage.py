@@ -1,20 +1,16 @@
-"""Puts the rig together: a world under the real drivers, chosen by name. In: `skin` or `replay:FILE`. Out: a SimWorld."""
+"""Puts the rig together: a world under the real drivers. In: what the robot does. Out: a SimWorld."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import islice
-from pathlib import Path
 
 from ..box import World
-from ..clock import Clock, SystemClock
+from ..clock import Clock
 from ..config import Config
-from ..errors import ConfigError, FormatError
 from ..sweep import SweepFormat
-from . import gpio, rig, script, skin, usb
+from . import gpio, rig, usb
 
-SETS = "replay:"
 READY, BUSY, RESULT_VALID, FAULT = "READY", "BUSY", "RESULT-VALID", "FAULT"
 START, STOP, NEW_OBJECT = "START", "STOP", "NEW-OBJECT"
 BITS = tuple(f"CLASS-{i}" for i in range(8))
@@ -43,18 +39,6 @@ class SimWorld(World):
     def finished(self, answered: int) -> bool:
         """True when the script has ended and everything in it was answered."""
         return self.robot.finished and answered >= len(self.robot.played)
-
-
-def named(name: str, fmt: SweepFormat, *, seed: int, sweeps: int | None, virtual: bool) -> SimWorld:
-    """The world that `--sim` names. Raises ConfigError for another name, FormatError where the bundle wants another skin."""
-    clock = rig.VirtualClock() if virtual else SystemClock()
-    if name == "skin":
-        if fmt != skin.FORMAT:
-            raise FormatError(f"the simulated skin sends {skin.FORMAT}, the bundle wants {fmt}; use --sim replay:FILE")
-        return build(fmt, islice(script.tubes(seed), sweeps), clock, "sim")
-    if name.startswith(SETS):
-        return build(fmt, islice(script.replay(Path(name.removeprefix(SETS)), fmt), sweeps), clock, "replay")
-    raise ConfigError(f"--sim {name} is unknown; use skin, or replay:FILE with a sweep set")
 
 
 def build(fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False) -> SimWorld:
