@@ -51,7 +51,8 @@ def inspect(taxels: NDArray[Any], tare: NDArray[np.float64], limits: Thresholds)
         return Finding(Status.STUCK_TAXEL, _places(stuck))
     if full.mean() > limits.saturated:
         return Finding(Status.SATURATED, _places(full > 0))
-    padded = np.pad(loaded, 1, constant_values=True)
+    padded = np.ones((tare.shape[0] + 2, tare.shape[1] + 2), bool)
+    padded[1:-1, 1:-1] = loaded
     dead = still & ~loaded & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     if dead.sum() > limits.dead_taxels:
         return Finding(Status.DEAD_TAXEL, _places(dead))

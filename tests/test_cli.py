@@ -57,7 +57,7 @@ def test_demo_paints_on_a_terminal():
             pass
         assert run.wait() == 0
     os.close(far)
-    first = shown.split(b"\033[10A\033[J")[0]
+    first = shown.split(b"\033[12A")[0]
     assert first.count(b"\033[48;5;") == 32
     assert b"$PPLP,RES,1," in shown
 
@@ -229,7 +229,7 @@ def test_output_that_nobody_reads():
 
 def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """A small bench: every key that scripts rely on, in JSON, with commit, seed and machine."""
-    for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 20}.items():
+    for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(bench, "_child", lambda name, seed: {name: {"seed": seed}})
     monkeypatch.setattr(bench, "_make_yardsticks", lambda folder: None)

@@ -7,6 +7,8 @@ on both sides. A broken file is refused by name: no later room looks at shapes a
 from __future__ import annotations
 
 import re
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,14 +22,16 @@ from appliance.sim import skin
 from appliance.sweep import DIGITS, SweepFormat
 
 Array = NDArray[Any]
-SIMULATED = re.compile(r"sim:(?P<name>[^:]+)(:(?P<seed>\d+))?(:(?P<each>[1-9]\d*))?")
+SIMULATED = re.compile(r"sim:(?P<name>[^:]+)(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?")
 CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)\s*(-?\d+)\s*")
+OWN_NUMBERS = ("recording", "position", "session")
+"""Groups whose numbers mean something within their set only."""
 COMPARE: dict[str, Callable[[Array, int], Array]] = {"=": np.equal, "<=": np.less_equal, ">=": np.greater_equal}
 
 
 @dataclass(frozen=True)
 class SweepSet:
-    """N sweeps of at least two materials, with what is known of them.
+    """N sweeps with what is known of them.
 
     samples: digits [N, T, R, C] of one of DIGITS. labels: int [N], index into `materials`.
     groups: int [N] each; sweeps with the same number of `recording` are pieces of one recording.
@@ -64,8 +68,6 @@ class SweepSet:
             )
         if len(set(self.materials)) < n:
             raise self._error(f"materials {list(self.materials)} name one twice; give each its own name")
-        if len(present := np.unique(self.labels)) < 2:
-            raise self._error(f"only one class, {self.materials[present[0]]!r}; a classifier needs two")
         if not 0 < self.rate_hz < np.inf:
             raise self._error(f"rate_hz is {self.rate_hz}; give frames per second")
 
@@ -89,6 +91,12 @@ class SweepSet:
             return np.arange(len(self))
         raise self._error(f"no group {name!r}; it has {', '.join(sorted(self.groups)) or 'none'}")
 
+    def of_several(self) -> SweepSet:
+        """The set itself. Raises FormatError where all its sweeps are of one material."""
+        if len(present := np.unique(self.labels)) < 2:
+            raise self._error(f"only one class, {self.materials[present[0]]!r}; a classifier needs two")
+        return self
+
     def take(self, index: Array) -> SweepSet:
         """The sweeps `index` (mask or numbers) with all materials, so that labels keep their meaning."""
         groups = {k: v[index] for k, v in self.groups.items()}
@@ -107,7 +115,7 @@ class SweepSet:
             keep &= COMPARE[how](self.group(name), int(value))
         if not keep.any():
             raise self._error(f"no sweep fulfils {' and '.join(conditions)}; it has {', '.join(sorted(self.groups))}")
-        part = self.take(keep)
+        part = self.take(keep).of_several()
         present, labels = np.unique(part.labels, return_inverse=True)
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))
 
@@ -144,54 +152,68 @@ class SweepSet:
 
 
 def load(spec: str, seed: int = 0) -> SweepSet:
-    """The set that `spec` names: a file PATH.npz, or sim:NAME[:SEED[:SWEEPS]] with SWEEPS per material and position.
+    """The set that `spec` names: a file PATH.npz, or sim:NAME[:SEED[-LAST][:SWEEPS]].
 
-    seed: of a simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
+    SWEEPS: per material and position. SEED-LAST: one set of several worlds, whose positions differ. seed: of a
+    simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
     """
     return _simulated(spec, seed) if spec.startswith("sim:") else _file(Path(spec))
 
 
 def join(sets: Sequence[SweepSet]) -> SweepSet:
-    """One set of several with the same format and materials; groups that all have, numbered on.
+    """One set of several with the same format and materials, and the groups that all have.
 
-    Raises FormatError where they do not fit.
+    Recordings, positions and sessions are numbered on, since number 0 of two sets is not the same thing; a force or a
+    speed is. Raises FormatError where the sets do not fit.
     """
     head, *others = sets
     for s in others:
         if (s.format, s.materials) != (head.format, head.materials):
             raise FormatError(
-                f"{s.source} ({s.format}) and {head.source} ({head.format}) are not of one kind; use one of them"
+                f"{s.source} ({s.format}) and {head.source} ({head.format}) differ; join sets of one kind"
             )
-    groups: dict[str, Array] = {}
-    for name in set.intersection(*(set(s.groups) for s in sets)):
-        offsets = np.cumsum([0] + [int(s.groups[name].max()) + 1 for s in sets])
-        groups[name] = np.concatenate([s.groups[name] + int(o) for s, o in zip(sets, offsets, strict=False)])
-    return SweepSet(
-        np.concatenate([s.samples for s in sets]), np.concatenate([s.labels for s in sets]), head.materials, head.rate_hz,
-        groups, " + ".join(s.source for s in sets),
-    )  # fmt: skip
+    names = set.intersection(*(set(s.groups) for s in sets))
+    if any("recording" in s.groups for s in sets):
+        names.add("recording")
+    groups = {}
+    for name in sorted(names):
+        parts = [s.group(name).astype(np.int64) for s in sets]
+        if name in OWN_NUMBERS:
+            starts = np.cumsum([0] + [int(np.ptp(part)) + 1 for part in parts])
+            parts = [part - part.min() + start for part, start in zip(parts, starts, strict=False)]
+        groups[name] = np.concatenate(parts)
+    samples, labels = (np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels"))
+    return SweepSet(samples, labels, head.materials, head.rate_hz, groups, " + ".join(s.source for s in sets))
 
 
 def _simulated(spec: str, seed: int) -> SweepSet:
-    found = SIMULATED.fullmatch(spec)
-    known = get_args(skin.SetName)
+    found, known = SIMULATED.fullmatch(spec), get_args(skin.SetName)
     if not found or found["name"] not in known:
         raise FormatError(
-            f"set {spec!r} is unknown; use sim:NAME, sim:NAME:SEED or sim:NAME:SEED:SWEEPS with {', '.join(known)}"
+            f"set {spec!r} is unknown; use sim:NAME[:SEED[-LAST][:SWEEPS]], NAME one of {', '.join(known)}"
         )
+    first = int(found["seed"] or seed)
     each = int(found["each"]) if found["each"] else None
-    samples, labels, position = skin.sweep_set(found["name"], int(found["seed"] or seed), each)
-    return SweepSet(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, {"position": position}, spec)
+    worlds = []
+    for world in range(first, int(found["last"] or first) + 1):
+        samples, labels, position = skin.sweep_set(found["name"], world, each)
+        worlds.append(SweepSet(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, {"position": position}, spec))
+    if not worlds:
+        raise FormatError(f"set {spec!r} is empty: its last seed comes before its first")
+    return replace(join(worlds), source=spec)
+
+
+def read(path: Path, what: str) -> dict[str, Array]:
+    """All arrays of an .npz, nothing unpickled. Raises FormatError saying that it is not `what`."""
+    try:
+        with np.load(path, allow_pickle=False) as z:
+            return {k: z[k] for k in z.files}
+    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as e:
+        raise FormatError(f"{path.name}: not {what}: {e}") from e
 
 
 def _file(path: Path) -> SweepSet:
-    try:
-        with np.load(path, allow_pickle=False) as z:
-            held = {k: z[k] for k in z.files}
-    except (OSError, ValueError, EOFError, AttributeError) as e:
-        raise FormatError(
-            f"{path.name}: not a sweep set ({e}); it is an .npz of samples, labels, materials, rate_hz"
-        ) from e
+    held = read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)")
     missing = {"samples", "labels", "materials", "rate_hz"} - set(held)
     if missing:
         raise FormatError(
@@ -203,4 +225,5 @@ def _file(path: Path) -> SweepSet:
         raise FormatError(f"{path.name}: rate_hz holds {held['rate_hz']!r}; give one number, frames per second")
     groups = {k.removeprefix("group_"): v for k, v in held.items() if k.startswith("group_")}
     materials = tuple(str(m) for m in held["materials"])
-    return SweepSet(held["samples"], held["labels"], materials, held["rate_hz"].item(), groups, path.name)
+    whole = SweepSet(held["samples"], held["labels"], materials, held["rate_hz"].item(), groups, path.name)
+    return whole.of_several()

@@ -23,6 +23,8 @@ from .rig import Act
 FRAME_NS = 66_000_000
 """Time between two pictures of the skin."""
 BAR = 30
+BRIGHT = 160
+"""Digits that are shown white; the skin seldom gives more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,8 @@ def picture(frames: Frames) -> list[str]:
     """The newest frame [R, C] as shaded cells with their digits, two lines a row."""
     lines = []
     for row in frames.taxels[-1].astype(int):
-        shade = [f"\033[48;5;{232 + min(23, max(0, d) * 24 // 256)}m\033[38;5;{16 if d > 127 else 250}m" for d in row]
+        level = [min(23, max(0, d) * 24 // BRIGHT) for d in row]
+        shade = [f"\033[48;5;{232 + v}m\033[38;5;{16 if v > 11 else 250}m" for v in level]
         lines.append("  " + "".join(f"{s}{'':6}\033[0m" for s in shade))
         lines.append("  " + "".join(f"{s}{d:^6}\033[0m" for s, d in zip(shade, row, strict=True)))
     return lines
@@ -157,7 +160,7 @@ class Demo:
             self._listen()
             if self._live and self._clock.now_ns() >= self._next_ns and self._watched.last is not None:
                 self._next_ns = self._clock.now_ns() + FRAME_NS
-                self._draw(["", *picture(self._watched.last), ""])
+                self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(self._watched.last), ""])
         if not self._raw and self.score.total:
             self._print(*self.score.table(self._watched.tally))
 
@@ -186,18 +189,17 @@ class Demo:
             )
 
     def _draw(self, lines: list[str]) -> None:
-        """Paint over the picture before."""
-        self._erase()
-        self._out.write("\n".join(lines) + "\n")
-        self._drawn = len(lines)
+        """Paint over the picture before, in one write, so that nothing flickers."""
+        self._out.write(self._back() + "".join(f"{line}\033[K\n" for line in lines))
         self._out.flush()
+        self._drawn = len(lines)
 
-    def _erase(self) -> None:
-        if self._drawn:
-            self._out.write(f"\033[{self._drawn}A\033[J")
-            self._drawn = 0
+    def _back(self) -> str:
+        """Where the picture begins."""
+        drawn, self._drawn = self._drawn, 0
+        return f"\033[{drawn}A" if drawn else ""
 
     def _print(self, *lines: str) -> None:
-        self._erase()
-        self._out.write("\n".join(lines) + "\n")
+        erase = "\033[J" if self._drawn else ""
+        self._out.write(self._back() + erase + "\n".join(lines) + "\n")
         self._out.flush()

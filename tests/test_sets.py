@@ -1,0 +1,211 @@
+"""The room of sweep sets: what is refused and how it is named, what belongs together and stays so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from appliance.errors import FormatError
+from appliance.sim import skin
+from train import sets
+from train.sets import SweepSet
+
+
+def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> SweepSet:
+    """Three materials that hum at different rates, `n` sweeps [64, 2, 2] of each, `pieces` to a recording."""
+    rng = np.random.default_rng(seed)
+    labels = np.repeat(np.arange(3), n)
+    pitch = np.array([0.05, 0.15, 0.35])[labels] * rng.uniform(0.9, 1.1, 3 * n)
+    phase = 2 * np.pi * (pitch[:, None] * np.arange(64) + rng.random((3 * n, 1)))
+    offset = rng.uniform(80, 120, (3 * n, 1, 2, 2))
+    samples = offset + 12 * np.sin(phase)[:, :, None, None] + 2 * rng.standard_normal((3 * n, 64, 2, 2))
+    groups = {"recording": np.arange(3 * n) // pieces, "speed": np.arange(3 * n) // pieces % 4}
+    return SweepSet(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "easy")
+
+
+def held() -> dict[str, np.ndarray]:
+    """What a good file holds."""
+    return {
+        "samples": np.arange(6 * 8 * 2 * 3).reshape(6, 8, 2, 3).astype(np.int16),
+        "labels": np.array([0, 1, 2, 0, 1, 2]),
+        "materials": np.array(["a", "b", "c"]),
+        "rate_hz": np.array(50.0),
+        "group_speed": np.array([1, 1, 1, 2, 2, 2]),
+    }
+
+
+def write(path: Path, **changes: object) -> str:
+    """A set file with some arrays changed, or left out where the change is None."""
+    arrays = {k: v for k, v in (held() | changes).items() if v is not None}
+    np.savez(path, **arrays)
+    return str(path)
+
+
+def test_a_file_is_read_as_it_is_described(tmp_path: Path):
+    """Format, materials, groups and digits come out as they were put in; save writes the same form."""
+    s = sets.load(write(tmp_path / "good.npz"))
+    assert str(s.format) == "2x3 int16 at 50 Hz, window 8"
+    assert s.materials == ("a", "b", "c")
+    s.save(tmp_path / "again.npz")
+    again = sets.load(str(tmp_path / "again.npz"))
+    np.testing.assert_array_equal(again.samples, held()["samples"])
+    np.testing.assert_array_equal(again.groups["speed"], held()["group_speed"])
+    assert (again.materials, again.rate_hz) == (s.materials, s.rate_hz)
+
+
+NAN = np.zeros((6, 8, 2, 3), np.float32)
+NAN[4, 7, 1, 2] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"samples": None}, "lacks samples"),
+        ({"materials": None, "rate_hz": None}, "lacks materials, rate_hz"),
+        ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
+        ({"samples": np.zeros((6, 0, 2, 3), np.uint8)}, "none empty"),
+        ({"samples": np.zeros((6, 8, 2, 3))}, "samples are float64; use one of uint8"),
+        ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
+        ({"labels": np.arange(5)}, "labels holds int64 \\[5\\]; give one whole number for each of 6"),
+        ({"labels": np.zeros(6)}, "labels holds float64"),
+        ({"labels": np.array([0, 1, 2, 0, 3, 1])}, "label 3 of sweep 4 is out of range; there are 3"),
+        ({"labels": np.array([0, 1, -1, 0, 2, 1])}, "label -1 of sweep 2 is out of range"),
+        ({"labels": np.full(6, 2)}, "only one class, 'c'"),
+        ({"materials": np.array(["a", "b", "a"])}, "name one twice"),
+        ({"materials": np.arange(3)}, "materials hold int64"),
+        ({"rate_hz": np.array([50.0, 60.0])}, "give one number"),
+        ({"rate_hz": np.array(-1.0)}, "rate_hz is -1.0"),
+        ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
+        ({"materials": np.array(["a", {}, "c"], object)}, "not a sweep set"),
+    ],
+)
+def test_a_broken_file_is_refused_by_name(tmp_path: Path, changes: dict, message: str):
+    """Each fault has its message, which begins with the file."""
+    with pytest.raises(FormatError, match=f"^broken.npz: .*{message}"):
+        sets.load(write(tmp_path / "broken.npz", **changes))
+
+
+def test_what_is_no_set_at_all_is_refused(tmp_path: Path):
+    """Text, a single array, a cut archive and nothing."""
+    (tmp_path / "text.npz").write_text("samples")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    whole = Path(write(tmp_path / "whole.npz")).read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    for name in ("text.npz", "empty.npz", "array.npy", "cut.npz", "missing.npz"):
+        with pytest.raises(FormatError, match=f"^{name}: not a sweep set"):
+            sets.load(str(tmp_path / name))
+
+
+def test_simulated_sets_have_their_worlds():
+    """Sizes of the paper's sets, the seed's place, and positions of joined worlds that stay apart."""
+    real = sets.load("sim:T-REAL:5-6:1")
+    assert (len(real), real.format, real.materials) == (2 * 9 * 6, skin.FORMAT, skin.MATERIALS)
+    assert len(np.unique(real.groups["position"])) == 18
+    hard = sets.load("sim:T-HARD", seed=6)
+    assert len(hard) == 60
+    np.testing.assert_array_equal(hard.samples, sets.load("sim:T-HARD:6").samples)
+    np.testing.assert_array_equal(real.samples[:54], skin.sweep_set("T-REAL", 5, 1)[0])
+
+
+@pytest.mark.parametrize("spec", ["sim:T-SOFT", "sim:T-REAL:x", "sim:T-REAL:1:0", "sim:", "sim:T-REAL:2-1"])
+def test_an_unknown_simulated_set_is_refused(spec: str):
+    """The message repeats what was asked for."""
+    with pytest.raises(FormatError, match=f"^set '{spec}' is "):
+        sets.load(spec)
+
+
+def test_select_keeps_what_fulfils_every_condition():
+    """All of = <= >=, and materials that are left over go, with the labels numbered anew."""
+    s = easy(8)
+    part = s.select(["speed>=1", "speed<=2"])
+    assert set(part.groups["speed"]) == {1, 2}
+    assert len(part) == len(s) // 2
+    assert len(s.select([])) == len(s)
+    upper = s.select(["recording>=8"])
+    assert upper.materials == ("middle", "high")
+    np.testing.assert_array_equal(np.bincount(upper.labels), [8, 8])
+    np.testing.assert_array_equal(upper.samples, s.samples[8:])
+
+
+@pytest.mark.parametrize(
+    ("condition", "message"),
+    [
+        ("speed<2", "cannot be read"),
+        ("speed", "cannot be read"),
+        ("force=1", "no group 'force'; it has recording, speed"),
+        ("speed=9", "no sweep fulfils speed=9"),
+        ("recording<=7", "only one class, 'low'"),
+    ],
+)
+def test_select_names_what_is_wrong(condition: str, message: str):
+    """A typing error never passes for an empty filter."""
+    with pytest.raises(FormatError, match=message):
+        easy(8).select([condition])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 7), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1))
+def test_split_never_separates_a_recording(pieces: int, share: float, seed: int):
+    """No recording is on both sides, nothing is lost or doubled, and both sides have each material near the share."""
+    s = easy(21, pieces=pieces) if 21 % pieces == 0 else easy(6 * pieces, pieces=pieces)
+    first, second = s.split("recording", share, seed)
+    assert not set(first.groups["recording"]) & set(second.groups["recording"])
+    assert len(first) + len(second) == len(s)
+    for part, ideal in ((first, share), (second, 1 - share)):
+        per_material = np.bincount(part.labels, minlength=3) / (len(s) / 3)
+        recordings = len(np.unique(s.groups["recording"])) / 3
+        assert np.all(np.abs(per_material - ideal) <= 1 / recordings + 1e-9)
+
+
+def test_split_is_the_seed_s_alone():
+    """The same seed gives the same parts, another seed others."""
+    s = easy(20)
+    parts = [s.split("recording", 0.5, seed)[0].groups["recording"] for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(parts[0], parts[1])
+    assert set(parts[0]) != set(parts[2])
+
+
+def test_split_refuses_what_would_flatter():
+    """Groups that cut recordings, a part without a material, a share that is none."""
+    s = easy(8, pieces=2)
+    s.groups["half"] = np.arange(len(s)) % 2
+    with pytest.raises(FormatError, match="'half' cut recordings in two"):
+        s.split("half", 0.5, 0)
+    s.groups["material"] = s.labels
+    del s.groups["recording"]
+    s.groups["one"] = np.zeros(len(s), int)
+    with pytest.raises(FormatError, match="the first part is everything; it has 1 groups"):
+        s.split("one", 0.5, 0)
+    for share in (0.0, 1.0, 1.5):
+        with pytest.raises(FormatError, match="splits nothing"):
+            s.split("material", share, 0)
+
+
+def test_split_never_trains_without_a_material():
+    """Where one group alone has a material it is in the first part, or the split is refused."""
+    s = easy(8).take(np.arange(19))  # 8 low, 8 middle, 3 high
+    s.groups["box"] = np.array([0] * 8 + [1] * 4 + [2] * 7)
+    told = set()
+    for seed in range(20):
+        try:
+            told.add(s.split("box", 0.5, seed)[0].labels.max())
+        except FormatError as e:
+            told.add(str(e))
+    assert told == {2, "easy: split by 'box': the first part lacks 'high'; it has 3 groups, use a finer one"}
+
+
+def test_join_keeps_recordings_apart_and_forces_together():
+    """Number 0 of two sets is two recordings, also where one set counts none; a speed of 2 is the same speed."""
+    a, b = easy(4, pieces=2), easy(4, seed=1)
+    both = sets.join([a, b])
+    assert not set(both.groups["recording"][:12]) & set(both.groups["recording"][12:])
+    np.testing.assert_array_equal(both.groups["speed"], np.append(a.groups["speed"], b.groups["speed"]))
+    del b.groups["recording"]
+    assert len(np.unique(sets.join([a, b]).groups["recording"])) == 6 + 12
+    with pytest.raises(FormatError, match="differ; join sets of one kind"):
+        sets.join([a, easy(4, dtype="int16")])
