@@ -127,7 +127,7 @@ class Classifier:
             finding = inspect(sweep.frames.taxels, self.tare, self.bundle.manifest.thresholds)
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding, np.empty(0), 0)
-        if sweep.object == 0 or sweep.object != self._object:
+        if sweep.object == 0 or sweep.object != self._object or self._how == "none":
             self._object, self._scores = sweep.object, []
         self._scores.append(softmax(self.logits(sweep.frames.taxels)))
         fused = len(self._scores)

@@ -112,10 +112,13 @@ class SerialConfig:
 
 @dataclass(frozen=True, slots=True)
 class ClassifierConfig:
-    """The network. bundle: a bundle's path, "" for the packaged one. fuse: how sweeps of one object are combined."""
+    """The network. bundle: a bundle's path, "" for the packaged one.
+
+    fuse: how the sweeps of one object become one answer; "none": they do not.
+    """
 
     bundle: str = ""
-    fuse: Literal["product", "vote"] = "product"
+    fuse: Literal["product", "vote", "none"] = "product"
 
 
 @dataclass(frozen=True, slots=True)

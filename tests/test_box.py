@@ -15,7 +15,7 @@ from conftest import SECOND, Rigged
 from appliance import bundle, config
 from appliance.__main__ import build
 from appliance.sim import rig, script, skin, stage
-from appliance.sim.demo import Answer
+from appliance.sim.score import Answer
 from appliance.sink import StdoutPort
 from appliance.sweep import Status
 
@@ -229,6 +229,13 @@ def test_sweeps_of_one_object_are_fused(rigged: Callable[..., Rigged]):
     box = rigged(world_of(acts))
     verdicts = box.until(lambda: box.box.answered == 6)
     assert [v.fused for v in verdicts] == [1, 1, 2, 3, 1, 2]
+
+
+def test_fusing_can_be_turned_off(rigged: Callable[..., Rigged]):
+    """With `classifier.fuse=none` NEW OBJECT changes nothing."""
+    acts = [replace(a, new_object=i == 0) for i, a in enumerate(script.tubes(1005, 3))]
+    box = rigged(world_of(acts), sets=("classifier.fuse=none",))
+    assert [v.fused for v in box.until(lambda: box.box.answered == 3)] == [1, 1, 1]
 
 
 def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):

@@ -30,13 +30,14 @@ from ..errors import BundleError
 from ..sweep import Status, Sweep, SweepFormat, Verdict
 from . import parts, rig, script, skin, stage
 from .parts import Build, drain
+from .score import wilson
 
 SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
 
 
 def run(bundle: Bundle, build: Build, yardsticks: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
     """All figures; `say` gets each as soon as it is there."""
-    figures: dict[str, Any] = {"commit": _commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id}
+    figures: dict[str, Any] = {"commit": commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id}
 
     def add(more: dict[str, Any]) -> None:
         figures.update(more)
@@ -50,14 +51,6 @@ def run(bundle: Bundle, build: Build, yardsticks: Path, seed: int, say: Callable
         add(_child(name, seed))
     add(_cold_start())
     return figures
-
-
-def wilson(right: int, total: int) -> list[float]:
-    """The 95 % Wilson interval of a share."""
-    z = 1.96
-    p, n = right / total, total
-    middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return [round(float((middle + d) / (1 + z * z / n)), 4) for d in (-half, half)]
 
 
 def _percentiles(values: list[float]) -> dict[str, float]:
@@ -100,7 +93,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     pairs = zip(watch.verdicts, world.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
     return {
-        "accuracy": {"right": right, "total": SWEEPS, "interval": wilson(right, SWEEPS)},
+        "accuracy": {"right": right, "total": SWEEPS, "interval": [round(v, 4) for v in wilson(right, SWEEPS)]},
         "frames_lost": lost,
         "edge_to_sentence_ms": _percentiles(watch.answered_ms),
         "edge_seen_ms": _percentiles(watch.seen_ms),
@@ -165,7 +158,8 @@ def _cold_start() -> dict[str, Any]:
     return {"cold_start_s": round(statistics.median(took), 3), "cold_start_worst_s": round(max(took), 3)}
 
 
-def _commit() -> str:
+def commit() -> str:
+    """The commit of this checkout; "unknown" elsewhere."""
     where = Path(__file__).parent
     try:
         done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=where, capture_output=True, text=True, check=False)

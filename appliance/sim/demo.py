@@ -6,45 +6,22 @@ In: a box on the rig and the far end of its serial line. Out: pictures where the
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import IO
-
-import numpy as np
 
 from ..clock import Clock
 from ..errors import SensorError
 from ..sensor import Sensor, Tally
-from ..sweep import Frames, Status
+from ..sweep import Frames
 from ..wire import Identity
 from .rig import Act
+from .score import Answer, Score
 
 FRAME_NS = 66_000_000
 """Time between two pictures of the skin."""
 BAR = 30
 BRIGHT = 160
 """Digits that are shown white; the skin seldom gives more."""
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """A RES sentence as the robot read it."""
-
-    sweep: int
-    status: str
-    label: str
-    probability: float
-    lost: int
-    latency_ms: float
-
-    @classmethod
-    def read(cls, line: str) -> Answer | None:
-        """The answer in a line, or None for another sentence."""
-        parts = line.split("*")[0].split(",")
-        if parts[:2] != ["$PPLP", "RES"]:
-            return None
-        return cls(int(parts[2]), parts[4], parts[5], float(parts[6]), int(parts[9]), float(parts[10]))
 
 
 class Watched:
@@ -80,37 +57,6 @@ class Watched:
         if len(frames):
             self.last = frames
         return frames
-
-
-@dataclass(slots=True)
-class Score:
-    """What the demo has seen so far."""
-
-    right: Counter[str] = field(default_factory=Counter)
-    total: Counter[str] = field(default_factory=Counter)
-    latency_ms: list[float] = field(default_factory=list)
-
-    def add(self, truth: str, answer: Answer) -> bool:
-        """Count an answer; True where it names the truth."""
-        right = answer.label == truth and answer.status == Status.OK
-        self.total[truth] += 1
-        self.right[truth] += right
-        self.latency_ms.append(answer.latency_ms)
-        return right
-
-    def table(self, tally: Tally) -> list[str]:
-        """The closing table."""
-        names = sorted(self.total)
-        rows = [f"  {name:<16}{self.right[name]:>5} /{self.total[name]:>3}" for name in names]
-        return [
-            "",
-            "  material        right / all",
-            *rows,
-            f"  {'all':<16}{self.right.total():>5} /{self.total.total():>3}",
-            "",
-            f"  frames lost     {tally.lost_frames} of {tally.frames + tally.lost_frames}",
-            f"  latency         {np.median(self.latency_ms):.2f} ms median, {max(self.latency_ms):.2f} ms worst",
-        ]
 
 
 def bar(probability: float) -> str:
@@ -162,7 +108,9 @@ class Demo:
                 self._next_ns = self._clock.now_ns() + FRAME_NS
                 self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(self._watched.last), ""])
         if not self._raw and self.score.total:
-            self._print(*self.score.table(self._watched.tally))
+            tally = self._watched.tally
+            lost = f"  frames lost     {tally.lost_frames} of {tally.frames + tally.lost_frames}"
+            self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}")
 
     def _listen(self) -> None:
         """Read what the box has said at the robot's end of the line."""
@@ -180,12 +128,12 @@ class Demo:
         answer = Answer.read(line)
         if answer is None:
             return
-        truth = self._played[answer.sweep - 1].label
-        mark = "right" if self.score.add(truth, answer) else "wrong"
+        act = self._played[answer.sweep - 1]
+        mark = "right" if self.score.add(act, answer) else "wrong"
         if not self._raw:
             said = answer.label or answer.status
             self._print(
-                f"{answer.sweep:>3}  {truth:<15} -> {said:<15} {mark}  {bar(answer.probability)}", f"     {line}"
+                f"{answer.sweep:>3}  {act.label:<15} -> {said:<15} {mark}  {bar(answer.probability)}", f"     {line}"
             )
 
     def _draw(self, lines: list[str]) -> None:

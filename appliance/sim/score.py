@@ -1,0 +1,78 @@
+"""Right or wrong: answers as the robot read them against what it did. In: sentences and acts. Out: counts with intervals."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import Counter
+from dataclasses import dataclass, field
+
+from ..sweep import Status
+from .rig import Act
+
+
+def wilson(right: int, total: int) -> tuple[float, float]:
+    """The 95 % Wilson interval of a share, `right` of `total` > 0."""
+    z, p = 1.96, right / total
+    middle, half = p + z * z / (2 * total), z * math.sqrt(p * (1 - p) / total + z * z / (4 * total * total))
+    low, high = ((middle + d) / (1 + z * z / total) for d in (-half, half))
+    return low, high
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A RES sentence as the robot read it."""
+
+    sweep: int
+    status: str
+    label: str
+    probability: float
+    lost: int
+    latency_ms: float
+    fused: int
+
+    @classmethod
+    def read(cls, line: str) -> Answer | None:
+        """The answer in a line, or None for another sentence."""
+        parts = line.split("*")[0].split(",")
+        if parts[:2] != ["$PPLP", "RES"]:
+            return None
+        return cls(int(parts[2]), parts[4], parts[5], float(parts[6]), int(parts[9]), float(parts[10]), int(parts[8]))
+
+
+@dataclass(slots=True)
+class Score:
+    """What has been answered so far. objects: the last answer for each object, where NEW OBJECT was signalled."""
+
+    right: Counter[str] = field(default_factory=Counter)
+    total: Counter[str] = field(default_factory=Counter)
+    objects: list[bool] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+
+    def add(self, act: Act, answer: Answer) -> bool:
+        """Count an answer; True where it names the truth."""
+        right = answer.label == act.label and answer.status == Status.OK
+        self.total[act.label] += 1
+        self.right[act.label] += right
+        self.latency_ms.append(answer.latency_ms)
+        if act.new_object:
+            self.objects.append(right)
+        elif self.objects:
+            self.objects[-1] = right
+        return right
+
+    def table(self) -> list[str]:
+        """Right of how many, by material, in all, and by object."""
+        rows = [(name, self.right[name], self.total[name]) for name in sorted(self.total)]
+        sums = [("all sweeps", self.right.total(), self.total.total())]
+        if self.objects:
+            sums.append(("all objects", sum(self.objects), len(self.objects)))
+        lines = [f"  {name:<16}{right:>5} / {n}" for name, right, n in rows]
+        for name, right, n in sums:
+            low, high = wilson(right, n)
+            lines.append(f"  {name:<16}{right:>5} / {n:<5} {right / n:.3f} [{low:.3f}, {high:.3f}]")
+        return ["  material        right / all", *lines]
+
+    def latency(self) -> str:
+        """Median and worst latency."""
+        return f"{statistics.median(self.latency_ms):.2f} ms median, {max(self.latency_ms):.2f} ms worst"
