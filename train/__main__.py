@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from appliance.errors import ApplianceError, FormatError
+from appliance.sim.bench import commit
 
 from . import export, fit, sets
 
@@ -50,6 +50,7 @@ def _parser() -> argparse.ArgumentParser:
                      help="share of training sweeps moved by a row of taxels (default 0)")  # fmt: skip
     one.add_argument("--stretch", type=float, default=recipe.stretch, metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
+    one.add_argument("--keep-means", action="store_true", help="show the head each taxel's mean too, for comparison")
     two = add("export", run_export, "quantize a fit and pack its bundle")
     two.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
     two.add_argument("--out", type=Path, required=True, metavar="DIR", help="the bundle; one that is there is replaced")
@@ -73,7 +74,7 @@ def run_fit(args: argparse.Namespace) -> None:
             args.rest.parent.mkdir(parents=True, exist_ok=True)
             rest.save(args.rest)
             print(f"rest: {len(rest)} sweeps in {args.rest}")
-    recipe = fit.Recipe(steps=args.steps, row_shift=args.row_shift, stretch=args.stretch)
+    recipe = fit.Recipe(steps=args.steps, row_shift=args.row_shift, stretch=args.stretch, keep_means=args.keep_means)
     made = fit.fit(sweeps, args.seed, recipe, _progress)
     made.save(args.out)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; held-out {made.about['held_out_by']}: "
@@ -82,7 +83,7 @@ def run_fit(args: argparse.Namespace) -> None:
 
 def run_export(args: argparse.Namespace) -> None:
     """Pack the bundle and say how it does."""
-    manifest = export.export(fit.Fit.load(args.fit), args.out, args.name, args.version, _commit(), args.full_scale)
+    manifest = export.export(fit.Fit.load(args.fit), args.out, args.name, args.version, commit(), args.full_scale)
     for protocol, figure in manifest.figures.items():
         if "accuracy" in figure:
             print(f"{protocol}: {_spoken(figure)}")
@@ -112,15 +113,6 @@ def _progress(line: str) -> None:
     """One line that is written over, for eyes only."""
     if sys.stderr.isatty():
         print(f"\r{line}\033[K", end="", file=sys.stderr, flush=True)
-
-
-def _commit() -> str:
-    """The commit that this code is of, with + where it was changed since; "unknown" outside a checkout."""
-    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
-    try:
-        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 if __name__ == "__main__":

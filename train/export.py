@@ -104,7 +104,7 @@ def export(
 
 def quantized(fit: Fit) -> tuple[onnx.ModelProto, Parity]:
     """The int8 model, its head refitted on what the int8 trunk gives. Raises ExportRefused where parity is broken."""
-    trunk = networks.trunk(fit.train.format, fit.scale, fit.weights)
+    trunk = networks.trunk(fit.train.format, fit.scale, fit.weights, fit.keep_means)
     whole = networks.with_head(trunk, fit.weights["head.weight"], fit.weights["head.bias"])
     some = np.linspace(0, len(fit.train) - 1, min(CALIBRATION_SWEEPS, len(fit.train))).astype(int)
     int8_trunk = quantize(trunk, fit.train.samples[some])

@@ -8,7 +8,6 @@ changed.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -24,6 +23,7 @@ from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from appliance.errors import FormatError
+from appliance.sim.score import wilson
 
 from .networks import Compact
 from .sets import SweepSet, read
@@ -40,6 +40,7 @@ class Recipe:
     """How the convolutions are trained. noise and gain: standard deviations, of a scaled taxel and of its factor.
 
     row_shift: share of sweeps moved by one row of taxels. stretch: largest change of speed. Both are drawn per sweep.
+    keep_means: see networks.Compact; the convolutions never see them, the closed-form head does.
     """
 
     steps: int = 800
@@ -53,6 +54,7 @@ class Recipe:
     gain: float = 0.15
     row_shift: float = 0.0
     stretch: float = 0.0
+    keep_means: bool = False
 
 
 @dataclass(frozen=True)
@@ -68,9 +70,14 @@ class Fit:
     held: SweepSet
     about: dict[str, Any]
 
+    @property
+    def keep_means(self) -> bool:
+        """Whether the head sees the means of the taxels."""
+        return bool(self.about["recipe"]["keep_means"])
+
     def network(self) -> Compact:
         """The network in PyTorch, ready to run."""
-        model = Compact(self.train.format, len(self.train.materials), self.scale, norm=False)
+        model = Compact(self.train.format, len(self.train.materials), self.scale, False, self.keep_means)
         model.load_state_dict({k: torch.from_numpy(v) for k, v in self.weights.items()})
         return model.eval()
 
@@ -118,6 +125,7 @@ def fit(sweeps: SweepSet, seed: int, recipe: Recipe, log: Callable[[str], None] 
     with one_thread(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = _train(Compact(train.format, len(train.materials), scale), train, recipe, seed, log)
+        model.keep_means = recipe.keep_means
         seen, unseen = features(model, train), features(model, held)
     weight, bias = closed_form_head(seen, train.labels, unseen, held.labels)
     weights = {k: v.numpy() for k, v in model.state_dict().items()} | {"head.weight": weight, "head.bias": bias}
@@ -143,7 +151,7 @@ def one_thread() -> Iterator[None]:
 @torch.no_grad()
 def features(model: Compact, sweeps: SweepSet) -> Array:
     """What the head sees of each sweep, float32 [N, F]."""
-    return np.concatenate([model.features(model.prepare(x)).numpy() for x in _tensors(sweeps, _in_order(len(sweeps)))])
+    return np.concatenate([model.seen(x).numpy() for x in _tensors(sweeps, _in_order(len(sweeps)))])
 
 
 def closed_form_head(seen: Array, labels: Array, held: Array, held_labels: Array) -> tuple[Array, Array]:
@@ -173,10 +181,8 @@ def temperature(logits: Array, labels: Array) -> float:
 
 def figure(right: int, n: int) -> dict[str, Any]:
     """An accuracy with n and its 95 % Wilson interval."""
-    z, p = 1.96, right / n
-    middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    low, high = ((middle + sign * half) / (1 + z * z / n) for sign in (-1, 1))
-    return {"accuracy": round(p, 4), "n": n, "low": round(low, 4), "high": round(high, 4)}
+    low, high = wilson(right, n)
+    return {"accuracy": round(right / n, 4), "n": n, "low": round(low, 4), "high": round(high, 4)}
 
 
 def augment(x: Tensor, rows: int, recipe: Recipe, rng: Generator) -> Tensor:

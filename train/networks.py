@@ -59,16 +59,20 @@ class Compact(nn.Module):
 
     Each taxel's mean over the window is taken away first: what is left is texture, and int8 does not spend its range
     on the offset. `scale` makes the rest about 1. Batch norms serve training only; `fused` folds them in.
+    keep_means: show the head the means as well, for comparison: where materials were recorded one after another they
+    tell the session rather than the material.
     """
 
-    def __init__(self, form: SweepFormat, classes: int, scale: float, norm: bool = True) -> None:
+    def __init__(
+        self, form: SweepFormat, classes: int, scale: float, norm: bool = True, keep_means: bool = False
+    ) -> None:
         super().__init__()
-        self.form, self.scale = form, scale
+        self.form, self.scale, self.keep_means = form, scale, keep_means
         plan = stages(form.window)
         inputs = (form.rows * form.cols,) + (CHANNELS,) * (len(plan) - 1)
         self.convs = nn.ModuleList(nn.Conv1d(n, CHANNELS, k, s) for n, (k, s) in zip(inputs, plan, strict=True))
         self.norms = nn.ModuleList(nn.BatchNorm1d(CHANNELS) if norm else nn.Identity() for _ in plan)
-        self.head = nn.Linear(CHANNELS * len(plan), classes)
+        self.head = nn.Linear(CHANNELS * len(plan) + keep_means * inputs[0], classes)
 
     def prepare(self, digits: Tensor) -> Tensor:
         """Digits [B, T, R, C] -> float32 [B, R * C, T] about 1, without each taxel's mean."""
@@ -83,9 +87,15 @@ class Compact(nn.Module):
             means.append(x.mean(2))
         return torch.log(torch.cat(means, 1) + FLOOR)
 
+    def seen(self, digits: Tensor) -> Tensor:
+        """Digits [B, T, R, C] -> what the head sees of them [B, F]."""
+        features = self.features(self.prepare(digits))
+        means = digits.flatten(2).float().mean(1) * self.scale
+        return torch.cat([features, means], 1) if self.keep_means else features
+
     def forward(self, digits: Tensor) -> Tensor:
         """Digits [B, T, R, C] -> logits [B, K]."""
-        logits: Tensor = self.head(self.features(self.prepare(digits)))
+        logits: Tensor = self.head(self.seen(digits))
         return logits
 
     def fused(self) -> Compact:
@@ -128,7 +138,9 @@ class Graph:
         return made
 
 
-def trunk(form: SweepFormat, scale: float, weights: Mapping[str, NDArray[Any]]) -> onnx.ModelProto:
+def trunk(
+    form: SweepFormat, scale: float, weights: Mapping[str, NDArray[Any]], keep_means: bool = False
+) -> onnx.ModelProto:
     """`Compact` up to its features: `sweep` -> `features` float32 [1, F]. weights: the state of a fused Compact.
 
     The means are taken away by matrix products, five times as fast in onnxruntime as ReduceMean and Sub along time, and
@@ -138,15 +150,18 @@ def trunk(form: SweepFormat, scale: float, weights: Mapping[str, NDArray[Any]]) 
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
     ones = g("ConstantOfShape", g.constant([form.window, 1], "int64"), value=one)
     x = g("Cast", g("Reshape", "sweep", g.constant([form.window, taxels], "int64")), to=TensorProto.FLOAT)
-    x = g("Gemm", ones, g("Gemm", ones, x, transA=1), x, alpha=-1 / form.window)
+    sums = g("Gemm", ones, x, transA=1)
+    x = g("Gemm", ones, sums, x, alpha=-1 / form.window)
     x = g("Transpose", g("Reshape", x, g.constant([1, form.window, taxels], "int64")), perm=[0, 2, 1])
     means = []
     for i, (_, stride) in enumerate(stages(form.window)):
         w, b = weights[f"convs.{i}.weight"], weights[f"convs.{i}.bias"]
         x = g("Relu", g("Conv", x, g.constant(w if i else w * scale), g.constant(b), strides=[stride]))
         means.append(g("ReduceMean", x, axes=[2], keepdims=0))
-    g("Log", g("Add", g("Concat", *means, axis=1), g.constant(FLOOR)), output="features")
-    return g.model(form, "features", CHANNELS * len(means))
+    seen = g("Log", g("Add", g("Concat", *means, axis=1), g.constant(FLOOR)), output="" if keep_means else "features")
+    if keep_means:
+        g("Concat", seen, g("Mul", sums, g.constant(scale / form.window)), axis=1, output="features")
+    return g.model(form, "features", CHANNELS * len(means) + keep_means * taxels)
 
 
 def with_head(trunk: onnx.ModelProto, weight: NDArray[Any], bias: NDArray[Any]) -> onnx.ModelProto:

@@ -159,13 +159,13 @@ def _cold_start() -> dict[str, Any]:
 
 
 def commit() -> str:
-    """The commit of this checkout; "unknown" elsewhere."""
-    where = Path(__file__).parent
+    """The commit that this code is of, with + where it was changed since; "unknown" outside a checkout."""
+    here = str(Path(__file__).parent)
+    command = ["git", "-C", here, "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
     try:
-        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=where, capture_output=True, text=True, check=False)
-    except FileNotFoundError:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return done.stdout.strip() or "unknown"
 
 
 def _machine() -> dict[str, Any]:
