@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -19,6 +20,7 @@ from appliance.sink import SerialSink
 from appliance.sweep import Sweep, SweepFormat, Verdict
 
 SECOND = 1_000_000_000
+SETTLE_S = 0.02
 
 
 def numbered(n: int, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
@@ -46,6 +48,7 @@ class Rigged:
     port: SerialSink
     heard: list[str] = field(default_factory=list)
     kept: list[Sweep] = field(default_factory=list)
+    rest: bytes = b""
 
     def until(self, done: Callable[[], bool], *, limit_s: float = 60) -> list[Verdict]:
         """Step until `done()`; fails after `limit_s` of the world's time."""
@@ -55,6 +58,7 @@ class Rigged:
             assert self.world.clock.now_ns() < end_ns, "nothing happened"
             verdicts += self.box.step()
             self.listen()
+        self.listen(SETTLE_S)
         return verdicts
 
     def seconds(self, s: float) -> list[Verdict]:
@@ -62,12 +66,11 @@ class Rigged:
         end_ns = self.world.clock.now_ns() + round(s * SECOND)
         return self.until(lambda: self.world.clock.now_ns() >= end_ns)
 
-    def listen(self) -> None:
-        """Read the robot's end."""
-        try:
-            self.heard += os.read(self.far_end, 65536).decode("ascii").splitlines()
-        except BlockingIOError:
-            return
+    def listen(self, wait_s: float = 0) -> None:
+        """Read the robot's end; the kernel passes on what the near end wrote in its own time."""
+        while select.select([self.far_end], [], [], wait_s)[0]:
+            *lines, self.rest = (self.rest + os.read(self.far_end, 65536)).split(b"\r\n")
+            self.heard += [line.decode("ascii") for line in lines]
 
     def ask(self, line: str) -> str:
         """Send a command; the answer's sentence."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pynmea2
 import pytest
-from conftest import SECOND, Rigged
+from conftest import SECOND, SETTLE_S, Rigged
 
 from appliance import bundle, config
 from appliance.__main__ import build
@@ -282,7 +282,7 @@ def test_stopping_answers_what_is_open(rigged: Callable[..., Rigged]):
     box.pulse(stage.START, 0.2)
     end = box.world.clock.now_ns() + SECOND
     box.box.run(lambda: box.world.clock.now_ns() > end)
-    box.listen()
+    box.listen(SETTLE_S)
     assert [a.status for a in answers(box)] == ["aborted"]
 
 

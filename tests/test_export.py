@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from onnx import numpy_helper
 from test_sets import easy
 
 from appliance import bundle
+from appliance.__main__ import main as palpate
 from appliance.classifier import Classifier, session, softmax
 from appliance.clock import SystemClock
 from appliance.errors import BundleError, FormatError
@@ -272,8 +274,9 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
 
 
 @pytest.mark.skipif("PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps")
-def test_fabrics_go_the_whole_way(tmp_path: Path):
-    """Another skin (int16, 16 x 1, 35.6 Hz, 128 frames) by the same commands; unseen recordings through the box."""
+def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Another skin (int16, 16 x 1, 35.6 Hz, 128 frames) by the same commands; unseen recordings over the USB
+    wire into sentences, NEW OBJECT before each recording: as many right as the classifier by itself has."""
     path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
     args = ["--set", str(path), "--only", "direction=0", "--only", "force<=180", "--seed", "1", "--steps", "300"]
     args += ["--split", "recording:0.7", "--rest", str(tmp_path / "rest.npz"), "--out", str(tmp_path / "fit.npz")]
@@ -286,6 +289,13 @@ def test_fabrics_go_the_whole_way(tmp_path: Path):
     told = export.figures(it, rest, "unseen")
     assert told["unseen"]["accuracy"] > 0.9
     assert told["unseen, by recording"]["accuracy"] > 0.95
+    sentences = ["demo", "--sim", f"replay:{tmp_path / 'rest.npz'}", "--virtual", "--sweeps", str(len(rest))]
+    assert palpate([*sentences, "--set", f"classifier.bundle={tmp_path / 'b'}"]) == 0
+    out = capsys.readouterr().out
+    right, total = (int(n) for n in re.search(r"all objects +(\d+) / (\d+)", out).groups())
+    assert total == told["unseen, by recording"]["n"]
+    assert right / total == pytest.approx(told["unseen, by recording"]["accuracy"], abs=0.01)
+    assert "frames lost     0 of" in out
 
 
 @pytest.mark.parametrize("keep", [True, False])

@@ -6,19 +6,22 @@ In: a box on the rig and the far end of its serial line. Out: pictures where the
 from __future__ import annotations
 
 import os
+import select
 from collections.abc import Callable, Sequence
 from typing import IO
 
 from ..clock import Clock
 from ..errors import SensorError
 from ..sensor import Sensor, Tally
-from ..sweep import Frames
+from ..sweep import Frames, Verdict
 from ..wire import Identity
 from .rig import Act
 from .score import Answer, Score
 
 FRAME_NS = 66_000_000
 """Time between two pictures of the skin."""
+HEARD_S = 1.0
+"""The longest that a sentence may take from one end of the line to the other."""
 BAR = 30
 BRIGHT = 160
 """Digits that are shown white; the skin seldom gives more."""
@@ -98,12 +101,13 @@ class Demo:
         self._watched = Watched(sensor)
         return self._watched
 
-    def run(self, step: Callable[[], object], sweeps: int, stopped: Callable[[], bool]) -> None:
-        """Call `step` until `sweeps` were answered or `stopped()`."""
+    def run(self, step: Callable[[], Sequence[Verdict]], sweeps: int, stopped: Callable[[], bool]) -> None:
+        """Call `step` until `sweeps` answers were heard or `stopped()`."""
         assert self._watched
+        said = 0
         while self.score.total.total() < sweeps and not stopped():
-            step()
-            self._listen()
+            said += len(step())
+            self._listen(said, sweeps)
             if self._live and self._clock.now_ns() >= self._next_ns and self._watched.last is not None:
                 self._next_ns = self._clock.now_ns() + FRAME_NS
                 self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(self._watched.last), ""])
@@ -112,15 +116,14 @@ class Demo:
             lost = f"  frames lost     {tally.lost_frames} of {tally.frames + tally.lost_frames}"
             self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}")
 
-    def _listen(self) -> None:
-        """Read what the box has said at the robot's end of the line."""
-        try:
-            self._rest += os.read(self._far_end, 65536)
-        except BlockingIOError:
-            return
-        *lines, self._rest = self._rest.split(b"\r\n")
-        for line in lines:
-            self._hear(line.decode("ascii"))
+    def _listen(self, said: int, wanted: int) -> None:
+        """Read what has come to the robot's end; wait for answers that were said and are not here; stop at `wanted`."""
+        while select.select([self._far_end], [], [], HEARD_S if self.score.total.total() < said else 0)[0]:
+            *lines, self._rest = (self._rest + os.read(self._far_end, 65536)).split(b"\r\n")
+            for line in lines:
+                self._hear(line.decode("ascii"))
+                if self.score.total.total() == wanted:
+                    return
 
     def _hear(self, line: str) -> None:
         if self._raw:
