@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import __version__, bundle, config
 from .box import Box, World
-from .capture import CaptureWriter, Playback
+from .capture import CaptureWriter, Playback, keeper
 from .check import check
 from .classifier import Classifier
 from .clock import SystemClock
@@ -29,7 +29,7 @@ from .lines import Lines
 from .recorder import Recorder
 from .sensor import Sensor, UsbSensor
 from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort, result
-from .sweep import Sweep, SweepFormat, load, save
+from .sweep import Sweep, SweepFormat, load
 from .trigger import GpioTrigger
 
 if TYPE_CHECKING:
@@ -54,6 +54,9 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:
         # whoever read our output has left; nothing more can be said there, not even at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as e:
+        print(f"palpate: {e.filename or 'a file'}: {e.strerror}; check its path and who may use it", file=sys.stderr)
         return 1
 
 
@@ -176,10 +179,10 @@ def run_box(args: argparse.Namespace) -> int:
         port: Port = StdoutPort(world.source)
         if settings.serial.port:
             port = SerialSink(settings.serial, world.clock, world.source)
-        capture = CaptureWriter(args.capture, model.format) if args.capture else None
+        capture = CaptureWriter(args.capture, model.format, _log) if args.capture else None
         if capture:
             stack.callback(capture.close)
-        keep = _keeper(args.keep, model.format)
+        keep = keeper(args.keep, model.format, _log) if args.keep else None
         box = build(settings, model, world, port, stack, capture=capture, keep=keep, log=_log)
 
         def done() -> bool:
@@ -188,17 +191,6 @@ def run_box(args: argparse.Namespace) -> int:
 
         box.run(done)
     return 0
-
-
-def _keeper(folder: Path | None, fmt: SweepFormat) -> Callable[[Sweep], None] | None:
-    """Saves the sweeps that have a window."""
-    if folder is None:
-        return None
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise ConfigError(f"--keep {folder}: {e.strerror}; name a folder that can be written") from e
-    return lambda sweep: save(folder / f"sweep-{sweep.id:06d}.npy", sweep, fmt) if len(sweep.frames) else None
 
 
 def run_demo(args: argparse.Namespace) -> int:
@@ -222,10 +214,11 @@ def run_check(args: argparse.Namespace) -> int:
     """`palpate check`: each part by itself, one line each; 1 where any fails."""
     settings = config.load(args.board, args.set, folder=args.config_dir)
     world = _world(args, lambda: _bundle(settings).format)
-    findings = list(check(world.wire(settings), lambda: _bundle(settings), world))
-    for f in findings:
-        print(f"{'ok  ' if f.ok else 'FAIL'}  {f.part:<14} {f.detail}")
-    return 0 if all(f.ok for f in findings) else 1
+    failed = 0
+    for f in check(world.wire(settings), lambda: _bundle(settings), world):
+        print(f"{'ok  ' if f.ok else 'FAIL'}  {f.part:<14} {f.detail}", flush=True)
+        failed += not f.ok
+    return 1 if failed else 0
 
 
 def run_replay(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Captures: everything that came in, with its times, in one file. In: transfers, states, edges. Out: the same, played again.
+"""Captures (everything that came in, with its times, in one file) and kept sweeps. Out: the same, played again.
 
 A capture played through the same rooms gives the same verdicts bit for bit, since nothing else enters them.
 """
@@ -8,15 +8,15 @@ from __future__ import annotations
 import json
 import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from enum import IntEnum
 from pathlib import Path
 from typing import IO
 
-from .errors import FormatError, SensorError
+from .errors import ConfigError, FormatError, SensorError
 from .sensor import Stream, Tally
-from .sweep import Frames, SweepFormat
+from .sweep import Frames, Sweep, SweepFormat, save
 from .trigger import Edge, EdgeKind
 from .wire import Identity
 
@@ -35,12 +35,20 @@ class Kind(IntEnum):
 
 
 class CaptureWriter:
-    """Writes a capture as it happens; what a power failure cuts off is at most what the system had not written yet."""
+    """Writes a capture as it happens; what a power failure cuts off is at most what the system had not written yet.
 
-    def __init__(self, path: Path, fmt: SweepFormat) -> None:
+    log: told once where the file cannot be written any more; the capture then ends, since one with a hole would lie, and
+    classifying goes on. Raises ConfigError where it cannot be opened.
+    """
+
+    def __init__(self, path: Path, fmt: SweepFormat, log: Callable[[str], None] = lambda line: None) -> None:
         head = json.dumps(asdict(fmt)).encode()
-        self._file: IO[bytes] = path.open("wb")
-        self._file.write(MAGIC + len(head).to_bytes(4, "little") + head)
+        self._path, self._log, self._ended = path, log, False
+        try:
+            self._file: IO[bytes] = path.open("wb")
+        except OSError as e:
+            raise ConfigError(f"--capture {path}: {e.strerror}; name a file that can be written") from e
+        self._put(lambda: self._file.write(MAGIC + len(head).to_bytes(4, "little") + head))
 
     def transfer(self, t_ns: int, data: bytes) -> None:
         """Note a bulk transfer that ended at `t_ns`."""
@@ -56,10 +64,39 @@ class CaptureWriter:
 
     def close(self) -> None:
         """Finish the file."""
-        self._file.close()
+        self._put(self._file.close)
 
     def _write(self, kind: Kind, t_ns: int, data: bytes) -> None:
-        self._file.write(_RECORD.pack(kind, t_ns, len(data)) + data)
+        if not self._ended:
+            self._put(lambda: self._file.write(_RECORD.pack(kind, t_ns, len(data)) + data))
+
+    def _put(self, write: Callable[[], object]) -> None:
+        try:
+            write()
+        except OSError as e:
+            if not self._ended:
+                self._log(f"capture: {self._path} cannot be written: {e.strerror}; it ends here, classifying goes on")
+            self._ended = True
+
+
+def keeper(folder: Path, fmt: SweepFormat, log: Callable[[str], None]) -> Callable[[Sweep], None]:
+    """Saves the sweeps that have a window to `folder`. A full disk costs the recording, never the classifying.
+
+    Raises ConfigError where the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ConfigError(f"--keep {folder}: {e.strerror}; name a folder that can be written") from e
+
+    def keep(sweep: Sweep) -> None:
+        if len(sweep.frames):
+            try:
+                save(folder / f"sweep-{sweep.id:06d}.npy", sweep, fmt)
+            except OSError as e:
+                log(f"keep: sweep {sweep.id} cannot be saved: {e.strerror}; make room in {folder}, classifying goes on")
+
+    return keep
 
 
 class Playback:

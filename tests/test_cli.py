@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -119,6 +120,22 @@ def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsysbinary: pyt
     assert said() == first
 
 
+def test_a_full_disk_costs_the_recording_never_the_classifying(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    """Neither sweeps nor capture can be written: each is told, every sweep is answered, exit code 0."""
+
+    def full(*args: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("appliance.capture.save", full)
+    assert main(["run", "--sim", "skin", *VIRTUAL, "--keep", str(tmp_path), "--capture", "/dev/full"]) == 0
+    said = capfd.readouterr()
+    assert said.out.count(",RES,") == 3
+    assert said.err.count("cannot be saved: No space left on device") == 3
+    assert said.err.count("capture: /dev/full cannot be written: No space left on device") == 1
+
+
 def test_replay_of_a_sweep_set(
     tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
 ):
@@ -180,6 +197,7 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (["replay", "/nowhere"], 8, "cannot be read"),
         (["replay", "/nowhere.npy"], 8, "not a recorded sweep"),
         (["run", "--sim", "skin", "--virtual", "--keep", "/proc/x"], 3, "--keep /proc/x"),
+        (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], 3, "--capture /proc/x"),
     ],
 )
 def test_exit_codes(args: list[str], code: int, hint: str, capsys: pytest.CaptureFixture[str]):

@@ -11,7 +11,7 @@ from conftest import SECOND, idle_world, numbered
 from appliance import wire
 from appliance.config import SensorConfig
 from appliance.sensor import UsbSensor
-from appliance.sim import skin
+from appliance.sim import rig, skin
 from appliance.sim.stage import SimWorld
 from appliance.sweep import EPOCH_BITS, Frames, SweepFormat
 
@@ -326,3 +326,25 @@ def test_another_format_is_not_other_code():
     assert frames.taxels.shape[1:] == (16, 1)
     assert (np.diff(frames.seq) == 1).all()
     assert sensor.state == "streaming"
+
+
+@pytest.mark.parametrize("replugged", [True, False])
+def test_a_board_whose_clock_starts_anew(replugged: bool):
+    """After a replug, or a crash of the firmware that USB does not notice, times and numbers begin a new epoch, and are right."""
+    world = idle_world(first_seq=1_000_000)
+    sensor = sensor_on(world)
+    now = world.clock.now_ns()
+
+    def swap() -> None:
+        world.backend.board = rig.Board(FMT, world.robot, world.clock)
+        world.backend.board.running = not replugged
+
+    if replugged:
+        world.backend.at(now + 2 * SECOND, world.backend.unplug)
+    world.backend.at(now + 3 * SECOND, swap)
+    read_for(sensor, world, 3.2)
+    frames = read_for(sensor, world, 2)
+    assert sensor.tally.enumerations == 1 + replugged
+    assert set(frames.seq >> EPOCH_BITS) == {1}
+    truth = np.array([world.backend.board.frame_ns(int(s) & ((1 << EPOCH_BITS) - 1)) for s in frames.seq])
+    assert np.abs(frames.t_ns - truth).max() < 1_000_000
