@@ -78,6 +78,9 @@ class DeviceClock:
             if offset >= self._points[-1][1]:
                 return
             self._points[-1] = (device_ns, offset)
+            at, low, slope = self._line
+            if offset >= low + slope * (device_ns - at):
+                return  # above the line: it stays the lower envelope
         else:
             self._points.append((device_ns, offset))
         self._line = self._fit()

@@ -92,16 +92,19 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
     return places, denied
 
 
+def line_error(doing: str, names: Iterable[str], e: OSError) -> LineError:
+    """What an errno means to a person, with the lines that it befell."""
+    advice = _ADVICE.get(e.errno or 0, "see the kernel log (dmesg)")
+    return LineError(f"cannot {doing} gpio lines {', '.join(names)}: {e.strerror} (errno {e.errno}); {advice}")
+
+
 @contextmanager
 def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
     """Make a LineError that names the lines of any OSError."""
     try:
         yield
     except OSError as e:
-        advice = _ADVICE.get(e.errno or 0, "see the kernel log (dmesg)")
-        raise LineError(
-            f"cannot {doing} gpio lines {', '.join(names)}: {e.strerror} (errno {e.errno}); {advice}"
-        ) from e
+        raise line_error(doing, names, e) from e
 
 
 def request_lines(
@@ -134,7 +137,7 @@ class Lines:
         self._clock, self._value = clock, gpio.line.Value
         names = [name for name in (self._ready, self._busy, self._fault, self._valid, *self._bits) if name]
         self._levels = dict.fromkeys(names, False)
-        self._was_busy = False
+        self._shown = False, False, False
         settings = gpio.LineSettings(direction=gpio.line.Direction.OUTPUT, output_value=self._value.INACTIVE)
         with ExitStack() as stack:
             self._requests = request_lines(gpio, names, settings, stack)
@@ -147,9 +150,11 @@ class Lines:
 
     def show(self, *, ready: bool, busy: bool, fault: bool) -> None:
         """Drive READY, BUSY and FAULT; writes only what has changed. RESULT VALID falls when a sweep begins."""
-        if busy and not self._was_busy:
+        if (ready, busy, fault) == self._shown:
+            return
+        if busy and not self._shown[1]:
             self.result(None)
-        self._was_busy = busy
+        self._shown = ready, busy, fault
         self._write({self._ready: ready, self._busy: busy, self._fault: fault})
 
     def result(self, code: int | None) -> None:

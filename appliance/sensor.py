@@ -83,6 +83,7 @@ class Stream:
 
     def __init__(self, fmt: SweepFormat, tally: Tally) -> None:
         self._format, self._tally = fmt, tally
+        self._grid, self._digits = (fmt.rows, fmt.cols), fmt.digits
         self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(np.int64)
         self._place = wire.Place(-1)
         self.restart()
@@ -102,11 +103,11 @@ class Stream:
         got = wire.unpack(self._leftover + data)
         self._leftover = got.leftover
         self._tally.garbage_bytes += got.garbage
-        f = self._format
         for p in got.packets:
-            if (*p.taxels.shape[1:], p.taxels.dtype) != (f.rows, f.cols, f.digits):
-                raise SensorMismatch(f"the skin sent {p.taxels.shape[1:]} {p.taxels.dtype}, but it had announced {f}")
-            self._tally.fifo_overflows += wire.Flag.OVERFLOW in p.flags
+            if p.taxels.shape[1:] != self._grid or p.taxels.dtype != self._digits:
+                form = f"{p.taxels.shape[1:]} {p.taxels.dtype}"
+                raise SensorMismatch(f"the skin sent {form}, but it had announced {self._format}; check its firmware")
+            self._tally.fifo_overflows += bool(p.flags & wire.Flag.OVERFLOW.value)
         fresh, place, lost, stale = wire.follow(got.packets, self._place)
         if place.epoch != self._place.epoch:
             self._device = DeviceClock()

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
-from .lines import check_binding, naming, request_lines
+from .lines import check_binding, line_error, naming, request_lines
 
 if TYPE_CHECKING:
     from gpiod import EdgeEvent, LineRequest
@@ -139,8 +139,12 @@ class GpioTrigger:
     def edges(self, now_ns: int) -> list[Edge]:
         """Edges that have settled by `now_ns` (read before the call), in order of time; never waits."""
         for bank in self._banks:
-            with naming("read", bank.names.values()):
+            try:  # not `naming`, whose generator costs more than a look at an empty queue
                 self._read(bank, now_ns)
+            except OSError as e:
+                raise line_error("read", bank.names.values(), e) from e
+        if self._blind_ns is None and not self._pending and not any(line.count for line in self._lines):
+            return []
         horizon_ns = min(bank.known_ns for bank in self._banks)
         for line in self._lines:
             if line.count and horizon_ns - line.last_ns >= self._glitch_ns:
@@ -171,7 +175,8 @@ class GpioTrigger:
             events = bank.request.read_edge_events(left)
             bank.early += events
             left -= len(events)
-        bank.early.sort(key=bank.step)
+        if len(bank.early) > 1:
+            bank.early.sort(key=bank.step)
         while bank.early:
             event = bank.early[0]
             # interrupt threads of two lines may overtake each other: wait a little before calling an event dropped

@@ -56,11 +56,11 @@ class Request(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """Frames in a row: seq and t_us (32 bits, as sent) belong to the first; taxels [n, R, C] digits."""
+    """Frames in a row: seq and t_us (32 bits, as sent) belong to the first, flags are bits of Flag; taxels [n, R, C] digits."""
 
     seq: int
     t_us: int
-    flags: Flag
+    flags: int
     taxels: NDArray[Any]
 
 
@@ -180,7 +180,7 @@ def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
     if kind == Kind.REPLY:
         return Reply(count, data[at + HEADER.size : end]), size
     taxels = np.frombuffer(data, _DTYPES[digit], count * rows * cols, at + HEADER.size).reshape(count, rows, cols)
-    return Packet(seq, t_us, Flag(flags & 3), taxels), size
+    return Packet(seq, t_us, flags, taxels), size
 
 
 def follow(packets: list[Packet], place: Place) -> tuple[list[tuple[int, Packet]], Place, int, int]:

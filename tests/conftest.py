@@ -34,7 +34,7 @@ def idle_world(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -
     n = min(round(seconds * fmt.rate_hz), 60_000)
     acts = [rig.Act(numbered(n, fmt), 10**9, 10**9 + 1, "")]
     world = stage.build(fmt, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
-    world.backend.board = rig.Board(fmt, world.robot, world.clock, **board)
+    world.backend.board = rig.Board(fmt, world.robot, world.clock, **{"packet_frames": 4} | board)
     return world
 
 

@@ -112,7 +112,7 @@ class Board:
     """
 
     def __init__(
-        self, fmt: SweepFormat, robot: Robot, clock: Clock, *, packet_frames: int = 4, fifo_frames: int = 750,
+        self, fmt: SweepFormat, robot: Robot, clock: Clock, *, packet_frames: int = 6, fifo_frames: int = 750,
         ppm: float = 0.0, latency: Callable[[], int] = lambda: 150_000, serial: str = "SIM0001", first_seq: int = 0,
     ) -> None:  # fmt: skip
         self.identity = wire.Identity(wire.VERSION, (1, 0, 0), "palpate-sim", serial)
