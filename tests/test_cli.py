@@ -192,7 +192,7 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (["run", "--board", "toaster"], 3, "rpi5"),
         (["run", "--set", "sweep.longets_s=1"], 3, "longest_s"),
         (["run", "--sim", "skin", "--set", "classifier.bundle=/nowhere"], 4, "no bundle at /nowhere"),
-        (["run", "--sim", "replay:/nowhere.npz"], 8, "/nowhere.npz"),
+        (["run", "--sim", "replay:/nowhere.npz"], 8, "nowhere.npz: not a sweep set"),
         (["run", "--board", "rpi5"], 6, "gpiochip"),
         (["replay", "/nowhere"], 8, "cannot be read"),
         (["replay", "/nowhere.npy"], 8, "not a recorded sweep"),
@@ -260,7 +260,9 @@ def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert figures["cold_start_s"] > 0
     assert figures["memory"] == {"seed": 2000}
     assert {"commit", "seed", "machine"} <= figures.keys()
-    assert "edge_to_sentence_ms" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "edge_to_sentence_ms" in out
+    assert "fp32 and paper_int8 were not measured" in out
 
 
 def test_bench_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

@@ -24,9 +24,10 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from appliance.errors import FormatError
 from appliance.sim.score import wilson
+from appliance.sim.sets import read
 
 from .networks import Compact
-from .sets import SweepSet, read
+from .sets import SweepSet
 
 Array = NDArray[Any]
 HELD_OUT = 0.2

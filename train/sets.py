@@ -1,27 +1,23 @@
 """The room of sweep sets. In: a file of the user's, or the name of a simulated set. Out: a checked SweepSet.
 
 A set knows which sweeps belong together (`groups`), can be narrowed to some of them and split so that no recording is
-on both sides. A broken file is refused by name: no later room looks at shapes again.
+on both sides. What a file must hold stands in appliance/sim/sets.py, which the box plays sets with.
 """
 
 from __future__ import annotations
 
 import re
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from appliance.errors import FormatError
-from appliance.sim import skin
-from appliance.sweep import DIGITS, SweepFormat
+from appliance.sim import sets, skin
+from appliance.sim.sets import Array, load_file
 
-Array = NDArray[Any]
 SIMULATED = re.compile(r"sim:(?P<name>[^:]+)(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?")
 CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)\s*(-?\d+)\s*")
 OWN_NUMBERS = ("recording", "position", "session")
@@ -30,66 +26,8 @@ COMPARE: dict[str, Callable[[Array, int], Array]] = {"=": np.equal, "<=": np.les
 
 
 @dataclass(frozen=True)
-class SweepSet:
-    """N sweeps with what is known of them.
-
-    samples: digits [N, T, R, C] of one of DIGITS. labels: int [N], index into `materials`.
-    groups: int [N] each; sweeps with the same number of `recording` are pieces of one recording.
-    Raises FormatError naming `source` and what is wrong.
-    """
-
-    samples: Array
-    labels: Array
-    materials: tuple[str, ...]
-    rate_hz: float
-    groups: dict[str, Array] = field(default_factory=dict)
-    source: str = "sweep set"
-
-    def __post_init__(self) -> None:
-        x, n = self.samples, len(self.materials)
-        if x.ndim != 4 or 0 in x.shape:
-            raise self._error(
-                f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], none empty"
-            )
-        if x.dtype.name not in DIGITS:
-            raise self._error(f"samples are {x.dtype}; use one of {', '.join(DIGITS)}")
-        if x.dtype.kind == "f" and not np.isfinite(x).all():
-            at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
-            raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
-        for name, values in {"labels": self.labels, **{f"group_{k}": v for k, v in self.groups.items()}}.items():
-            if values.shape != (len(x),) or values.dtype.kind not in "iu":
-                what = f"{values.dtype} {list(values.shape)}"
-                raise self._error(f"{name} holds {what}; give one whole number for each of {len(x)} sweeps")
-        outside = np.flatnonzero((self.labels < 0) | (self.labels >= n))
-        if len(outside):
-            i = outside[0]
-            raise self._error(
-                f"label {self.labels[i]} of sweep {i} is out of range; there are {n} materials, from 0 on"
-            )
-        if len(set(self.materials)) < n:
-            raise self._error(f"materials {list(self.materials)} name one twice; give each its own name")
-        if not 0 < self.rate_hz < np.inf:
-            raise self._error(f"rate_hz is {self.rate_hz}; give frames per second")
-
-    def _error(self, why: str) -> FormatError:
-        return FormatError(f"{self.source}: {why}")
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
-    @property
-    def format(self) -> SweepFormat:
-        """The form of each sweep."""
-        _, window, rows, cols = self.samples.shape
-        return SweepFormat(rows, cols, self.rate_hz, window, self.samples.dtype.name)
-
-    def group(self, name: str) -> Array:
-        """Group `name`, int [N]; where nothing is known of recordings each sweep is one. Raises FormatError."""
-        if name in self.groups:
-            return self.groups[name]
-        if name == "recording":
-            return np.arange(len(self))
-        raise self._error(f"no group {name!r}; it has {', '.join(sorted(self.groups)) or 'none'}")
+class SweepSet(sets.SweepSet):
+    """A set to train on: it can be narrowed and split."""
 
     def of_several(self) -> SweepSet:
         """The set itself. Raises FormatError where all its sweeps are of one material."""
@@ -157,7 +95,7 @@ def load(spec: str, seed: int = 0) -> SweepSet:
     SWEEPS: per material and position. SEED-LAST: one set of several worlds, whose positions differ. seed: of a
     simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
     """
-    return _simulated(spec, seed) if spec.startswith("sim:") else _file(Path(spec))
+    return _simulated(spec, seed) if spec.startswith("sim:") else load_file(Path(spec), SweepSet).of_several()
 
 
 def join(sets: Sequence[SweepSet]) -> SweepSet:
@@ -201,29 +139,3 @@ def _simulated(spec: str, seed: int) -> SweepSet:
     if not worlds:
         raise FormatError(f"set {spec!r} is empty: its last seed comes before its first")
     return replace(join(worlds), source=spec)
-
-
-def read(path: Path, what: str) -> dict[str, Array]:
-    """All arrays of an .npz, nothing unpickled. Raises FormatError saying that it is not `what`."""
-    try:
-        with np.load(path, allow_pickle=False) as z:
-            return {k: z[k] for k in z.files}
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as e:
-        raise FormatError(f"{path.name}: not {what}: {e}") from e
-
-
-def _file(path: Path) -> SweepSet:
-    held = read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)")
-    missing = {"samples", "labels", "materials", "rate_hz"} - set(held)
-    if missing:
-        raise FormatError(
-            f"{path.name}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, materials, rate_hz"
-        )
-    if held["materials"].ndim != 1 or held["materials"].dtype.kind != "U":
-        raise FormatError(f"{path.name}: materials hold {held['materials'].dtype}; give a list of names")
-    if held["rate_hz"].size != 1 or held["rate_hz"].dtype.kind not in "iuf":
-        raise FormatError(f"{path.name}: rate_hz holds {held['rate_hz']!r}; give one number, frames per second")
-    groups = {k.removeprefix("group_"): v for k, v in held.items() if k.startswith("group_")}
-    materials = tuple(str(m) for m in held["materials"])
-    whole = SweepSet(held["samples"], held["labels"], materials, held["rate_hz"].item(), groups, path.name)
-    return whole.of_several()

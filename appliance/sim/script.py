@@ -8,15 +8,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import ConfigError, FormatError
-from ..sweep import DIGITS, SweepFormat
+from ..sweep import SweepFormat
 from . import skin
 from .rig import Act
+from .sets import SweepSet, load_file
 
 SETS = "replay:"
 PAUSE_S = 0.1, 0.14
@@ -61,47 +60,21 @@ def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement]
         yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
 
 
-def read_set(path: Path) -> tuple[SweepFormat, dict[str, NDArray[Any]]]:
-    """Format and arrays of a sweep set (.npz): samples [N, T, R, C], labels [N], materials [K], rate_hz, group_*.
-
-    Raises FormatError where the file cannot be read or lacks one of them.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as z:
-            arrays = dict(z)
-        n, frames, rows, cols = arrays["samples"].shape
-        fmt = SweepFormat(rows, cols, float(arrays["rate_hz"]), frames, arrays["samples"].dtype.name)
-        names = [str(arrays["materials"][k]) for k in arrays["labels"]]
-    except KeyError as e:
-        raise FormatError(f"{path}: a sweep set needs samples, labels, materials and rate_hz; {e} is missing") from e
-    except (OSError, ValueError, IndexError, TypeError) as e:
-        raise FormatError(
-            f"{path}: not a sweep set: {e}; see the README for its form, digits are {', '.join(DIGITS)}"
-        ) from e
-    if len(names) != n:
-        raise FormatError(f"{path}: {n} samples but {len(names)} labels; each sweep needs one")
-    arrays["names"] = np.array(names)
-    return fmt, arrays
-
-
 def replay(path: Path, fmt: SweepFormat) -> Iterator[Act]:
     """The sweeps of a set in their order; NEW OBJECT wherever a new recording begins. FormatError where it is not `fmt`."""
-    held, arrays = read_set(path)
-    if held != fmt:
+    held = load_file(path, SweepSet)
+    if held.format != fmt:
         raise FormatError(
-            f"{path} holds {held}, the bundle wants {fmt}; name its bundle with --set classifier.bundle=DIR"
+            f"{path} holds {held.format}, the bundle wants {fmt}; name its bundle with --set classifier.bundle=DIR"
         )
-    return _play(fmt, arrays)
+    return _play(held)
 
 
-def _play(fmt: SweepFormat, arrays: dict[str, NDArray[Any]]) -> Iterator[Act]:
-    recordings = arrays.get("group_recording")
-    before = None
-    for i, window in enumerate(arrays["samples"]):
-        frames = np.concatenate([window[:1].repeat(2 * MARGIN, 0), window, window[-1:].repeat(2 * MARGIN, 0)])
-        recording = None if recordings is None else int(recordings[i])
-        yield Act(
-            frames, MARGIN, fmt.window // 2 * 2 + 3 * MARGIN, str(arrays["names"][i]),
-            new_object=recording is not None and recording != before,
-        )  # fmt: skip
-        before = recording
+def _play(held: SweepSet) -> Iterator[Act]:
+    begins = np.ones(len(held), bool)
+    recording = held.groups.get("recording", np.zeros(len(held), int))
+    begins[1:] = recording[1:] != recording[:-1]
+    stop = held.format.window // 2 * 2 + 3 * MARGIN  # even, so that a frame lies in the middle
+    for window, label, new in zip(held.samples, held.labels, begins & ("recording" in held.groups), strict=True):
+        before, after = window[:1].repeat(2 * MARGIN, 0), window[-1:].repeat(2 * MARGIN, 0)
+        yield Act(np.concatenate([before, window, after]), MARGIN, stop, held.materials[label], bool(new))
