@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import shutil
 import subprocess
@@ -18,9 +19,9 @@ BOX = [p for p in ROOMS if p.is_relative_to(ROOT / "appliance") and "sim" not in
 ALLOWED = {"numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2"}  # the last is Python's own from 3.12 on
 
 
-def run(*args: str | Path, cwd: Path) -> str:
+def run(*args: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
     """Run a command; its output, or a failure that shows it."""
-    done = subprocess.run(args, cwd=cwd, capture_output=True, text=True, check=False)
+    done = subprocess.run(args, cwd=cwd, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -61,6 +62,17 @@ def test_the_simulator_is_not_loaded_unless_named():
     """`palpate config` and everything it imports leave appliance.sim alone."""
     code = "import sys; from appliance.__main__ import main; main(['config']); print([m for m in sys.modules if '.sim' in m])"
     assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
+
+
+def test_onnxruntime_starts_no_thread_of_its_own():
+    """Telemetry off: no uploader, no pool; a session that has run leaves the process with its one thread."""
+    code = (
+        "import os; from appliance import bundle, classifier, clock; import onnxruntime;"
+        "box = classifier.Classifier(bundle.load(bundle.DEFAULT), clock.SystemClock()); box.self_test();"
+        "print(len(os.listdir('/proc/self/task')))"
+    )
+    env = {k: v for k, v in os.environ.items() if not k.startswith("ORT_")} | {"OPENBLAS_NUM_THREADS": "1"}
+    assert run(sys.executable, "-c", code, cwd=ROOT, env=env).splitlines()[-1] == "1"
 
 
 @pytest.mark.parametrize("path", ROOMS, ids=lambda p: str(p.relative_to(ROOT)))
