@@ -1,4 +1,4 @@
-"""The command `palpate`: the only place where parts are put together. In: arguments and configuration. Out: an exit code.
+"""The command `palpate`: the only place where parts are put together. In: arguments, configuration. Out: an exit code.
 
 Simulated parts are chosen by name here and nowhere else, and every sentence they cause says so.
 """
@@ -35,8 +35,8 @@ from .trigger import GpioTrigger
 if TYPE_CHECKING:
     from .sim.stage import SimWorld
 
-EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments; 3 configuration;
-4 bundle; 5 skin; 6 gpio lines; 7 serial port; 8 a file of another form; 130 interrupted"""
+EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments;
+3 configuration; 4 bundle; 5 skin; 6 gpio lines; 7 serial port; 8 a file of another form; 130 interrupted"""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""The box itself: one thread, one loop. In: sensor, trigger, recorder, classifier, sinks. Out: an answer to every trigger.
+"""The box itself: one thread, one loop. In: sensor, trigger, recorder, classifier, sinks. Out: answers to all triggers.
 
 Which parts these are is decided elsewhere (`__main__`); nothing here knows whether they are real.
 """

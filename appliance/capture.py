@@ -37,8 +37,8 @@ class Kind(IntEnum):
 class CaptureWriter:
     """Writes a capture as it happens; what a power failure cuts off is at most what the system had not written yet.
 
-    log: told once where the file cannot be written any more; the capture then ends, since one with a hole would lie, and
-    classifying goes on. Raises ConfigError where it cannot be opened.
+    log: told once where the file cannot be written any more; the capture then ends, since one with a hole would lie,
+    and classifying goes on. Raises ConfigError where it cannot be opened.
     """
 
     def __init__(self, path: Path, fmt: SweepFormat, log: Callable[[str], None] = lambda line: None) -> None:

@@ -73,7 +73,8 @@ def _skin(settings: Config, bundle: Bundle, world: World) -> str:
             raise sensor.trouble or SensorError(f"the skin sent no frame within {LISTEN_S} s; replug it")
         who = sensor.identity
         tally = sensor.tally
-        return f"{who.board if who else ''} {who.serial if who else ''}, {tally.frames} frames in {LISTEN_S} s, {tally.lost_frames} lost"
+        name = f"{who.board} {who.serial}" if who else ""
+        return f"{name}, {tally.frames} frames in {LISTEN_S} s, {tally.lost_frames} lost"
     finally:
         sensor.close()
 

@@ -70,8 +70,8 @@ def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
 def fuse(scores: list[NDArray[np.float64]], how: str) -> NDArray[np.float64]:
     """Fuse the probabilities [K] of several sweeps of one object into one [K].
 
-    `product` (Bayes with independent sweeps; Tulbure and Baeuml 2018) is the default. `vote` is the paper's sec. V.D: the most
-    frequent label wins and of equally frequent ones the one seen first, so two sweeps never differ from the first.
+    `product` (Bayes with independent sweeps; Tulbure and Baeuml 2018) is the default. `vote` is the paper's sec. V.D:
+    the most frequent label wins, of equally frequent ones the one seen first: two sweeps never differ from the first.
     """
     if how == "product":
         # floored, so that one sweep that is sure beyond float64 cannot veto all others with log 0

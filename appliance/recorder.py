@@ -55,7 +55,7 @@ class Recorder:
         return bool(self._closing) or (self._open is not None and not self._open.answered)
 
     def put(self, frames: Frames, now_ns: int) -> None:
-        """Take frames into the ring. Frames of a new enumeration end the open sweep: its first half is of another time."""
+        """Take frames into the ring. Those of a new enumeration end the open sweep: its first half lies before it."""
         if not len(frames):
             return
         if self._newest >= 0 and frames.seq[-1] >> EPOCH_BITS != self._newest >> EPOCH_BITS:
@@ -169,7 +169,7 @@ class Recorder:
 
 
 def _interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
-    """Fill `missing` rows of `frames` in place from their neighbours in `have`; False where a gap is too wide for that."""
+    """Fill `missing` rows of `frames` in place from their neighbours in `have`; False where a gap is too wide."""
     right = np.searchsorted(have, missing)
     if len(missing) and (right.min() == 0 or right.max() == len(have)):
         return False

@@ -1,4 +1,4 @@
-"""UsbSensor: frames from pyusb, through unplug and replug. In: a pyusb backend and a clock. Out: Frames, state, trouble.
+"""UsbSensor: frames from pyusb, through unplug and replug. In: a pyusb backend, a clock. Out: Frames, state, trouble.
 
 `read` never raises for what a bus can do: it gives no frames, says why in `state` and `trouble`, and tries again.
 """

@@ -74,7 +74,7 @@ def checksum(body: str) -> str:
 
 
 def sentence(kind: str, *fields: object) -> bytes:
-    """`$PPLP,KIND,field,…*hh` with CR and LF. Characters that NMEA reserves become spaces; too long a last field is cut."""
+    """`$PPLP,KIND,field,…*hh` with CR and LF. What NMEA reserves becomes a space; too long a last field is cut."""
     body = ",".join([TALKER, kind, *(_UNSAFE.sub(" ", str(f)) for f in fields)])[: MAX_LINE - 6]
     return f"${body}*{checksum(body)}\r\n".encode("ascii")
 

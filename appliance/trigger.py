@@ -1,4 +1,4 @@
-"""The trigger room. In: the robot's GPIO edges, time-stamped by the kernel. Out: START, STOP, NEW OBJECT, settled, in order.
+"""The trigger room. In: the robot's GPIO edges, stamped by the kernel. Out: START, STOP, NEW OBJECT, settled, in order.
 
 What the kernel dropped or a storm buried is told as LOST; nothing is made up for it.
 """

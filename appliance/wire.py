@@ -1,4 +1,4 @@
-"""Bytes <-> frames: firmware_config/PROTOCOL.md part 1 in pure functions. Bytes come in, packets and what was lost go out.
+"""Bytes <-> frames: firmware_config/PROTOCOL.md part 1 in pure functions. In: bytes. Out: packets and what was lost.
 
 Nothing here raises on what a wire can bring, and a frame is given out only where its packet's CRC is right.
 """
@@ -24,7 +24,7 @@ CRC = struct.Struct("<I")
 MAX_PAYLOAD = 4096
 MAX_FRAMES = 255
 RECENT = 1 << 16
-"""A packet at most this many frames behind the newest is a repetition; one further behind means that the count restarted."""
+"""A packet at most this many frames behind the newest is a repetition; one further behind is a count that restarted."""
 
 _DTYPES = tuple(np.dtype(d).newbyteorder("<") for d in DIGITS)
 _IDENTITY = struct.Struct("<BBBB16s16s")
@@ -56,7 +56,7 @@ class Request(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """Frames in a row: seq and t_us (32 bits, as sent) belong to the first, flags are bits of Flag; taxels [n, R, C] digits."""
+    """Frames in a row: seq and t_us (32 bits, as sent) of the first, flags (bits of Flag), taxels [n, R, C] digits."""
 
     seq: int
     t_us: int
@@ -94,7 +94,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class SkinFormat:
-    """What a readout board sends: grid, digit type, frames a second, depth of its FIFO in frames, frames in a packet."""
+    """What a readout board sends: grid, digit type, frames a second, frames in its FIFO and in a packet."""
 
     rows: int
     cols: int

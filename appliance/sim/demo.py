@@ -1,4 +1,4 @@
-"""What a person sees: the skin live in the terminal while a sweep runs, then the verdict and its sentence, then a table.
+"""What a person sees: the skin live in the terminal while a sweep runs, the verdict and its sentence, then a table.
 
 In: a box on the rig and the far end of its serial line. Out: pictures where there is a terminal, else plain lines.
 """

@@ -38,7 +38,7 @@ class VirtualClock:
 
 
 class SkippingClock:
-    """Real time without the waiting: work takes the time it takes, sleep takes none. For measuring the box's own share."""
+    """Real time without the waiting: work takes the time it takes, sleep takes none. For measuring the box itself."""
 
     def __init__(self) -> None:
         self._skipped_ns = 0
@@ -72,7 +72,7 @@ class EdgeLines(Protocol):
 
 
 class Robot:
-    """Plays a script of acts: drives start, stop and NEW OBJECT at the right frames. `played` keeps what it did, for scoring."""
+    """Plays a script of acts: drives start, stop and NEW OBJECT at the right frames. `played` is what it did."""
 
     def __init__(self, script: Iterator[Act], lines: EdgeLines, *, start: str, stop: str, new_object: str = "") -> None:
         self.played: list[Act] = []
@@ -106,7 +106,7 @@ class Robot:
 
 
 class Board:
-    """A readout board that speaks PROTOCOL.md: samples the script at its own rate, holds frames in a FIFO, sends packets.
+    """A readout board that speaks PROTOCOL.md: samples the script at its own rate, has a FIFO, sends packets.
 
     ppm: error of its crystal. latency: draws the nanoseconds from a packet's last frame to its arrival.
     """

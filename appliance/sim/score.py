@@ -1,4 +1,4 @@
-"""Right or wrong: answers as the robot read them against what it did. In: sentences and acts. Out: counts with intervals."""
+"""Right or wrong: answers as the robot read them against what it did. In: sentences, acts. Out: counts, intervals."""
 
 from __future__ import annotations
 

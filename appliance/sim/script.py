@@ -41,7 +41,7 @@ def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
 
 
 def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = ()) -> Iterator[Act]:
-    """Sweeps over the six tubes in random order, `sweeps` of them or without end; each tube is turned before each sweep.
+    """Sweeps over the six tubes in random order, `sweeps` of them or without end; tubes are turned before each sweep.
 
     places: where the skin sits, the next one for each round of six tubes; by default one place drawn from `seed`.
     """
@@ -61,7 +61,7 @@ def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement]
 
 
 def replay(path: Path, fmt: SweepFormat) -> Iterator[Act]:
-    """The sweeps of a set in their order; NEW OBJECT wherever a new recording begins. FormatError where it is not `fmt`."""
+    """The sweeps of a set in order; NEW OBJECT wherever a new recording begins. FormatError where it is not `fmt`."""
     held = load_file(path, SweepSet)
     if held.format != fmt:
         raise FormatError(
