@@ -45,8 +45,8 @@ class DeviceClock:
     Arrival minus device time is the clock offset plus a delay that is never negative, so the offset is the lower
     envelope of these points. Until `settle_s` have been seen it is their minimum. Then it is the line below all points
     of the last `span_s` that lies closest to them on average: the edge of their lower convex hull over the mean time,
-    with its slope bounded by `max_ppm` (two crystals differ by less). What stays is the shortest delay itself, some 0.1 ms,
-    which cannot be told from the offset. Make a new one after each enumeration: the device's clock starts anew.
+    with its slope bounded by `max_ppm` (two crystals differ by less). What stays is the shortest delay itself, some
+    0.1 ms, which cannot be told from the offset. Make a new one after each enumeration: the device's clock starts anew.
     """
 
     def __init__(
