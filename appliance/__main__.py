@@ -158,7 +158,7 @@ def build(
     return Box(
         watch(sensor), trigger, Recorder(model.format, settings.sweep), classifier, world.clock, sinks=sinks,
         port=port, panel=lines, state_s=settings.serial.state_s, source=world.source, log=log,
-        edge_tap=capture.edges if capture else None, keep=keep,
+        tap=capture, keep=keep,
     )  # fmt: skip
 
 
@@ -222,7 +222,7 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_replay(args: argparse.Namespace) -> int:
-    """`palpate replay`: the sentences of a capture, or of one saved sweep."""
+    """`palpate replay`: all sentences of a capture, or that of one saved sweep."""
     settings, model = _settings(args)
     if args.file.suffix == ".npy":
         sweep, fmt = load(args.file)
@@ -232,8 +232,10 @@ def run_replay(args: argparse.Namespace) -> int:
     play = Playback(args.file)
     _same(args.file, play.format, model)
     classifier = Classifier(model, play, settings.classifier.fuse)
-    port = StdoutPort("replay")
-    Box(play, play, Recorder(model.format, settings.sweep), classifier, play, sinks=[port]).run(lambda: play.finished)
+    port = StdoutPort("replay", play.commands)
+    recorder = Recorder(model.format, settings.sweep)
+    box = Box(play, play, recorder, classifier, play, sinks=[port], port=port, source="replay")
+    box.run(lambda: play.finished)
     return 0
 
 

@@ -33,6 +33,18 @@ class Panel(Protocol):
         ...
 
 
+class Tap(Protocol):
+    """Takes note of what comes in beside frames, for captures."""
+
+    def edges(self, t_ns: int, edges: list[Edge]) -> None:
+        """Edges have settled."""
+        ...
+
+    def command(self, t_ns: int, name: str) -> None:
+        """A command is about to be carried out."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class World:
     """What the drivers stand on. These are the real devices; the rig's world says otherwise.
@@ -58,20 +70,20 @@ class Box:
     """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer, listen.
 
     port: where commands come from and state sentences go, or None. panel: READY, BUSY, FAULT, or None.
-    edge_tap: called with (now, edges), for captures. keep: called with each sweep, for recordings.
+    tap: takes note of edges and commands, for captures. keep: called with each sweep, for recordings.
     """
 
     def __init__(
         self, sensor: Sensor, trigger: Trigger, recorder: Recorder, classifier: Classifier, clock: Clock, *,
         sinks: Sequence[ResultSink] = (), port: Port | None = None, panel: Panel | None = None,
         state_s: float = 1.0, source: str = "usb", log: Callable[[str], None] = lambda line: None,
-        edge_tap: Callable[[int, list[Edge]], None] | None = None, keep: Callable[[Sweep], None] | None = None,
+        tap: Tap | None = None, keep: Callable[[Sweep], None] | None = None,
     ) -> None:  # fmt: skip
         self.answered = 0
         self._sensor, self._trigger, self._recorder, self._classifier = sensor, trigger, recorder, classifier
         self._clock, self._sinks, self._port, self._panel = clock, sinks, port, panel
         self._state_ns, self._source, self._log = round(state_s * 1e9), source, log
-        self._edge_tap, self._keep = edge_tap, keep
+        self._tap, self._keep = tap, keep
         self._next_state_ns = clock.now_ns()
         self._troubles: dict[str, str] = {}
 
@@ -93,8 +105,8 @@ class Box:
         now = self._clock.now_ns()
         self._recorder.put(frames, now)
         edges = self._trigger.edges(now)
-        if self._edge_tap and edges:
-            self._edge_tap(now, edges)
+        if self._tap and edges:
+            self._tap.edges(now, edges)
         able = self._sensor.state == "streaming" and not self._trigger.blind
         self._recorder.trigger(edges, able, now)
         if self._sensor.state != "streaming":
@@ -122,6 +134,8 @@ class Box:
         if not self._port:
             return
         for command in self._port.commands():
+            if self._tap and not command.error:
+                self._tap.command(now_ns, command.name)
             self._port.say(self._obey(command))
         self._note("serial", self._port.trouble, "open")
         if now_ns >= self._next_state_ns:

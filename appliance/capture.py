@@ -1,4 +1,4 @@
-"""Captures (everything that came in, with its times, in one file) and kept sweeps. Out: the same, played again.
+"""Captures (transfers, states, edges, commands with their times, in one file) and kept sweeps. Out: the same, played.
 
 A capture played through the same rooms gives the same verdicts bit for bit, since nothing else enters them.
 """
@@ -9,13 +9,15 @@ import json
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from enum import IntEnum
 from pathlib import Path
 from typing import IO
 
-from .errors import ConfigError, FormatError, SensorError
+from .errors import ConfigError, FormatError, SensorError, SensorMismatch
 from .sensor import Stream, Tally
+from .sink import Command
 from .sweep import Frames, Sweep, SweepFormat, save
 from .trigger import Edge, EdgeKind
 from .wire import Identity
@@ -32,6 +34,7 @@ class Kind(IntEnum):
     TRANSFER = 0
     STATE = 1
     EDGES = 2
+    COMMAND = 3
 
 
 class CaptureWriter:
@@ -61,6 +64,10 @@ class CaptureWriter:
     def edges(self, t_ns: int, edges: list[Edge]) -> None:
         """Note edges that the trigger gave out at `t_ns`."""
         self._write(Kind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
+
+    def command(self, t_ns: int, name: str) -> None:
+        """Note a command that was carried out."""
+        self._write(Kind.COMMAND, t_ns, name.encode())
 
     def close(self) -> None:
         """Finish the file."""
@@ -100,7 +107,7 @@ def keeper(folder: Path, fmt: SweepFormat, log: Callable[[str], None]) -> Callab
 
 
 class Playback:
-    """Sensor, trigger and clock in one: gives a capture's content to the rooms behind, each piece at its recorded time.
+    """Sensor, trigger, clock and commands in one: gives a capture's content to the rooms behind, each piece at its recorded time.
 
     Raises FormatError where the file cannot be read or is no capture; a last record that was cut off is left out.
     """
@@ -149,12 +156,15 @@ class Playback:
         frames = Frames.empty(self.format)
         if self._records:
             kind, self._now_ns, data = self._records[0]
-            if kind != Kind.EDGES:
+            if kind in (Kind.TRANSFER, Kind.STATE):
                 self._records.popleft()
             if kind == Kind.TRANSFER:
-                frames = self._stream.feed(data, self._now_ns)
+                with suppress(SensorMismatch):  # what the sensor made of it then is the next record
+                    frames = self._stream.feed(data, self._now_ns)
             elif kind == Kind.STATE:
-                self._change(data.decode())
+                self.state = data.decode()
+                if self.state == "streaming":
+                    self._stream.restart()
         return frames
 
     def edges(self, now_ns: int) -> list[Edge]:
@@ -164,12 +174,12 @@ class Playback:
             edges += [Edge(_KINDS[k], t) for t, k in _EDGE.iter_unpack(self._records.popleft()[2])]
         return edges
 
-    def _change(self, state: str) -> None:
-        self.state = state
-        if state == "streaming":
-            if self.tally.enumerations:
-                self._stream.restart()
-            self.tally.enumerations += 1
+    def commands(self) -> list[Command]:
+        """Port: the commands that were carried out at this moment."""
+        found = []
+        while self._records and self._records[0][0] == Kind.COMMAND and self._records[0][1] <= self._now_ns:
+            found.append(Command(self._records.popleft()[2].decode()))
+        return found
 
 
 def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[Kind, int, bytes]]:

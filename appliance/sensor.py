@@ -86,16 +86,14 @@ class Stream:
         self._grid, self._digits = (fmt.rows, fmt.cols), fmt.digits
         self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(np.int64)
         self._place = wire.Place(-1)
-        self.restart()
-
-    def restart(self) -> None:
-        """A new enumeration: numbers get the next epoch, the device's clock starts anew."""
-        self._place = wire.Place(self._place.epoch + 1)
         self._device = DeviceClock()
         self._leftover = b""
 
-    def forget(self) -> None:
-        """A transfer was lost: what was begun will not be continued."""
+    def restart(self) -> None:
+        """A new enumeration, the first one too: numbers get the next epoch, the device's clock starts anew."""
+        self._tally.enumerations += 1
+        self._place = wire.Place(self._place.epoch + 1)
+        self._device = DeviceClock()
         self._leftover = b""
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
@@ -184,9 +182,7 @@ class UsbSensor:
         except usb.core.USBError as e:
             self._drop(link.explain(e))
             return False
-        if self.tally.enumerations:
-            self._stream.restart()
-        self.tally.enumerations += 1
+        self._stream.restart()
         self._heard_ns = self._clock.now_ns()
         self._set_state("streaming", None)
         return True
@@ -222,7 +218,6 @@ class UsbSensor:
             if e.errno == errno.EOVERFLOW:
                 # more bytes than were asked for: this transfer is gone, the sequence numbers will say what was in it
                 self.tally.overflows += 1
-                self._stream.forget()
             else:
                 self._drop(link.explain(e))
             return b""

@@ -109,10 +109,13 @@ def _command(line: bytes) -> Command:
 
 
 class StdoutPort:
-    """Sentences on standard output, where no serial port is configured; nobody can command there."""
+    """Sentences on standard output, where no serial port is configured.
 
-    def __init__(self, source: str) -> None:
-        self.dropped, self.trouble, self._source = 0, "", source
+    commands: where they come from; nobody can command on standard output itself.
+    """
+
+    def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
+        self.dropped, self.trouble, self._source, self._commands = 0, "", source, commands
 
     def send(self, verdict: Verdict) -> None:
         """Print a verdict's sentence."""
@@ -124,8 +127,8 @@ class StdoutPort:
         sys.stdout.buffer.flush()
 
     def commands(self) -> list[Command]:
-        """None: standard output is one-way."""
-        return []
+        """Whatever the other source has."""
+        return self._commands()
 
     def close(self) -> None:
         """Nothing is held."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import SECOND, Rigged
 
+from appliance import wire
 from appliance.box import Box
 from appliance.bundle import Bundle
 from appliance.capture import CaptureWriter, Playback
@@ -17,6 +20,7 @@ from appliance.config import SweepConfig
 from appliance.errors import FormatError
 from appliance.recorder import Recorder
 from appliance.sim import rig, script, skin, stage
+from appliance.sink import StdoutPort
 from appliance.sweep import Sweep, Verdict, load, save
 
 
@@ -25,7 +29,9 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     play = Playback(path)
     sweeps: list[Sweep] = []
     verdicts: list[Verdict] = []
-    box = Box(play, play, Recorder(play.format, SweepConfig()), Classifier(model, play), play, keep=sweeps.append)
+    port = StdoutPort("replay", play.commands)
+    recorder, classifier = Recorder(play.format, SweepConfig()), Classifier(model, play)
+    box = Box(play, play, recorder, classifier, play, port=port, keep=sweeps.append)
     while not play.finished:
         verdicts += box.step()
     return verdicts, sweeps
@@ -62,6 +68,42 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     for a, b in zip(box.kept, sweeps, strict=True):
         assert a.frames.taxels.tobytes() == b.frames.taxels.tobytes()
         assert (a.frames.t_ns == b.frames.t_ns).all()
+
+
+def test_commands_are_part_of_a_capture(rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path):
+    """NEW and ABORT change what comes after them, so they are captured: replayed sweeps fuse and end as they did."""
+    world = stage.build(skin.FORMAT, script.tubes(1014, 5), rig.VirtualClock(), "sim")
+    capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
+    box = rigged(world, capture=capture)
+    first = box.until(lambda: box.box.answered == 1)
+    assert ",NEW,ok" in box.ask("$PPLP,NEW")
+    first += box.until(lambda: box.box.answered == 3)
+    first += box.seconds(2)
+    os.write(box.far_end, b"$PPLP,ABORT\r\n")
+    first += box.until(lambda: world.finished(box.box.answered))
+    capture.close()
+    verdicts, _ = played(tmp_path / "capture", default_bundle)
+    assert [v.fused for v in first] == [1, 1, 2, 0, 3]
+    assert [(v.status, v.label, v.fused) for v in verdicts] == [(v.status, v.label, v.fused) for v in first]
+    for a, b in zip(first, verdicts, strict=True):
+        assert a.scores.tobytes() == b.scores.tobytes()
+
+
+def test_a_capture_of_a_skin_that_sent_another_form(
+    rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
+):
+    """Packets of another grid in mid stream: the sweep is `sensor-lost` when it happens and when it is replayed."""
+    world = stage.build(skin.FORMAT, script.tubes(1015, 2), rig.VirtualClock(), "sim")
+    count = itertools.count()
+    other = wire.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
+    world.backend.mangle = lambda data: other if next(count) == 200 else data
+    capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
+    box = rigged(world, capture=capture)
+    first = box.until(lambda: world.finished(box.box.answered))
+    capture.close()
+    verdicts, _ = played(tmp_path / "capture", default_bundle)
+    assert first[0].status == "sensor-lost"
+    assert [v.status for v in verdicts] == [v.status for v in first]
 
 
 def test_a_capture_that_was_cut_off_plays_up_to_there(
