@@ -27,7 +27,7 @@ from .config import Config
 from .errors import ApplianceError, ConfigError, FormatError
 from .lines import Lines
 from .recorder import Recorder
-from .sensor import Sensor, UsbSensor
+from .sensor import UsbSensor
 from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort, result
 from .sweep import Sweep, SweepFormat, load
 from .trigger import GpioTrigger
@@ -134,9 +134,8 @@ def _log(line: str) -> None:
 
 def build(
     settings: Config, model: bundle.Bundle, world: World, port: Port, stack: ExitStack, *,
-    watch: Callable[[Sensor], Sensor] = lambda sensor: sensor, capture: CaptureWriter | None = None,
-    keep: Callable[[Sweep], None] | None = None, log: Callable[[str], None] = lambda line: None,
-    also: Iterable[ResultSink] = (),
+    capture: CaptureWriter | None = None, keep: Callable[[Sweep], None] | None = None,
+    log: Callable[[str], None] = lambda line: None, also: Iterable[ResultSink] = (),
 ) -> Box:  # fmt: skip
     """Put the parts together; `stack` takes them apart again."""
     settings = world.wire(settings)
@@ -156,7 +155,7 @@ def build(
     if settings.output.class_bits:
         sinks.append(LineSink(lines, model.manifest.labels))
     return Box(
-        watch(sensor), trigger, Recorder(model.format, settings.sweep), classifier, world.clock, sinks=sinks,
+        sensor, trigger, Recorder(model.format, settings.sweep), classifier, world.clock, sinks=sinks,
         port=port, panel=lines, state_s=settings.serial.state_s, source=world.source, log=log,
         tap=capture, keep=keep,
     )  # fmt: skip
@@ -205,8 +204,8 @@ def run_demo(args: argparse.Namespace) -> int:
         far_end, name = stack.enter_context(terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
         show = demo.Demo(world.robot.played, far_end, world.clock, sys.stdout, raw=args.raw)
-        box = build(settings, model, world, port, stack, watch=show.watch)
-        show.run(box.step, args.sweeps, stopped)
+        box = build(settings, model, world, port, stack)
+        show.run(box, args.sweeps, stopped)
     return 0
 
 

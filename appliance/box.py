@@ -10,13 +10,14 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .classifier import Classifier
 from .clock import Clock
 from .config import Config
 from .errors import ApplianceError
 from .recorder import Recorder
-from .sensor import Sensor
+from .sensor import Sensor, Tally
 from .sink import Command, Port, ResultSink, sentence
 from .sweep import Status, Sweep, Verdict
 from .trigger import Edge, Trigger
@@ -88,9 +89,14 @@ class Box:
         self._troubles: dict[str, str] = {}
 
     @property
-    def frames_lost(self) -> int:
-        """Frames that the skin took and the box never got, since the start."""
-        return self._sensor.tally.lost_frames
+    def tally(self) -> Tally:
+        """What the sensor has counted since the start."""
+        return self._sensor.tally
+
+    def newest_frame(self) -> NDArray[Any] | None:
+        """The newest frame [R, C] of digits, None before the first."""
+        frames = self._recorder.latest(1)
+        return None if frames is None else frames[0]
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Take turns until `stopped()`; what is open then is answered `aborted`."""

@@ -107,7 +107,7 @@ def keeper(folder: Path, fmt: SweepFormat, log: Callable[[str], None]) -> Callab
 
 
 class Playback:
-    """Sensor, trigger, clock and commands in one: gives a capture's content to the rooms behind, each piece at its recorded time.
+    """Sensor, trigger, clock and commands in one: gives what a capture holds to the rooms behind, each at its time.
 
     Raises FormatError where the file cannot be read or is no capture; a last record that was cut off is left out.
     """

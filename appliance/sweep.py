@@ -85,11 +85,6 @@ class SweepFormat:
         return 1e9 / self.rate_hz
 
     @property
-    def window_s(self) -> float:
-        """Length of the window in seconds."""
-        return self.window / self.rate_hz
-
-    @property
     def skin(self) -> tuple[int, int, str]:
         """What a readout board must agree to: rows, columns, digit type."""
         return self.rows, self.cols, self.dtype

@@ -18,7 +18,6 @@ from conftest import numbered
 from appliance import bundle
 from appliance.__main__ import main
 from appliance.sim import bench, demo, parts, score, script, skin, terminal
-from appliance.sweep import Frames
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
 
@@ -66,7 +65,7 @@ def test_demo_paints_on_a_terminal():
 def test_picture_shows_each_digit():
     """The picture's numbers are the newest frame's digits."""
     frame = numbered(1)
-    text = "\n".join(demo.picture(Frames(np.zeros(1), np.zeros(1), frame)))
+    text = "\n".join(demo.picture(frame[0]))
     assert all(f"{d:^6}" in text for d in frame.ravel())
 
 

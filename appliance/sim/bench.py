@@ -91,7 +91,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
         while not world.finished(box.answered):
             box.step()
             drain(far_end)
-        lost = box.frames_lost
+        lost = box.tally.lost_frames
     pairs = zip(watch.verdicts, world.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
     return {

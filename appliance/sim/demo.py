@@ -8,13 +8,12 @@ from __future__ import annotations
 import os
 import select
 from collections.abc import Callable, Sequence
-from typing import IO
+from typing import IO, Any
 
+from numpy.typing import NDArray
+
+from ..box import Box
 from ..clock import Clock
-from ..errors import SensorError
-from ..sensor import Sensor, Tally
-from ..sweep import Frames, Verdict
-from ..wire import Identity
 from .rig import Act
 from .score import Answer, Score
 
@@ -27,51 +26,16 @@ BRIGHT = 160
 """Digits that are shown white; the skin seldom gives more."""
 
 
-class Watched:
-    """A sensor whose frames somebody else may look at on their way."""
-
-    def __init__(self, sensor: Sensor) -> None:
-        self._sensor = sensor
-        self.last: Frames | None = None
-
-    @property
-    def state(self) -> str:
-        """The sensor's state."""
-        return self._sensor.state
-
-    @property
-    def trouble(self) -> SensorError | None:
-        """The sensor's trouble."""
-        return self._sensor.trouble
-
-    @property
-    def identity(self) -> Identity | None:
-        """The board's identity."""
-        return self._sensor.identity
-
-    @property
-    def tally(self) -> Tally:
-        """The sensor's counts."""
-        return self._sensor.tally
-
-    def read(self) -> Frames:
-        """The sensor's frames."""
-        frames = self._sensor.read()
-        if len(frames):
-            self.last = frames
-        return frames
-
-
 def bar(probability: float) -> str:
     """A probability as a bar."""
     full = round(probability * BAR)
     return "█" * full + "·" * (BAR - full) + f" {probability:6.1%}"
 
 
-def picture(frames: Frames) -> list[str]:
-    """The newest frame [R, C] as shaded cells with their digits, two lines a row."""
+def picture(frame: NDArray[Any]) -> list[str]:
+    """A frame [R, C] as shaded cells with their digits, two lines a row."""
     lines = []
-    for row in frames.taxels[-1].astype(int):
+    for row in frame.astype(int):
         level = [min(23, max(0, d) * 24 // BRIGHT) for d in row]
         shade = [f"\033[48;5;{232 + v}m\033[38;5;{16 if v > 11 else 250}m" for v in level]
         lines.append("  " + "".join(f"{s}{'':6}\033[0m" for s in shade))
@@ -91,29 +55,21 @@ class Demo:
         self._played, self._clock, self._out = played, clock, out
         self._far_end, self._raw = far_end, raw
         self._live = not raw and out.isatty()
-        self._watched: Watched | None = None
         self._rest = b""
         self._drawn = 0
         self._next_ns = 0
 
-    def watch(self, sensor: Sensor) -> Sensor:
-        """The sensor, watched: give the box this one."""
-        self._watched = Watched(sensor)
-        return self._watched
-
-    def run(self, step: Callable[[], Sequence[Verdict]], sweeps: int, stopped: Callable[[], bool]) -> None:
-        """Call `step` until `sweeps` answers were heard or `stopped()`."""
-        assert self._watched
+    def run(self, box: Box, sweeps: int, stopped: Callable[[], bool]) -> None:
+        """Step `box` until `sweeps` answers were heard or `stopped()`."""
         said = 0
         while self.score.total.total() < sweeps and not stopped():
-            said += len(step())
+            said += len(box.step())
             self._listen(said, sweeps)
-            if self._live and self._clock.now_ns() >= self._next_ns and self._watched.last is not None:
+            if self._live and self._clock.now_ns() >= self._next_ns and (frame := box.newest_frame()) is not None:
                 self._next_ns = self._clock.now_ns() + FRAME_NS
-                self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(self._watched.last), ""])
+                self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""])
         if not self._raw and self.score.total:
-            tally = self._watched.tally
-            lost = f"  frames lost     {tally.lost_frames} of {tally.frames + tally.lost_frames}"
+            lost = f"  frames lost     {box.tally.lost_frames} of {box.tally.frames + box.tally.lost_frames}"
             self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}")
 
     def _listen(self, said: int, wanted: int) -> None:
