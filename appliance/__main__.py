@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from .sim.stage import SimWorld
 
 EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments;
-3 configuration; 4 bundle; 5 skin; 6 gpio lines; 7 serial port; 8 a file of another form; 130 interrupted"""
+3 configuration; 4 bundle; 6 gpio lines; 8 a file of another form; 130 interrupted. A skin or a serial port that is not
+there ends nothing: it is waited for, and `check` names it"""
 
 
 def main(argv: list[str] | None = None) -> int:

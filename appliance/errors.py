@@ -25,7 +25,6 @@ class BundleError(ApplianceError):
 class SensorError(ApplianceError):
     """The skin cannot be read. `state` names the trouble as the state sentence does (PROTOCOL.md, sensor states)."""
 
-    exit_code = 5
     state = "error"
 
 
@@ -73,8 +72,6 @@ class LineError(ApplianceError):
 
 class PortError(ApplianceError):
     """The serial port cannot be opened."""
-
-    exit_code = 7
 
 
 class FormatError(ApplianceError):
