@@ -7,7 +7,7 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types bench bundle wheel lock clean
+.PHONY: help demo test check lint types bench bundle paper wheel lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -36,6 +36,9 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --row-shift 0.5 --seed 1 --out build/default.npz
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 1
 
+paper: $(DESKTOP) ## the paper's experiment, run again: docs/paper/ (goes on where it was interrupted)
+	$(BIN)/palpate-train paper --out docs/paper
+
 wheel: $(DESKTOP) ## build the wheel of the box into dist/
 	rm -rf build/lib build/bdist.* # setuptools would put what an older build left behind into the wheel
 	$(PIP) wheel --no-deps -w dist .
@@ -59,5 +62,5 @@ $(RUNTIME): appliance/requirements.lock pyproject.toml
 
 # The same with the desktop's pinned tools: tests, training, export.
 $(DESKTOP): $(RUNTIME) train/pyproject.toml
-	$(PIP) install -e '.[dev]' -e train
+	$(PIP) install -e '.[dev]' -e 'train[minirocket,dask]'
 	@touch $@

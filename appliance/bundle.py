@@ -1,8 +1,8 @@
 """The model bundle: a folder in, a checked Bundle out. Nothing in it is trusted before its hash and form are.
 
 A bundle is `manifest.json`, `model.onnx` and `golden.npz`. The graph takes the sensor's own digits as `sweep`
-[1, T, R, C] (or float32 features [1, n] as `features`, where the manifest's input is L or H) and gives `logits`
-float32 [1, K]; all scaling is inside it. Golden sweeps come with the logits that export saw.
+[1, T, R, C] (or float32 features [1, n] as `features`, where the manifest's input is one of features.KINDS) and gives
+`logits` float32 [1, K]; all scaling is inside it. Golden sweeps come with the logits that export saw.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import features
 from .errors import BundleError, FormatError
 from .sweep import SweepFormat
 
@@ -28,7 +29,7 @@ except ImportError:  # Python 3.11
 SCHEMA = 1
 DEFAULT = Path(__file__).with_name("default_bundle")
 MANIFEST, MODEL, GOLDEN = "manifest.json", "model.onnx", "golden.npz"
-INPUTS = ("raw", "L", "H")
+INPUTS = ("raw", *features.KINDS)
 LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
 """What a label may look like: it travels in a sentence, so no comma, star or dollar, and at most 24 characters."""
 GOLDEN_TOLERANCE = 0.02

@@ -37,11 +37,13 @@ def inspect(taxels: NDArray[Any], tare: NDArray[np.float64], limits: Thresholds)
     """Look at a window [T, R, C] before it is classified; `tare` [R, C] is the unloaded skin in digits.
 
     A loaded taxel always moves: one that is constant is stuck. A silent taxel is dead where every direct neighbour is
-    loaded; at the edge of the contact it may be silent by right.
+    loaded; at the edge of the contact it may be silent by right. One that gives no numbers is dead anywhere.
     """
     series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # [R*C, T]: three times as fast to reduce
     still = (series.min(axis=1) == series.max(axis=1)).reshape(tare.shape)
     load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
+    if not np.isfinite(load).all():  # of a float skin: whatever the network makes of it is no answer
+        return Finding(Status.DEAD_TAXEL, _places(~np.isfinite(load)))
     loaded = load >= limits.contact
     if not loaded.any():
         return Finding(Status.NO_CONTACT, f"strongest taxel {load.max():.1f} digits")

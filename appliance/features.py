@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import related, series
 from .errors import FormatError
+from .series import FLOOR
 
 Array = NDArray[np.float64]
 
@@ -24,8 +26,6 @@ HIGH_HZ = (20.0, 375.0)
 """Band of roughness and c1 (eq. 2, 3); at 750 Hz and 1500 frames bins 40 to 750."""
 LOW_HZ = (2.0, 20.0)
 """Band of c2 (eq. 3); bins 4 to 40."""
-FLOOR = 1e-6
-"""Least power of a bin in digits^2: a silent skin has a logarithm and a centroid, and no real reading is changed."""
 HOP_S, WINDOW_S = 0.05, 0.1
 """Step and length of the short windows (eq. 5)."""
 SILENT = 1e-12
@@ -39,7 +39,7 @@ def taxel_weights(taxels: NDArray[Any]) -> Array:
     none grows without bound where means cancel. Where no mean is positive all weights are 1 / M. Raises FormatError for
     an array that is no sweep.
     """
-    return _weights(_series(taxels))
+    return series.weights(series.of(taxels))
 
 
 def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
@@ -50,11 +50,11 @@ def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
     printed. Every bin's power is at least FLOOR: a silent skin gives about log(M * FLOOR) and the middle of each band.
     One frame is enough for an answer. Raises FormatError for an array that is no sweep or a rate that is none.
     """
-    x = _series(taxels)
-    _check_rate(rate_hz)
+    x = series.of(taxels)
+    series.check_rate(rate_hz)
     frames = x.shape[1]
-    power = np.maximum(_power(_detrended(x), frames), FLOOR)
-    weights = _weights(x)
+    power = np.maximum(series.power(series.detrended(x), frames), FLOOR)
+    weights = series.weights(x)
     first, last = _bins(HIGH_HZ, frames, rate_hz)
     roughness = np.log(power[:, first : last + 1].sum() / max(last - first, 1))
     centroids = [_centroid(power, weights, band, frames, rate_hz) for band in (HIGH_HZ, LOW_HZ)]
@@ -82,67 +82,37 @@ def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Ar
     before the window function. Taxels are added by eq. 4 and each l is divided by its sum over q: it sums to 1, or is 0
     in a silence. Raises FormatError as `h_shape`, for an array that is no sweep, and for another window function.
     """
-    x = _series(taxels)
+    x = series.of(taxels)
     frames = x.shape[1]
     count, bands = h_shape(frames, rate_hz)
     width, top = _short_window(frames, rate_hz)
     cut = _cuts(x, count, width, HOP_S * rate_hz) * _window(window, width)
-    power = _power(cut, frames)[:, :, : top + 1]
+    power = series.power(cut, frames)[:, :, : top + 1]
     power[:, :, 0] = 0.0
     total = np.zeros((count, 2 * bands))
-    total[:, : top + 1] = np.tensordot(_weights(x), power, 1)
+    total[:, : top + 1] = np.tensordot(series.weights(x), power, 1)
     paired = total.reshape(count, bands, 2).sum(axis=2)
     normalised: Array = paired / np.maximum(paired.sum(axis=1, keepdims=True), SILENT)
     return normalised.ravel()
 
 
-KINDS: Mapping[str, Callable[[NDArray[Any], float], Array]] = MappingProxyType({"L": l_features, "H": h_features})
+KINDS: Mapping[str, Callable[[NDArray[Any], float], Array]] = MappingProxyType(
+    {
+        "L": l_features,
+        "H": h_features,
+        "static": related.static,
+        "spectrogram": related.spectrogram,
+        "correlation": related.correlation,
+    }
+)
 """Feature sets by the name that a bundle's manifest uses."""
 
 
 def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float32]:
-    """The feature set `kind` ("L" or "H") of digits [T, R, C] at `rate_hz`, as float32 [n]. Raises FormatError."""
+    """The feature set `kind` of KINDS of digits [T, R, C] at `rate_hz`, as float32 [n]. Raises FormatError."""
     if kind not in KINDS:
         raise FormatError(f"feature set {kind!r} is unknown; use one of {', '.join(KINDS)}")
     return KINDS[kind](taxels, rate_hz).astype(np.float32)
-
-
-def _series(taxels: NDArray[Any]) -> Array:
-    """Digits [T, R, C] as one time series a taxel: float64 [M, T]."""
-    if taxels.ndim != 3 or taxels.size == 0:
-        raise FormatError(f"an array of shape {taxels.shape} is no sweep; use frames x rows x columns, none of them 0")
-    x = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T, np.float64)
-    if not np.isfinite(x).all():
-        raise FormatError("the sweep holds digits that are not a number or infinite; check how it was recorded")
-    return x
-
-
-def _check_rate(rate_hz: float) -> None:
-    if not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise FormatError(f"a rate of {rate_hz} Hz is out of range; use more than 0")
-
-
-def _weights(x: Array) -> Array:
-    mean = np.maximum(x.mean(axis=1), 0.0)
-    total = mean.sum()
-    weights: Array = mean / total if total > 0 else np.full(len(x), 1 / len(x))
-    return weights
-
-
-def _detrended(x: Array) -> Array:
-    """`x` [M, T] less its straight line of least squares."""
-    centred: Array = x - x.mean(axis=1, keepdims=True)
-    time = np.arange(x.shape[1]) - (x.shape[1] - 1) / 2
-    slope = centred @ time / max(time @ time, 1.0)
-    centred -= slope[:, None] * time
-    return centred
-
-
-def _power(x: Array, frames: int) -> Array:
-    """Eq. 1, squared: |sum over time|^2 / frames, in digits^2, along the last axis; bins from DC to Nyquist."""
-    spectrum = np.fft.rfft(x)
-    power: Array = (spectrum.real**2 + spectrum.imag**2) / frames
-    return power
 
 
 def _clean(bins: float) -> float:
@@ -167,7 +137,7 @@ def _centroid(power: Array, weights: Array, band: tuple[float, float], frames: i
 
 def _short_window(frames: int, rate_hz: float) -> tuple[int, int]:
     """(W, K): frames in a short window and its highest bin used."""
-    _check_rate(rate_hz)
+    series.check_rate(rate_hz)
     width = round(WINDOW_S * rate_hz)
     if HOP_S * rate_hz < 1:
         raise FormatError(f"{rate_hz:g} Hz is too slow for H-features; use at least {1 / HOP_S:g} Hz, or L")

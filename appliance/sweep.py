@@ -207,5 +207,5 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
             raise FormatError(f"{path}: records of {table.dtype} do not fit the format {fmt} of its sidecar")
         frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
         return Sweep(status=status, frames=frames, **about), fmt
-    except (OSError, ValueError, KeyError, TypeError) as e:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as e:
         raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e

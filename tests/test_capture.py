@@ -188,7 +188,9 @@ def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_p
             lambda d: (d / "s.json").write_text((d / "s.json").read_text().replace('"rows": 4', '"rows": 3')),
             "do not fit",
         ),
+        (lambda d: (d / "s.json").write_text("3"), "not a recorded sweep"),
         (lambda d: (d / "s.npy").write_bytes(b"nonsense"), "not a recorded sweep"),
+        (lambda d: (d / "s.npy").write_bytes(b""), "not a recorded sweep"),
         (lambda d: np.save(d / "s.npy", np.array([{}]), allow_pickle=True), "not a recorded sweep"),
     ],
 )

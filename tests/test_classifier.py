@@ -63,6 +63,15 @@ def test_a_spoiled_window_is_named(place, value: int, status: Status, detail: st
     assert detail in found.detail
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_taxel_that_gives_no_number_is_dead(value: float):
+    """One frame of it is enough, at the edge too, and however many dead ones the bundle bears."""
+    taxels = moving().astype(np.float32)
+    taxels[150, 0, 3] = value
+    found = inspect(taxels, BARE, replace(LIMITS, dead_taxels=3))
+    assert (found.status, found.detail) == (Status.DEAD_TAXEL, "taxel 1.4")
+
+
 def test_a_bundle_that_bears_dead_taxels():
     """As many dead taxels as the bundle allows are let through."""
     taxels = moving()

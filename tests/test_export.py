@@ -22,11 +22,11 @@ from appliance.clock import SystemClock
 from appliance.errors import BundleError, FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import export, fit, networks, sets
+from train import export, fit, networks, pack, sets
 from train.__main__ import main
-from train.export import ExportRefused
 from train.fit import Fit, Recipe
 from train.networks import Compact
+from train.pack import ExportRefused
 
 OPS = {"Reshape", "Cast", "ConstantOfShape", "Gemm", "Transpose", "Conv", "Relu", "ReduceMean", "Concat", "Add", "Log"}
 
@@ -74,7 +74,7 @@ def test_the_float_graph_is_the_network(dtype: str):
     digits = np.random.default_rng(0).integers(0, 200, (5, 128, 3, 2)).astype(dtype)
     with torch.no_grad():
         want = model(torch.from_numpy(digits.astype(np.float32))).numpy()
-    np.testing.assert_allclose(export.run(graph, digits), want, atol=1e-4)
+    np.testing.assert_allclose(pack.run(graph, digits), want, atol=1e-4)
     assert {n.op_type for n in graph.graph.node} == OPS
     assert all(size > 0 for shape in shapes(graph) for size in shape)
     (given,) = graph.graph.input
@@ -120,7 +120,7 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     assert it.bundle.golden_logits.argmax(1).tolist() == [0, 2]
     held = manifest.figures["held-out recording"]
     assert held["n"] == len(fitted.held)
-    assert held["accuracy"] == pytest.approx(np.mean(export.score(it, fitted.held) == fitted.held.labels), abs=1e-4)
+    assert held["accuracy"] == pytest.approx(np.mean(pack.score(it, fitted.held) == fitted.held.labels), abs=1e-4)
     assert manifest.figures["held-out recording, by recording"]["n"] == len(fitted.held) / 2
     assert manifest.figures["parity"]["agreement"] >= export.LEAST_AGREEMENT
     weakest = fitted.train.samples.mean(axis=1).max(axis=(1, 2)).min()
@@ -131,7 +131,7 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
         "0123abcd",
         1,
     )
-    assert np.mean(export.score(it, easy(seed=5)) == easy(seed=5).labels) > 0.9
+    assert np.mean(pack.score(it, easy(seed=5)) == easy(seed=5).labels) > 0.9
 
 
 def test_the_same_fit_gives_the_same_bytes(fitted: Fit, packed: Path, tmp_path: Path):
@@ -147,7 +147,7 @@ def test_scores_are_fused_by_recording(packed: Path):
     it, s = box(packed), easy(10, pieces=5, seed=7)
     s.samples[3] = 0
     s.samples[9] = s.samples[29]
-    alone, fused = export.score(it, s), export.score(it, s, fused=True)
+    alone, fused = pack.score(it, s), pack.score(it, s, fused=True)
     assert np.flatnonzero(alone < 0).tolist() == [3]
     assert alone[9] != fused[9]
     p = softmax(np.stack([it.logits(x) for x in s.samples]))
@@ -186,16 +186,16 @@ def test_a_box_that_would_refuse_is_no_box(fitted: Fit, tmp_path: Path):
 def test_the_box_must_say_what_export_saw(fitted: Fit, packed: Path):
     """Other labels from the box than from the int8 model are refused, with how many."""
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
-    assert "held-out" in export.judge(packed, fitted.held, logits, "held-out")
+    assert "held-out" in pack.judge(packed, fitted.held, logits, "held-out")
     logits[:2] = -logits[:2]
     with pytest.raises(ExportRefused, match="labels 2 of 24 held-out sweeps otherwise"):
-        export.judge(packed, fitted.held, logits, "held-out")
+        pack.judge(packed, fitted.held, logits, "held-out")
 
 
 def test_a_material_never_recognised_is_refused(fitted: Fit):
     """There is no golden sweep of it."""
     with pytest.raises(ExportRefused, match="no training sweep of 'high' is recognised"):
-        export.golden_sweeps(fitted.train, np.tile(np.float32([1, 0, 0]), (len(fitted.train), 1)))
+        pack.golden_sweeps(fitted.train, np.tile(np.float32([1, 0, 0]), (len(fitted.train), 1)))
 
 
 def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):
@@ -238,7 +238,7 @@ def test_the_default_bundle_is_what_the_box_needs():
     assert (it.bundle.format, it.bundle.manifest.labels) == (skin.FORMAT, skin.MATERIALS)
     assert sum(f.stat().st_size for f in bundle.DEFAULT.iterdir()) < 64 * 1024
     unseen = sets.load("sim:T-REAL:1900:3")
-    assert np.mean(export.score(it, unseen) == unseen.labels) > 0.9
+    assert np.mean(pack.score(it, unseen) == unseen.labels) > 0.9
     assert json.loads(it.bundle.manifest.json())["figures"]["held-out position"]["low"] > 0.9
 
 
@@ -286,7 +286,7 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
     )
     it, rest = box(tmp_path / "b"), sets.load(str(tmp_path / "rest.npz"))
     assert (it.bundle.format.dtype, it.bundle.format.rows, it.bundle.format.window) == ("int16", 16, 128)
-    told = export.figures(it, rest, "unseen")
+    told = pack.figures(it, rest, "unseen")
     assert told["unseen"]["accuracy"] > 0.9
     assert told["unseen, by recording"]["accuracy"] > 0.95
     sentences = ["demo", "--sim", f"replay:{tmp_path / 'rest.npz'}", "--virtual", "--sweeps", str(len(rest))]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +71,15 @@ NAN[4, 7, 1, 2] = np.nan
         ({"materials": None, "rate_hz": None}, "lacks materials, rate_hz"),
         ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
         ({"samples": np.zeros((6, 0, 2, 3), np.uint8)}, "none empty"),
-        ({"samples": np.zeros((6, 8, 2, 3))}, "samples are float64; use one of uint8"),
+        ({"samples": np.zeros((6, 8, 2, 3))}, "samples are float64; use one of uint8.*samples.astype\\('float32'\\)"),
+        ({"samples": np.full((6, 8, 2, 3), -1)}, "samples are int64; .*samples.astype\\('int16'\\)"),
+        ({"samples": np.ones((6, 8, 2, 3), bool)}, "samples are bool; .*samples.astype\\('uint8'\\)"),
+        ({"samples": np.full((6, 8, 2, 3), 1 << 40)}, "samples are int64; .*samples.astype\\('float32'\\)"),
+        ({"samples": np.full((6, 8, 2, 3), 1j)}, "samples are complex128; use one of uint8, int16, uint16, float32$"),
+        ({"samples": np.zeros((6, 8, 256, 1), np.uint8)}, "a grid of 256 x 1 taxels is out of range"),
+        ({"rate_hz": np.array(np.nan)}, "rate_hz is nan"),
+        ({"rate_hz": np.array(2e6)}, "a rate of 2000000.0 Hz is out of range"),
+        ({"group_speed": np.ones(6)}, "group_speed holds float64"),
         ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
         ({"labels": np.arange(5)}, "labels holds int64 \\[5\\]; give one whole number for each of 6"),
         ({"labels": np.zeros(6)}, "labels holds float64"),
@@ -132,13 +143,30 @@ def test_select_keeps_what_fulfils_every_condition():
     np.testing.assert_array_equal(upper.samples, s.samples[8:])
 
 
+def test_select_takes_any_of_several_values():
+    """Values of a group, and materials by name, spaces around either."""
+    s = easy(8)
+    assert set(s.select(["speed=0, 3"]).groups["speed"]) == {0, 3}
+    part = s.select(["material=high, low"])
+    assert part.materials == ("low", "high")
+    np.testing.assert_array_equal(part.samples, s.samples[np.r_[:8, 16:24]])
+    assert s.select(["material=high,low", "speed=1"]).format == s.format
+
+
 @pytest.mark.parametrize(
     ("condition", "message"),
     [
         ("speed<2", "cannot be read"),
         ("speed", "cannot be read"),
         ("force=1", "no group 'force'; it has recording, speed"),
-        ("speed=9", "no sweep fulfils speed=9"),
+        ("speed=", "'' is no whole number"),
+        ("speed=1,fast", "'1,fast' is no whole number"),
+        ("speed<=1,2", "<= takes a group and one whole number"),
+        ("material>=low", ">= takes a group and one whole number"),
+        ("speed=9", "no sweep fulfils speed=9; it has 0, 1, 2, 3$"),
+        ("speed=1,9", "no sweep fulfils speed=9; it has 0"),
+        ("material=low,hihg", "no sweep fulfils material=hihg; it has high, low, middle"),
+        ("recording>=99999999999999999999", "no sweep fulfils recording>=9+;"),
         ("recording<=7", "only one class, 'low'"),
     ],
 )
@@ -209,3 +237,104 @@ def test_join_keeps_recordings_apart_and_forces_together():
     assert len(np.unique(sets.join([a, b]).groups["recording"])) == 6 + 12
     with pytest.raises(FormatError, match="differ; join sets of one kind"):
         sets.join([a, easy(4, dtype="int16")])
+
+
+def test_joined_sets_are_told_apart():
+    """`set` counts in the order given, so that one can be trained on and the other be tested on; one alone has none."""
+    real, hard = sets.load("sim:T-REAL:1001:1"), sets.load("sim:T-HARD:1001-1002:2")
+    both = sets.join([real, hard])
+    np.testing.assert_array_equal(both.groups["set"], [0] * 54 + [1] * 24)
+    np.testing.assert_array_equal(both.groups["world"], [1001] * 66 + [1002] * 12)
+    assert not set(both.groups["position"][:54]) & set(both.groups["position"][54:])
+    assert sets.join([hard]) is hard
+    assert "set" not in hard.groups
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
+def test_without_means_leaves_the_texture(dtype: str):
+    """Float32, mean zero, a constant taxel exactly zero, differences in time, labels and groups as they were."""
+    s = easy(4, dtype=dtype)
+    s.samples[2, :, 1, 0] = 3.3 if dtype == "float32" else 3
+    s = replace(s, samples=s.samples[:, :49])  # in float32 the mean of so many 3.3 is not 3.3
+    bare = s.without_means()
+    assert bare.samples.dtype == np.float32
+    assert np.abs(bare.samples.mean(axis=1, dtype=np.float64)).max() < 1e-6
+    assert not bare.samples[2, :, 1, 0].any()
+    np.testing.assert_allclose(np.diff(bare.samples, axis=1), np.diff(s.samples.astype(float), axis=1), atol=1e-4)
+    assert (bare.labels is s.labels, bare.groups, bare.materials) == (True, s.groups, s.materials)
+
+
+def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
+    """The same for a file read back, whatever its form; another for each thing that could change a result."""
+    s = easy(4)
+    for name in ("a.npz", "b.h5"):
+        s.save(tmp_path / name)
+        assert sets.digest(sets.load(str(tmp_path / name))) == sets.digest(s)
+    assert re.fullmatch("[0-9a-f]{16}", sets.digest(s))
+    other = s.samples.copy()
+    other[-1, -1, -1, -1] ^= 1
+    changed = [
+        replace(s, samples=other),
+        replace(s, samples=s.samples.astype(np.int16)),
+        replace(s, samples=s.samples.astype(np.uint16)),
+        replace(s, samples=s.samples.reshape(12, 64, 4, 1)),
+        replace(s, labels=s.labels[::-1]),
+        replace(s, materials=("low", "middle", "top")),
+        replace(s, rate_hz=101.0),
+        replace(s, groups={"recording": s.groups["recording"]}),
+        replace(s, groups=s.groups | {"speed": s.groups["recording"]}),
+    ]
+    assert len({sets.digest(x) for x in (s, *changed)}) == 10
+    assert sets.digest(replace(s, source="elsewhere", labels=s.labels.astype(np.uint8))) == sets.digest(s)
+
+
+def test_describe_says_what_a_set_holds():
+    """Sweeps, form, materials with their counts, recordings, groups with their values, long lists shortened."""
+    s = easy(20, pieces=2)
+    s.groups["force"] = np.arange(60) % 12 * 10
+    lines = sets.describe(s).splitlines()
+    assert lines[0] == f"easy: 60 sweeps of 0.64 s; 2x2 uint8 at 100 Hz, window 64; digest {sets.digest(s)}"
+    assert lines[1:] == [
+        "  materials: 3: low 20, middle 20, high 20",
+        "  recordings: 30, of 2 each",
+        "  force: 12: 0, 10, 20, 30, 40, 50, 60, 70, …, 110",
+        "  speed: 4: 0, 1, 2, 3",
+    ]
+    assert "  recordings: 29, of 1 to 2 each" in sets.describe(s.take(np.arange(1, 58)))
+
+
+def test_describe_says_what_is_confounded():
+    """Values that hold one material, a material that one value takes with it, recordings of several; not one value."""
+    s = easy(4, pieces=8)
+    s.groups.update(session=s.labels // 2, one=np.zeros(12, int))
+    assert sets.describe(s).splitlines()[2:] == [
+        "  recordings: 2, of 4 to 8 each",
+        "    1 of them hold sweeps of several materials: number recordings within one material",
+        "  one: 1: 0",
+        "  session: 2: 0, 1",
+        "    confounded: one material only at 1",
+        "    confounded: 'low' only at 0; leaving that out leaves none to train on",
+        "    confounded: 'middle' only at 0; leaving that out leaves none to train on",
+        "    confounded: 'high' only at 1; leaving that out leaves none to train on",
+        "  speed: 2: 0, 1",
+        "    confounded: one material only at 1",
+        "    confounded: 'low' only at 0; leaving that out leaves none to train on",
+        "    confounded: 'middle' only at 0; leaving that out leaves none to train on",
+        "    confounded: 'high' only at 1; leaving that out leaves none to train on",
+    ]
+
+
+def test_what_is_known_can_be_loaded():
+    """Every simulated set in the list has as many sweeps as it says (the large one: sixty for each of its worlds)."""
+    said = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", sets.known()))
+    assert said == {"sim:T-LAB": "240", "sim:T-REAL": "540", "sim:T-HARD": "60", "sim:T-HARD:1-20": "1200"}
+    assert len(sets.load("sim:T-LAB", 1001)) == 240
+    assert len(sets.load("sim:T-HARD:1001-1002")) == 120
+
+
+def test_a_set_goes_to_another_process():
+    """Pickled and back, as a cluster does; this is no way to load a file."""
+    s = easy(4)
+    again = pickle.loads(pickle.dumps(s))
+    assert sets.digest(again) == sets.digest(s)
+    assert again.source == s.source

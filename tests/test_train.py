@@ -14,7 +14,7 @@ from test_sets import easy
 from appliance.errors import FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import fit, networks, sets
+from train import fit, loop, networks, sets
 from train.__main__ import main
 from train.fit import Fit, Recipe
 from train.networks import Compact, stages
@@ -75,7 +75,7 @@ def test_row_shift_is_drawn_per_sweep():
     """Some sweeps stay, some go up, some down by one row; the row that comes in is its neighbour's, no stronger."""
     x = torch.arange(1, 9, dtype=torch.float32).reshape(1, 8, 1).expand(300, 8, 5)  # rows (1,2) (3,4) (5,6) (7,8)
     still = Recipe(row_shift=0.5, noise=0, gain=0)
-    y = fit.augment(x, 4, still, torch.Generator().manual_seed(0))[:, :, 0]
+    y = loop.augment(x, 4, still, torch.Generator().manual_seed(0))[:, :, 0]
     stays = (y[:, 2:6] == torch.tensor([3, 4, 5, 6])).all(1)
     up = (y[:, :6] == torch.tensor([3, 4, 5, 6, 7, 8])).all(1)
     down = (y[:, 2:] == torch.tensor([1, 2, 3, 4, 5, 6])).all(1)
@@ -93,7 +93,7 @@ def test_stretch_changes_speed_and_nothing_else():
     """A tone comes back at 0.7 to 1.3 times its rate, with its strength."""
     t = torch.arange(400) / 400
     x = torch.sin(2 * np.pi * 40 * t).expand(64, 1, 400)
-    y = fit.augment(x, 1, Recipe(stretch=0.3, noise=0, gain=0), torch.Generator().manual_seed(0))
+    y = loop.augment(x, 1, Recipe(stretch=0.3, noise=0, gain=0), torch.Generator().manual_seed(0))
     crossings = (y[:, 0, 1:] * y[:, 0, :-1] < 0).sum(1) / 2
     assert crossings.min() >= 26
     assert crossings.max() <= 54
@@ -104,7 +104,7 @@ def test_stretch_changes_speed_and_nothing_else():
 def test_gain_is_a_taxel_s_and_noise_a_frame_s():
     """The stated deviations, gain constant in time, the same draw for the same seed."""
     x = torch.ones(200, 4, 300)
-    y, again = (fit.augment(x, 2, Recipe(), torch.Generator().manual_seed(3)) for _ in range(2))
+    y, again = (loop.augment(x, 2, Recipe(), torch.Generator().manual_seed(3)) for _ in range(2))
     assert torch.equal(y, again)
     assert y.mean(2).std().item() == pytest.approx(0.15, rel=0.1)
     assert y.std(2).mean().item() == pytest.approx(0.05, rel=0.05)

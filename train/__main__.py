@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
+from appliance.bundle import Manifest
 from appliance.errors import ApplianceError, FormatError
 from appliance.sim.bench import commit
 
-from . import export, fit, sets
+from . import calibrate, chart, evaluate, export, fit, methods, options, pack, paper, score, sets, stress, trial
+from .fold import whole
+
+Add = Callable[[str, Callable[[argparse.Namespace], None], str], argparse.ArgumentParser]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -24,6 +30,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as e:
         print(f"palpate-train: {e.filename}: {e.strerror}", file=sys.stderr)
         return ApplianceError.exit_code
+    except KeyboardInterrupt:
+        print("palpate-train: interrupted; the same command goes on where it was", file=sys.stderr)
+        return 130
     return 0
 
 
@@ -36,13 +45,68 @@ def _parser() -> argparse.ArgumentParser:
         command.set_defaults(run=run)
         return command
 
+    _add_looking(add)
+    _add_evaluate(add)
+    _add_shows(add)
+    _add_fit(add)
+    _add_bundles(add)
+    return parser
+
+
+def _add_looking(add: Add) -> None:
+    """The commands that only tell."""
+    add("methods", run_methods, "list the methods that evaluate knows")
+    one = add("sets", run_sets, "tell what sweep sets can be named, or what is in some")
+    one.add_argument("sets", nargs="*", metavar="SET", help=options.SET)
+
+
+def _add_evaluate(add: Add) -> None:
+    one = add("evaluate", run_evaluate, "train and test methods under a protocol")
+    options.add_set(one)
+    one.add_argument("--protocol", action="append", required=True, metavar="PROTOCOL", dest="protocols",
+                     help="random:10, leave:GROUP or split:GROUP=a,b->c; hard ones tell more")  # fmt: skip
+    one.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
+    one.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
+    one.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and random folds: 1 to N (1)")
+    one.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
+    options.add_effort(one)
+    options.add_where(one)
+
+
+def _add_shows(add: Add) -> None:
+    """The commands that write what people look at."""
+    one = add("paper", run_paper, "run the paper's experiment on the simulated skin and tell it as a page")
+    one.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
+    one.add_argument(
+        "--quick", action="store_true", help="small sets, hardly trained: everything is tried, nothing told"
+    )
+    two = add("stress", run_stress, "put trained methods under what goes wrong, one thing at a time")
+    options.add_set(two)
+    two.add_argument("--test", required=True, metavar="SET", help="what is stressed; simulated, it is drawn anew")
+    two.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
+    two.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and stress: 1 to N (1)")
+    two.add_argument("--out", type=Path, required=True, metavar="DIR", help="for results.json, table.md and curves.svg")
+    two.add_argument("--strong", default="compact,minirocket", metavar="A,B", help="methods drawn with their bands")
+    for command in (one, two):
+        options.add_effort(command)
+        options.add_where(command)
+    three = add("calibrate", run_calibrate, "compare the simulator with the twenty accuracies that the paper prints")
+    three.add_argument("--seeds", default="201-208", metavar="FIRST-LAST", help="of the simulated worlds (201-208)")
+    three.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
+    three.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    three.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
+    four = add("chart", run_chart, "draw what evaluate wrote: methods by protocols")
+    four.add_argument("results", type=Path, nargs="+", metavar="FILE", help="of evaluate --json; several are joined")
+    four.add_argument("--out", type=Path, required=True, metavar="FILE.svg")
+    four.add_argument("--recordings", action="store_true", help="count recordings instead of windows")
+
+
+def _add_fit(add: Add) -> None:
     recipe = fit.Recipe()
     one = add("fit", run_fit, "train a network on sweep sets")
-    one.add_argument("--set", action="append", required=True, metavar="SET", dest="sets",
-                     help="FILE.npz or sim:NAME[:SEED[-LAST][:SWEEPS]]; several are joined")  # fmt: skip
+    options.add_set(one)
     one.add_argument("--seed", type=int, required=True, help="of the training, and of simulated sets that name none")
     one.add_argument("--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)")
-    one.add_argument("--only", action="append", default=[], metavar="GROUP<=N", help="keep sweeps with =, <= or >=")
     one.add_argument("--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7")
     one.add_argument("--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set")
     one.add_argument("--steps", type=int, default=recipe.steps, help=f"of training (default {recipe.steps})")
@@ -51,22 +115,117 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--stretch", type=float, default=recipe.stretch, metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
     one.add_argument("--keep-means", action="store_true", help="show the head each taxel's mean too, for comparison")
-    two = add("export", run_export, "quantize a fit and pack its bundle")
-    two.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
-    two.add_argument("--out", type=Path, required=True, metavar="DIR", help="the bundle; one that is there is replaced")
-    two.add_argument("--name", required=True)
-    two.add_argument("--version", required=True)
-    two.add_argument("--full-scale", type=float, help="the sensor's highest digit (default: its type's)")
+
+
+def _add_bundles(add: Add) -> None:
+    """The commands that make what the box runs."""
+    one = add("export", run_export, "quantize a fit and pack its bundle")
+    one.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
+    two = add("pack", run_pack, "train any method and pack its bundle, in floating point")
+    options.add_set(two)
+    two.add_argument("--method", required=True, metavar="NAME", help="see palpate-train methods")
+    two.add_argument("--seed", type=int, required=True, help="of the training, and of simulated sets that name none")
+    options.add_effort(two)
+    for command in (one, two):
+        command.add_argument(
+            "--out", type=Path, required=True, metavar="DIR", help="the bundle; replaced if it is there"
+        )
+        command.add_argument("--name", required=True)
+        command.add_argument("--version", required=True)
+        command.add_argument("--full-scale", type=float, help="the sensor's highest digit (default: its type's)")
     three = add("yardsticks", run_yardsticks, "write the models that palpate bench times beside the bundle")
     three.add_argument("--out", type=Path, required=True, metavar="DIR")
-    return parser
+
+
+def run_methods(args: argparse.Namespace) -> None:
+    """One line for each method."""
+    for method in methods.every().values():
+        extra = f" (needs pip install 'palpate-train[{method.extra}]')" if method.extra else ""
+        print(f"{method.name:<16} {method.about}{extra}")
+
+
+def run_sets(args: argparse.Namespace) -> None:
+    """What can be named, or what is in the sets named."""
+    print("\n\n".join(sets.describe(sets.load(spec, 1)) for spec in args.sets) if args.sets else sets.known())
+
+
+def run_evaluate(args: argparse.Namespace) -> None:
+    """Say each result as it comes, and write all of them."""
+    sweeps = options.load(args)
+    names = options.names(args)
+    plan = evaluate.Plan(names, tuple(args.protocols), options.seeds(args), args.remove_means, options.effort(args))
+    done: list[dict[str, Any]] = []
+    refused: dict[str, str] = {}
+    print(evaluate.HEADER)
+    for result in evaluate.evaluate(sweeps, plan, options.where(args), _progress):
+        if result.refused:
+            refused[result.method] = result.refused
+            continue
+        done.append(result.json() | {"only": args.only})
+        print(evaluate.line(done[-1]), flush=True)
+        if args.json:
+            done.sort(key=lambda r: (args.protocols.index(r["protocol"]), names.index(r["method"]), r["seed"]))
+            _write(args.json, done)
+    if refused:
+        raise FormatError("; ".join(f"{name} cannot be used here: {why}" for name, why in refused.items()))
+
+
+def run_paper(args: argparse.Namespace) -> None:
+    """All of it; the page is named at the end."""
+    print(paper.run(args.out, args.quick, options.where(args), _progress, options.effort(args)))
+
+
+def run_stress(args: argparse.Namespace) -> None:
+    """Curves as JSON and as a picture, and the table."""
+    train = options.load(args)
+    simulated = args.test.startswith("sim:")
+    test = trial.Trial.simulated(args.test) if simulated else trial.Trial.of(sets.load(args.test).select(args.only))
+    told = stress.run(
+        options.names(args),
+        train,
+        test,
+        options.where(args),
+        seeds=options.seeds(args),
+        effort=options.effort(args),
+        log=_progress,
+    )
+    told |= {"train": train.source, "digest": sets.digest(train), "format": str(train.format)} | score.provenance()
+    table = stress.table(told)
+    whole(args.out / "results.json", (json.dumps(told) + "\n").encode())
+    whole(args.out / "table.md", table.encode())
+    whole(args.out / "curves.svg", chart.stress(told, args.strong.split(",")).encode())
+    print(table)
+
+
+def run_calibrate(args: argparse.Namespace) -> None:
+    """The table; the figures as JSON where asked for."""
+    first, _, last = args.seeds.partition("-")
+    if not first.isdigit() or not (last or first).isdigit() or int(last or first) < int(first):
+        raise FormatError(f"--seeds {args.seeds} cannot be read; write FIRST-LAST, e.g. 201-208")
+    seeds = range(int(first), int(last or first) + 1)
+    told = calibrate.measure(seeds, args.ablate, _progress, jobs=args.jobs) | score.provenance()
+    if args.json:
+        whole(args.json, (json.dumps(told, indent=1) + "\n").encode())
+    print(calibrate.table(told))
+
+
+def run_chart(args: argparse.Namespace) -> None:
+    """The picture's name."""
+    results: list[dict[str, Any]] = []
+    for path in args.results:
+        try:
+            results += json.loads(path.read_bytes())
+        except ValueError as e:
+            raise FormatError(f"{path.name}: not what evaluate wrote: {e}") from e
+    whole(args.out, chart.matrix(results, count="recording" if args.recordings else "window").encode())
+    print(args.out)
 
 
 def run_fit(args: argparse.Namespace) -> None:
     """Train, save the fit and say how it does on what was held out."""
     if args.rest and not args.split:
         raise FormatError("--rest needs --split; without it nothing is left over")
-    sweeps = sets.join([sets.load(spec, args.seed) for spec in args.sets]).select(args.only)
+    sweeps = options.load(args, args.seed)
     if args.split:
         by, share = _by_share(args.split)
         sweeps, rest = sweeps.split(by, share, args.seed)
@@ -83,12 +242,25 @@ def run_fit(args: argparse.Namespace) -> None:
 
 def run_export(args: argparse.Namespace) -> None:
     """Pack the bundle and say how it does."""
-    manifest = export.export(fit.Fit.load(args.fit), args.out, args.name, args.version, commit(), args.full_scale)
+    _told(export.export(fit.Fit.load(args.fit), *_packing(args)), args.out)
+
+
+def run_pack(args: argparse.Namespace) -> None:
+    """Train, pack the bundle and say how it does."""
+    (method,) = methods.find([args.method], options.effort(args))
+    _told(pack.pack(pack.trained(method, options.load(args, args.seed), args.seed), *_packing(args)), args.out)
+
+
+def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None]:
+    return args.out, args.name, args.version, commit(), args.full_scale
+
+
+def _told(manifest: Manifest, out: Path) -> None:
     for protocol, figure in manifest.figures.items():
         if "accuracy" in figure:
             print(f"{protocol}: {_spoken(figure)}")
-    size = sum(f.stat().st_size for f in args.out.iterdir())
-    print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {args.out}")
+    size = sum(f.stat().st_size for f in out.iterdir())
+    print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
 
 
 def run_yardsticks(args: argparse.Namespace) -> None:
@@ -107,6 +279,11 @@ def _by_share(text: str) -> tuple[str, float]:
 
 def _spoken(figure: dict[str, float]) -> str:
     return f"{figure['accuracy']:.3f} [{figure['low']:.3f}, {figure['high']:.3f}] of {figure['n']}"
+
+
+def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:
+    """Write a JSON list, one line each, whole or not at all."""
+    whole(path, ("[\n" + ",\n".join(json.dumps(result) for result in results) + "\n]\n").encode())
 
 
 def _progress(line: str) -> None:

@@ -1,38 +1,84 @@
-"""The room of networks. In: the form of a sweep. Out: the compact network in PyTorch, and graphs in ONNX.
+"""The room of networks. In: the form of a sweep. Out: networks in PyTorch, each of which writes its own ONNX graph.
 
-The ONNX graphs are written node by node: what runs on the box is what stands here, with fixed shapes and no tracer's
-surprises. They take the sensor's own digits; all scaling is inside.
+All have a linear head on features of a sweep; `prepare` makes digits what the convolutions take. The graphs are
+written with train/graphs.py and take the sensor's own digits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from math import ceil
 from typing import Any
 
 import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from appliance.errors import FormatError
 from appliance.sweep import SweepFormat
 
+from .graphs import TENSOR, Graph, centred, weight_count, with_head
+
+__all__ = ["TENSOR", "Compact", "Graph", "ImageNetwork", "Network", "Recurrent", "paper_cnn", "stages", "trunk",
+           "weight_count", "with_head"]  # fmt: skip
 CHANNELS = 32
 """Of each stage: the fewest for which Arm's symmetric int8 kernel is used."""
 FLOOR = 0.02
 """Added to a mean activation before its logarithm: a silent channel stays finite."""
 LEAST_STEPS = 24
 """Time steps that the last stage should have: a mean over less is mostly noise."""
-TENSOR = {
-    "uint8": TensorProto.UINT8,
-    "int16": TensorProto.INT16,
-    "uint16": TensorProto.UINT16,
-    "float32": TensorProto.FLOAT,
-}
-OPSET, IR = 17, 8
+STATE, PATCHES, LEAST_PATCH = 64, 128, 8
+"""Of Recurrent: size of its state, about how many patches it sees, frames of the shortest."""
+
+
+class Network(nn.Module):
+    """What all networks share. `scale` makes digits about 1 after `offset`, or each taxel's own mean, is taken away.
+
+    dropout: share of the features that the head misses in training.
+    """
+
+    head: nn.Linear
+
+    def __init__(self, form: SweepFormat, scale: float, offset: float | None = None) -> None:
+        super().__init__()
+        self.form, self.scale, self.offset, self.dropout = form, scale, offset, 0.0
+
+    def prepare(self, digits: Tensor) -> Tensor:
+        """Digits [B, T, R, C] -> float32 [B, R * C, T] about 1."""
+        x = digits.flatten(2).transpose(1, 2).float()
+        return (x - (x.mean(2, keepdim=True) if self.offset is None else self.offset)) * self.scale
+
+    def features(self, prepared: Tensor) -> Tensor:
+        """[B, R * C, T] as `prepare` gives -> what the head sees of it [B, F]."""
+        raise NotImplementedError
+
+    def judge(self, prepared: Tensor) -> Tensor:
+        """[B, R * C, T] as `prepare` gives -> logits [B, K]; in training the head misses some features."""
+        logits: Tensor = self.head(functional.dropout(self.features(prepared), self.dropout, self.training))
+        return logits
+
+    def seen(self, digits: Tensor) -> Tensor:
+        """Digits [B, T, R, C] -> what the head sees of them [B, F]."""
+        return self.features(self.prepare(digits))
+
+    def forward(self, digits: Tensor) -> Tensor:
+        """Digits [B, T, R, C] -> logits [B, K]."""
+        logits: Tensor = self.head(self.seen(digits))
+        return logits
+
+    def fused(self) -> Network:
+        """The same network, ready for inference."""
+        return self.eval()
+
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` -> `logits` float32 [1, K], as in inference."""
+        raise NotImplementedError
 
 
 def stages(window: int) -> tuple[tuple[int, int], ...]:
@@ -54,7 +100,7 @@ def stages(window: int) -> tuple[tuple[int, int], ...]:
     return plan
 
 
-class Compact(nn.Module):
+class Compact(Network):
     """Three strided convolutions over time with the taxels as channels; the head sees each one's mean activation.
 
     Each taxel's mean over the window is taken away first: what is left is texture, and int8 does not spend its range
@@ -66,18 +112,13 @@ class Compact(nn.Module):
     def __init__(
         self, form: SweepFormat, classes: int, scale: float, norm: bool = True, keep_means: bool = False
     ) -> None:
-        super().__init__()
-        self.form, self.scale, self.keep_means = form, scale, keep_means
+        super().__init__(form, scale)
+        self.keep_means = keep_means
         plan = stages(form.window)
         inputs = (form.rows * form.cols,) + (CHANNELS,) * (len(plan) - 1)
         self.convs = nn.ModuleList(nn.Conv1d(n, CHANNELS, k, s) for n, (k, s) in zip(inputs, plan, strict=True))
         self.norms = nn.ModuleList(nn.BatchNorm1d(CHANNELS) if norm else nn.Identity() for _ in plan)
         self.head = nn.Linear(CHANNELS * len(plan) + keep_means * inputs[0], classes)
-
-    def prepare(self, digits: Tensor) -> Tensor:
-        """Digits [B, T, R, C] -> float32 [B, R * C, T] about 1, without each taxel's mean."""
-        x = digits.flatten(2).transpose(1, 2).float()
-        return (x - x.mean(2, keepdim=True)) * self.scale
 
     def features(self, prepared: Tensor) -> Tensor:
         """[B, R * C, T] -> log mean activations [B, 3 * CHANNELS]."""
@@ -93,11 +134,6 @@ class Compact(nn.Module):
         means = digits.flatten(2).float().mean(1) * self.scale
         return torch.cat([features, means], 1) if self.keep_means else features
 
-    def forward(self, digits: Tensor) -> Tensor:
-        """Digits [B, T, R, C] -> logits [B, K]."""
-        logits: Tensor = self.head(self.seen(digits))
-        return logits
-
     def fused(self) -> Compact:
         """The same network for inference, its batch norms folded into the convolutions."""
         plain = Compact(self.form, self.head.out_features, self.scale, norm=False)
@@ -106,36 +142,11 @@ class Compact(nn.Module):
             mine.load_state_dict(fuse_conv_bn_eval(conv.eval(), norm.eval()).state_dict())
         return plain.eval()
 
-
-class Graph:
-    """An ONNX graph in the making."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def constant(self, value: Any, dtype: str = "float32") -> str:
-        """The name of a new constant."""
-        name = f"constant{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.array(value, dtype, order="C"), name))
-        return name
-
-    def __call__(self, op: str, *inputs: str, output: str = "", **attributes: Any) -> str:
-        """Add one node; the name of its output."""
-        output = output or f"{op.lower()}{len(self.nodes)}"
-        self.nodes.append(helper.make_node(op, inputs, [output], name=output, **attributes))
-        return output
-
-    def model(self, form: SweepFormat, output: str, size: int) -> onnx.ModelProto:
-        """The finished, checked model: `sweep` [1, T, R, C] -> `output` float32 [1, size]."""
-        sweep = helper.make_tensor_value_info("sweep", TENSOR[form.dtype], [1, form.window, form.rows, form.cols])
-        out = helper.make_tensor_value_info(output, TensorProto.FLOAT, [1, size])
-        graph = helper.make_graph(self.nodes, "palpate", [sweep], [out], self.constants)
-        made = helper.make_model(
-            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR, producer_name="palpate"
-        )
-        onnx.checker.check_model(made, full_check=True)
-        return made
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` -> `logits` float32 [1, K]; of a fused network."""
+        weights = {k: v.numpy() for k, v in self.state_dict().items()}
+        whole = trunk(self.form, self.scale, weights, self.keep_means)
+        return with_head(whole, weights["head.weight"], weights["head.bias"])
 
 
 def trunk(
@@ -143,16 +154,10 @@ def trunk(
 ) -> onnx.ModelProto:
     """`Compact` up to its features: `sweep` -> `features` float32 [1, F]. weights: the state of a fused Compact.
 
-    The means are taken away by matrix products, five times as fast in onnxruntime as ReduceMean and Sub along time, and
-    exact for whole digits in whatever order a processor adds them up. The first convolution takes the scale along.
+    The first convolution takes the scale along.
     """
-    g, taxels = Graph(), form.rows * form.cols
-    one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
-    ones = g("ConstantOfShape", g.constant([form.window, 1], "int64"), value=one)
-    x = g("Cast", g("Reshape", "sweep", g.constant([form.window, taxels], "int64")), to=TensorProto.FLOAT)
-    sums = g("Gemm", ones, x, transA=1)
-    x = g("Gemm", ones, sums, x, alpha=-1 / form.window)
-    x = g("Transpose", g("Reshape", x, g.constant([1, form.window, taxels], "int64")), perm=[0, 2, 1])
+    g = Graph()
+    x, sums = centred(g, form)
     means = []
     for i, (_, stride) in enumerate(stages(form.window)):
         w, b = weights[f"convs.{i}.weight"], weights[f"convs.{i}.bias"]
@@ -161,46 +166,127 @@ def trunk(
     seen = g("Log", g("Add", g("Concat", *means, axis=1), g.constant(FLOOR)), output="" if keep_means else "features")
     if keep_means:
         g("Concat", seen, g("Mul", sums, g.constant(scale / form.window)), axis=1, output="features")
-    return g.model(form, "features", CHANNELS * len(means) + keep_means * taxels)
+    return g.model(form, "features", CHANNELS * len(means) + keep_means * form.rows * form.cols)
 
 
-def with_head(trunk: onnx.ModelProto, weight: NDArray[Any], bias: NDArray[Any]) -> onnx.ModelProto:
-    """A trunk (float or int8) and a linear head, weight [K, F] and bias [K]: `sweep` -> `logits` float32 [1, K]."""
-    whole = onnx.ModelProto()
-    whole.CopyFrom(trunk)
-    graph = whole.graph
-    for name, value in (("head.weight", weight), ("head.bias", bias)):
-        graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(value, np.float32), name))
-    inputs = [graph.output[0].name, "head.weight", "head.bias"]
-    graph.node.append(helper.make_node("Gemm", inputs, ["logits"], name="logits", transB=1))
-    graph.output.pop()
-    graph.output.append(helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, len(bias)]))
-    onnx.checker.check_model(whole, full_check=True)
-    return whole
+@dataclass(frozen=True)
+class Image:
+    """Layers of an ImageNetwork. channels: of each convolution; strides: its steps in (time, taxels); pool: in time.
+
+    norm: batch norms behind the convolutions. dense: neurons of the layer before the head.
+    """
+
+    channels: tuple[int, ...]
+    strides: tuple[tuple[int, int], ...]
+    pool: int
+    norm: bool
+    dense: int
+
+
+KERNEL = (15, 5)
+"""Of the paper's convolutions, frames by taxels (table I)."""
+PAPER = Image(channels=(32, 64), strides=((1, 1), (1, 1)), pool=10, norm=False, dense=1024)
+"""The paper's CNN (eq. 6 to 9, table I)."""
+TACTNET2 = Image(channels=(32, 64, 128), strides=((5, 2), (5, 2), (5, 1)), pool=2, norm=True, dense=1024)
+"""TactNet-II as far as it is known: three convolutions, batch norm, 1.84 M parameters (Tulbure and Baeuml 2018; here
+1.83 M for 1500 x 4 x 4 and six classes). The kernels are those of its predecessor; channels, strides, which stand for
+most of the pooling and are a twentieth of the work, and the dense layer are ours."""
+
+
+class ImageNetwork(Network):
+    """Convolutions over one image, time by taxels, then a dense layer: the form of the paper's CNN.
+
+    Zero padding keeps sizes; where the pooling runs over the end it pools what is there.
+    """
+
+    def __init__(self, form: SweepFormat, classes: int, scale: float, offset: float | None, plan: Image) -> None:
+        super().__init__(form, scale, offset)
+        self.plan, steps, taxels = plan, form.window, form.rows * form.cols
+        self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
+        for before, after, by in zip((1, *plan.channels), plan.channels, plan.strides, strict=False):
+            self.convs.append(nn.Conv2d(before, after, KERNEL, by, padding=(KERNEL[0] // 2, KERNEL[1] // 2)))
+            self.norms.append(nn.BatchNorm2d(after) if plan.norm else nn.Identity())
+            steps, taxels = ceil(ceil(steps / by[0]) / plan.pool), ceil(taxels / by[1])
+        self.dense = nn.Linear(plan.channels[-1] * steps * taxels, plan.dense)
+        self.head = nn.Linear(plan.dense, classes)
+        for layer in (*self.convs, self.dense):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)
+        self.to(memory_format=torch.channels_last)  # a fifth faster on a processor
+
+    def features(self, prepared: Tensor) -> Tensor:
+        """[B, R * C, T] -> activations of the dense layer [B, plan.dense]."""
+        x = prepared.transpose(1, 2)[:, None]
+        for conv, norm in zip(self.convs, self.norms, strict=True):
+            x = functional.max_pool2d(norm(conv(x)), (self.plan.pool, 1), ceil_mode=True).relu()
+        return torch.relu(self.dense(x.flatten(1)))
+
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` -> `logits` float32 [1, K]; the batch norms are folded into the convolutions."""
+        g, form, classes = Graph(), self.form, self.head.out_features
+        steps, taxels = form.window, form.rows * form.cols
+        if self.offset is None:
+            x = g("Transpose", centred(g, form)[0], perm=[0, 2, 1])
+        else:
+            x = g("Sub", g("Cast", "sweep", to=TensorProto.FLOAT), g.constant(self.offset))
+        x = g("Mul", g("Reshape", x, g.constant([1, 1, steps, taxels], "int64")), g.constant(self.scale))
+        for conv, norm in zip(self.convs, self.norms, strict=True):
+            plain = fuse_conv_bn_eval(conv.eval(), norm.eval()) if self.plan.norm else conv
+            x = g("Conv", x, *_constants(g, plain), pads=list(conv.padding) * 2, strides=list(conv.stride))
+            steps = ceil(steps / conv.stride[0])
+            by = [self.plan.pool, 1]
+            x = g("MaxPool", g("Relu", x), kernel_shape=by, strides=by, pads=[0, 0, -steps % self.plan.pool, 0])
+            steps = ceil(steps / self.plan.pool)
+        x = g("Relu", g("Gemm", g("Flatten", x), *_constants(g, self.dense), transB=1))
+        g("Gemm", x, *_constants(g, self.head), transB=1, output="logits")
+        return g.model(form, "logits", classes)
+
+
+class Recurrent(Network):
+    """Patches of time with the taxels as channels, a gated recurrent unit over them; the head sees its mean state.
+
+    A patch is two strides long; about PATCHES of them cover the window, whatever its rate and length.
+    """
+
+    def __init__(self, form: SweepFormat, classes: int, scale: float) -> None:
+        super().__init__(form, scale)
+        self.stride = max(form.window // PATCHES, 1)
+        kernel = min(max(2 * self.stride, LEAST_PATCH), form.window)
+        self.patches = nn.Conv1d(form.rows * form.cols, STATE, kernel, self.stride)
+        self.unit = nn.GRU(STATE, STATE)
+        self.head = nn.Linear(STATE, classes)
+
+    def features(self, prepared: Tensor) -> Tensor:
+        """[B, R * C, T] -> mean state over time [B, STATE]."""
+        states, _ = self.unit(torch.relu(self.patches(prepared)).permute(2, 0, 1))
+        return states.mean(0)
+
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` -> `logits` float32 [1, K]."""
+        g, unit = Graph(), self.unit
+        x = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
+        x = g("Relu", g("Conv", x, *_constants(g, self.patches), strides=[self.stride]))
+        given, kept = (_reordered(w) for w in (unit.weight_ih_l0, unit.weight_hh_l0))
+        biases = np.concatenate([_reordered(b) for b in (unit.bias_ih_l0, unit.bias_hh_l0)])
+        weights = [g.constant(w[None]) for w in (given, kept, biases)]
+        x = g("GRU", g("Transpose", x, perm=[2, 0, 1]), *weights, hidden_size=STATE, linear_before_reset=1)
+        x = g("Reshape", g("ReduceMean", x, axes=[0]), g.constant([1, STATE], "int64"))
+        g("Gemm", x, *_constants(g, self.head), transB=1, output="logits")
+        return g.model(self.form, "logits", self.head.out_features)
+
+
+def _constants(g: Graph, layer: nn.Module) -> tuple[str, str]:
+    return g.constant(layer.weight.detach().numpy()), g.constant(layer.bias.detach().numpy())
+
+
+def _reordered(gates: Tensor) -> NDArray[Any]:
+    """PyTorch's gates (reset, update, new) in ONNX's order (update, reset, new)."""
+    reset, update, new = gates.detach().numpy().reshape(3, STATE, *gates.shape[1:])
+    return np.concatenate([update, reset, new])
 
 
 def paper_cnn(form: SweepFormat, classes: int, rng: np.random.Generator) -> onnx.ModelProto:
-    """The paper's CNN (eq. 6 to 9, table I) with random weights: a yardstick for time and memory, not for accuracy.
-
-    Its input is one image, time by taxels; zero padding keeps sizes.
-    """
-    g, taxels, steps = Graph(), form.rows * form.cols, form.window
-
-    def weights(*shape: int) -> tuple[str, str]:
-        drawn = rng.standard_normal(shape, np.float32) * np.sqrt(2 / np.prod(shape[1:]), dtype=np.float32)
-        return g.constant(drawn), g.constant(np.zeros(shape[0]))
-
-    x = g("Reshape", g("Cast", "sweep", to=TensorProto.FLOAT), g.constant([1, 1, steps, taxels], "int64"))
-    x = g("Mul", x, g.constant(1 / 255))
-    for before, channels in ((1, 32), (32, 64)):
-        x = g("Relu", g("Conv", x, *weights(channels, before, 15, 5), pads=[7, 2, 7, 2]))
-        x = g("MaxPool", x, kernel_shape=[10, 1], strides=[10, 1])
-        steps //= 10
-    x = g("Relu", g("Gemm", g("Flatten", x), *weights(1024, channels * steps * taxels), transB=1))
-    g("Gemm", x, *weights(classes, 1024), transB=1, output="logits")
-    return g.model(form, "logits", classes)
-
-
-def weight_count(model: onnx.ModelProto) -> int:
-    """How many trained numbers a float graph holds: what is left of its constants without shapes and scalars."""
-    return sum(int(np.prod(c.dims)) for c in model.graph.initializer if c.data_type == TensorProto.FLOAT and c.dims)
+    """The paper's CNN with random weights: a yardstick for time and memory, not for accuracy."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(rng.integers(2**31)))
+        return ImageNetwork(form, classes, 1 / 255, 0.0, PAPER).graph()

@@ -1,13 +1,14 @@
 """The room of sweep sets. In: a file of the user's, or the name of a simulated set. Out: a checked SweepSet.
 
 A set knows which sweeps belong together (`groups`), can be narrowed to some of them and split so that no recording is
-on both sides. What a file must hold stands in appliance/sim/sets.py, which the box plays sets with.
+on both sides. What a file must hold stands in appliance/sim/sets.py, which the box plays sets with; files.py reads it.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -16,13 +17,15 @@ import numpy as np
 
 from appliance.errors import FormatError
 from appliance.sim import sets, skin
-from appliance.sim.sets import Array, load_file
+from appliance.sim.sets import Array
+
+from . import files
 
 SIMULATED = re.compile(r"sim:(?P<name>[^:]+)(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?")
-CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)\s*(-?\d+)\s*")
-OWN_NUMBERS = ("recording", "position", "session")
+CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)(.*)")
+OWN_NUMBERS = ("recording", "position", "session", "object")
 """Groups whose numbers mean something within their set only."""
-COMPARE: dict[str, Callable[[Array, int], Array]] = {"=": np.equal, "<=": np.less_equal, ">=": np.greater_equal}
+LIMITS: dict[str, Callable[[Array, int], Array]] = {"<=": np.less_equal, ">=": np.greater_equal}
 
 
 @dataclass(frozen=True)
@@ -35,27 +38,72 @@ class SweepSet(sets.SweepSet):
             raise self._error(f"only one class, {self.materials[present[0]]!r}; a classifier needs two")
         return self
 
+    def of_whole_recordings(self) -> SweepSet:
+        """The set itself. Raises FormatError where a recording is of several materials: no verdict on it could be right."""
+        values, _, counts = self.tally("recording")
+        if len(several := values[(counts > 0).sum(axis=1) > 1]):
+            raise self._error(
+                f"recording {several[0]} holds sweeps of several materials, as {len(several)} do; "
+                "give each recording its own number"
+            )
+        return self
+
     def take(self, index: Array) -> SweepSet:
         """The sweeps `index` (mask or numbers) with all materials, so that labels keep their meaning."""
         groups = {k: v[index] for k, v in self.groups.items()}
         return replace(self, samples=self.samples[index], labels=self.labels[index], groups=groups)
 
     def select(self, conditions: Sequence[str]) -> SweepSet:
-        """The sweeps for which all conditions hold ("direction=0", "force<=180"), without materials left over.
+        """The sweeps for which all conditions hold, without materials left over.
 
-        Raises FormatError where a condition cannot be read, its group is unknown, or less than two classes remain.
+        A condition is a group and a limit ("force<=180") or any of several values ("force=100,150"); `material` goes
+        by name ("material=Canvas,Linen"). Raises FormatError where a condition cannot be read, its group or a value of
+        it does not occur, or less than two classes remain.
         """
         keep = np.ones(len(self), bool)
         for text in conditions:
-            if not (found := CONDITION.fullmatch(text)):
-                raise self._error(f"condition {text!r} cannot be read; write a group, one of = <= >=, a whole number")
-            name, how, value = found.groups()
-            keep &= COMPARE[how](self.group(name), int(value))
+            keep &= self._fulfils(text)
         if not keep.any():
-            raise self._error(f"no sweep fulfils {' and '.join(conditions)}; it has {', '.join(sorted(self.groups))}")
+            raise self._error(f"no sweep fulfils {' and '.join(conditions)}; ask for less at once")
         part = self.take(keep).of_several()
         present, labels = np.unique(part.labels, return_inverse=True)
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))
+
+    def _fulfils(self, condition: str) -> Array:
+        """bool [N], the sweeps for which one condition holds."""
+        if not (found := CONDITION.fullmatch(condition)):
+            raise self._error(f"condition {condition!r} cannot be read; write a group, one of = <= >=, whole numbers")
+        name, how, text = found.groups()
+        by_name = name == "material"
+        of_each = np.array(self.materials)[self.labels] if by_name else self.group(name)
+        try:
+            values = [value.strip() if by_name else int(value) for value in text.split(",")]
+        except ValueError:
+            raise self._error(f"condition {condition!r} cannot be read; {text.strip()!r} is no whole number") from None
+        if how in LIMITS:
+            if by_name or len(values) > 1:
+                raise self._error(f"condition {condition!r} cannot be read; {how} takes a group and one whole number")
+            return LIMITS[how](of_each, values[0])
+        for value in values:
+            if not (of_each == value).any():
+                raise self._error(f"no sweep fulfils {name}={value}; it has {_shortened(np.unique(of_each))}")
+        return np.isin(of_each, values)
+
+    def without_means(self) -> SweepSet:
+        """The set with each window's mean over time taken from each taxel: samples float32, zero where one is constant.
+
+        What is left is texture: the mean alone often tells the session in which a material was recorded.
+        """
+        means = self.samples.mean(axis=1, keepdims=True, dtype=np.float64)  # exact where a taxel is constant
+        samples = np.subtract(self.samples, means, out=np.empty(self.samples.shape, np.float32), casting="same_kind")
+        return replace(self, samples=samples)
+
+    def tally(self, by: str) -> tuple[Array, Array, Array]:
+        """The values [V] of group `by`, the place of each sweep's among them [N], and sweeps [V, K] of each material."""
+        values, member = np.unique(self.group(by), return_inverse=True)
+        counts = np.zeros((len(values), len(self.materials)), int)
+        np.add.at(counts, (member, self.labels), 1)
+        return values, member, counts
 
     def split(self, by: str, share: float, seed: int) -> tuple[SweepSet, SweepSet]:
         """Two parts, of which the first has about `share` of each material's groups `by`; no group is on both sides.
@@ -64,10 +112,8 @@ class SweepSet(sets.SweepSet):
         """
         if not 0 < share < 1:
             raise self._error(f"a share of {share} splits nothing; use more than 0 and less than 1")
-        rng, group = np.random.default_rng(seed), self.group(by)
-        names, member = np.unique(group, return_inverse=True)
-        counts = np.zeros((len(names), len(self.materials)), int)
-        np.add.at(counts, (member, self.labels), 1)
+        rng = np.random.default_rng(seed)
+        names, member, counts = self.tally(by)
         first = np.zeros(len(names), bool)
         for label in np.unique(main := counts.argmax(axis=1)):
             those = rng.permutation(np.flatnonzero(main == label))
@@ -82,28 +128,37 @@ class SweepSet(sets.SweepSet):
         return self.take(inside), self.take(~inside)
 
     def save(self, path: Path) -> None:
-        """Write the set as a compressed .npz, which `load` reads."""
+        """Write the set where `load` reads it: HDF5 where the name ends so, else a compressed .npz."""
         groups = {f"group_{k}": v for k, v in self.groups.items()}
-        arrays = {"samples": self.samples, "labels": self.labels, "materials": np.array(self.materials)} | groups
-        with path.open("wb") as f:
-            np.savez_compressed(f, rate_hz=np.float64(self.rate_hz), **arrays)
+        arrays = {"samples": self.samples, "labels": self.labels, "rate_hz": np.float64(self.rate_hz)} | groups
+        if path.suffix in files.HDF5:
+            files.write_hdf5(path, arrays | {"materials": list(self.materials)})
+        else:
+            with path.open("wb") as f:
+                np.savez_compressed(f, materials=np.array(self.materials), **arrays)
 
 
 def load(spec: str, seed: int = 0) -> SweepSet:
-    """The set that `spec` names: a file PATH.npz, or sim:NAME[:SEED[-LAST][:SWEEPS]].
+    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings, or sim:NAME[:SEED[-LAST][:SWEEPS]].
 
     SWEEPS: per material and position. SEED-LAST: one set of several worlds, whose positions differ. seed: of a
     simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
     """
-    return _simulated(spec, seed) if spec.startswith("sim:") else load_file(Path(spec), SweepSet).of_several()
+    return _simulated(spec, seed) if spec.startswith("sim:") else files.read(Path(spec), SweepSet).of_several()
 
 
 def join(sets: Sequence[SweepSet]) -> SweepSet:
-    """One set of several with the same format and materials, and the groups that all have.
+    """One set of several with the same format and materials, the groups that all have, and `set`: the place of each.
 
-    Recordings, positions and sessions are numbered on, since number 0 of two sets is not the same thing; a force or a
-    speed is. Raises FormatError where the sets do not fit.
+    Recordings, positions, sessions and objects are numbered on, since number 0 of two sets is not the same thing; a
+    force or a speed is. One set alone stays as it is. Raises FormatError where the sets do not fit.
     """
+    if len(sets) == 1:
+        return sets[0]
+    return _one([replace(s, groups=s.groups | {"set": np.full(len(s), i)}) for i, s in enumerate(sets)])
+
+
+def _one(sets: Sequence[SweepSet]) -> SweepSet:
     head, *others = sets
     for s in others:
         if (s.format, s.materials) != (head.format, head.materials):
@@ -135,7 +190,69 @@ def _simulated(spec: str, seed: int) -> SweepSet:
     worlds = []
     for world in range(first, int(found["last"] or first) + 1):
         samples, labels, position = skin.sweep_set(found["name"], world, each)
-        worlds.append(SweepSet(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, {"position": position}, spec))
+        groups = {"position": position, "world": np.full(len(labels), world)}
+        worlds.append(SweepSet(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, spec))
     if not worlds:
         raise FormatError(f"set {spec!r} is empty: its last seed comes before its first")
-    return replace(join(worlds), source=spec)
+    return replace(_one(worlds), source=spec)
+
+
+def digest(sweeps: SweepSet) -> str:
+    """16 hex digits (SHA-256) of everything but the source: the same for the same data, from whatever file it came."""
+    x, names = sweeps.samples, sorted(sweeps.groups)
+    total = hashlib.sha256(repr((sweeps.materials, float(sweeps.rate_hz), x.dtype.name, x.shape, names)).encode())
+    for numbers in (sweeps.labels, *(sweeps.groups[name] for name in names)):
+        total.update(numbers.astype("<i8").tobytes())
+    total.update(np.ascontiguousarray(x, x.dtype.newbyteorder("<")).data)
+    return total.hexdigest()[:16]
+
+
+def describe(sweeps: SweepSet) -> str:
+    """What a set holds, in lines: sweeps and their form, materials, recordings, groups and what is confounded."""
+    fmt, counts = sweeps.format, np.bincount(sweeps.labels, minlength=len(sweeps.materials))
+    each = ", ".join(f"{name} {n}" for name, n in zip(sweeps.materials, counts, strict=True))
+    _, _, held = sweeps.tally("recording")
+    least, most = (windows := held.sum(axis=1)).min(), windows.max()
+    lines = [
+        f"{sweeps.source}: {len(sweeps)} sweeps of {fmt.window / fmt.rate_hz:.3g} s; {fmt}; digest {digest(sweeps)}",
+        f"  materials: {len(counts)}: {each}",
+        f"  recordings: {len(windows)}, of {least if least == most else f'{least} to {most}'} each",
+    ]
+    if several := np.count_nonzero((held > 0).sum(axis=1) > 1):
+        lines.append(f"    {several} of them hold sweeps of several materials: number recordings within one material")
+    for name in sorted(set(sweeps.groups) - {"recording"}):
+        values, _, counts = sweeps.tally(name)
+        lines.append(f"  {name}: {len(values)}: {_shortened(values)}")
+        lines += [f"    confounded: {why}" for why in _confounded(values, counts > 0, sweeps.materials)]
+    return "\n".join(lines)
+
+
+def _confounded(values: Array, holds: Array, materials: Sequence[str]) -> Iterator[str]:
+    """How a group of several values tells the material, or takes one with it when left out. holds: bool [V, K]."""
+    if len(values) < 2:
+        return
+    if len(single := values[holds.sum(axis=1) == 1]):
+        yield f"one material only at {_shortened(single)}"
+    for k in np.flatnonzero(holds.sum(axis=0) == 1):
+        yield f"{materials[k]!r} only at {values[holds[:, k].argmax()]}; leaving that out leaves none to train on"
+
+
+def _shortened(values: Array) -> str:
+    texts = [str(value) for value in values]
+    return ", ".join(texts if len(texts) <= 9 else [*texts[:8], "…", texts[-1]])
+
+
+def known() -> str:
+    """What `load` takes, in lines."""
+    tubes = len(skin.MATERIALS)
+    lines = [
+        "FILE.npz, .h5, .hdf5   samples [N, T, R, C], labels [N], materials [K], rate_hz, group_NAME [N]",
+        "FILE.h5, .hdf5         TactMat: samples [materials, repetitions, T, R, C], materials",
+        "FOLDER                 what palpate run --keep FOLDER recorded, with its material in each .json",
+        "sim:NAME[:SEED[-LAST][:SWEEPS]]  simulated; SWEEPS of a tube at each position, SEED to LAST joined",
+    ]
+    for name, (positions, each) in skin.SETS.items():
+        total = positions * each * tubes
+        lines.append(f"  sim:{name:<12}{total:>5} sweeps, {each} of each of {tubes} tubes at {positions} position(s)")
+    lines.append(f"  sim:{'T-HARD:1-20':<12}{20 * total:>5} sweeps, twenty worlds joined, for tight intervals")
+    return "\n".join(lines)

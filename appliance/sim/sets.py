@@ -44,7 +44,7 @@ class SweepSet:
                 f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], none empty"
             )
         if x.dtype.name not in DIGITS:
-            raise self._error(f"samples are {x.dtype}; use one of {', '.join(DIGITS)}")
+            raise self._error(f"samples are {x.dtype}; use one of {', '.join(DIGITS)}{_conversion(x)}")
         if x.dtype.kind == "f" and not np.isfinite(x).all():
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
@@ -62,6 +62,10 @@ class SweepSet:
             raise self._error(f"materials {list(self.materials)} name one twice; give each its own name")
         if not 0 < self.rate_hz < np.inf:
             raise self._error(f"rate_hz is {self.rate_hz}; give frames per second")
+        try:
+            _ = self.format
+        except FormatError as e:
+            raise self._error(str(e)) from e
 
     def _error(self, why: str) -> FormatError:
         return FormatError(f"{self.source}: {why}")
@@ -94,17 +98,31 @@ def read(path: Path, what: str) -> dict[str, Array]:
 
 
 def load_file(path: Path, kind: type[Set]) -> Set:
-    """The set in `path`. Raises FormatError naming what is missing or of the wrong form, and where."""
-    held = read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)")
+    """The set in the .npz `path`. Raises FormatError naming what is missing or of the wrong form, and where."""
+    return build(read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)"), path.name, kind)
+
+
+def build(held: dict[str, Array], source: str, kind: type[Set]) -> Set:
+    """The set of the arrays `held`, named as in a file. Raises FormatError naming `source` and what is wrong."""
     missing = {"samples", "labels", "materials", "rate_hz"} - set(held)
     if missing:
         raise FormatError(
-            f"{path.name}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, materials, rate_hz"
+            f"{source}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, materials, rate_hz"
         )
     if held["materials"].ndim != 1 or held["materials"].dtype.kind != "U":
-        raise FormatError(f"{path.name}: materials hold {held['materials'].dtype}; give a list of names")
+        raise FormatError(f"{source}: materials hold {held['materials'].dtype}; give a list of names")
     if held["rate_hz"].size != 1 or held["rate_hz"].dtype.kind not in "iuf":
-        raise FormatError(f"{path.name}: rate_hz holds {held['rate_hz']!r}; give one number, frames per second")
-    groups = {k.removeprefix("group_"): v for k, v in held.items() if k.startswith("group_")}
+        raise FormatError(f"{source}: rate_hz holds {held['rate_hz']!r}; give one number, frames per second")
+    # torch and onnxruntime take this machine's byte order only
+    native = {k: v.astype(v.dtype.newbyteorder("="), copy=False) for k, v in held.items()}
+    groups = {k.removeprefix("group_"): v for k, v in native.items() if k.startswith("group_")}
     materials = tuple(str(m) for m in held["materials"])
-    return kind(held["samples"], held["labels"], materials, held["rate_hz"].item(), groups, path.name)
+    return kind(native["samples"], native["labels"], materials, held["rate_hz"].item(), groups, source)
+
+
+def _conversion(x: Array) -> str:
+    """What to do with samples of another type: the first digit type that holds the same values, float32 for broken ones."""
+    if x.dtype.kind not in "biuf":
+        return ""
+    fits = (d for d in DIGITS if x.dtype.kind != "f" and (x.astype(d) == x).all())
+    return f", e.g. samples.astype({next(fits, 'float32')!r})"

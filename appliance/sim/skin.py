@@ -48,12 +48,12 @@ class Material:
 
 
 TUBES = (
-    Material("metal", 0.00, 0.005, 12.0, 1.2, 0.028, 155.0, 0.45),
-    Material("wood", 0.00, 0.010, 7.0, 1.0, 0.034, 120.0, 0.60),
-    Material("paper", 0.03, 0.050, 7.0, 0.8, 0.055, 70.0, 0.50),
-    Material("plastic rough", 0.01, 0.100, 4.5, 0.4, 0.080, 45.0, 0.70),
-    Material("plastic smooth", 0.00, 0.006, 10.0, 1.2, 0.034, 150.0, 0.90),
-    Material("foam", 0.20, 0.040, 6.0, 1.0, 0.040, 20.0, 0.60),
+    Material("metal", 0.00, 0.0083, 9.0, 1.2, 0.0268, 159.0, 0.49),
+    Material("wood", 0.00, 0.0167, 5.2, 1.0, 0.0400, 109.5, 0.52),
+    Material("paper", 0.03, 0.0835, 5.2, 0.8, 0.0438, 86.0, 0.50),
+    Material("plastic rough", 0.01, 0.1670, 3.4, 0.4, 0.0633, 54.5, 0.70),
+    Material("plastic smooth", 0.00, 0.0102, 7.5, 1.2, 0.0272, 143.5, 0.88),
+    Material("foam", 0.20, 0.0668, 4.5, 1.0, 0.0317, 20.3, 0.60),
 )
 MATERIALS = tuple(tube.name for tube in TUBES)
 
@@ -62,25 +62,26 @@ MATERIALS = tuple(tube.name for tube in TUBES)
 class World:
     """Everything of the scene that is neither the skin's place nor drawn at random. `off`: EFFECTS to leave out.
 
-    A spread is a standard deviation, of the natural logarithm where nothing else is said.
+    A spread is a standard deviation, of the natural logarithm where nothing else is said. Fitted: docs/decisions/0003.
     Raises ConfigError where `off` names an effect that does not exist.
     """
 
     off: frozenset[str] = frozenset()
     tubes: tuple[Material, ...] = TUBES
     force_n: float = 1.0
-    force_spread: float = 0.10  # share of the force
+    force_spread: float = 0.07  # share of the force
     pad_kpa_per_mm: float = 4.0
     pad_half_mm: float = 8.5  # along the tube; beyond it the pad bends away
     digits_per_kpa: float = 15.0
-    noise_digits: float = 0.6
-    gain_spread: float = 0.18  # per attachment, once for all taxels and once for each
+    noise_digits: float = 0.36
+    gain_spread: float = 0.17  # per attachment, once for all taxels and once for each
     bedding_mm: float = 0.05  # spread of the height of tape and pad under a taxel, per attachment
-    colour_spread: float = 0.40  # of how tape and glove pass vibrations, per attachment and octave
-    damping_hz: float = 120.0  # above it the pad swallows vibrations,
-    damping_octaves_per_mm: float = -0.50  # and sooner towards the finger's tip
-    spot_spread: float = 0.20  # of height and vibration from one spot of a tube to another
-    spot_octaves: float = 0.12  # spread of pitch and rate likewise
+    colour_spread: float = 0.49  # of how tape and glove pass vibrations, per attachment and octave
+    damping_hz: float = 114.0  # above it the pad swallows vibrations,
+    damping_octaves_per_mm: float = -0.60  # and sooner, the further towards the finger's tip the skin sits;
+    relief_per_mm: float = 0.12  # there it follows the relief more, as the logarithm of the height
+    spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
+    spot_octaves: float = 0.13  # spread of pitch and rate likewise
 
     def __post_init__(self) -> None:
         if unknown := self.off - set(EFFECTS):
@@ -168,7 +169,8 @@ def spot(tube: Material, rng: Generator, world: World) -> Material:
 def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World) -> Array:
     """Effect: height [n, 4, 4] in mm under the taxels, averaged over their length. `slid` [n]: frames slid so far.
 
-    Each column runs over a track of its own, on which the rows follow one another at the speed of sliding.
+    Each column runs over a track of its own, on which the rows follow one another at the speed of sliding. A sheet
+    that reaches over the pad's end is not held down there: the further ahead it sits, the freer it follows the relief.
     """
     if "texture" in world.off:
         return np.zeros((1, 4, 4))
@@ -176,7 +178,7 @@ def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World)
     n = 500 * int(np.ceil((slid[-1] + lead.max() + 1) / 500))  # a length that the FFT likes
     blur = np.sinc(np.fft.rfftfreq(n, STEP_MM) * TAXEL_MM)
     track = tube.texture_mm * band(n, 4, 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM, rng, blur)
-    height: Array = track[np.arange(4), slid[:, None, None] + lead]
+    height: Array = np.exp(world.relief_per_mm * x.mean()) * track[np.arange(4), slid[:, None, None] + lead]
     return height
 
 
@@ -200,8 +202,7 @@ def noise(n: int, rng: Generator, world: World) -> Array:
 
 def gap(x: Array, y: Array | float, world: World) -> Array:
     """Distance in mm of the unloaded pad from a tube that it just touches: the tube falls off, then the pad ends."""
-    ends: Array = (x / world.pad_half_mm) ** 6
-    return y**2 / (2 * TUBE_RADIUS_MM) + ends
+    return np.square(y) / (2 * TUBE_RADIUS_MM) + (x / world.pad_half_mm) ** 6
 
 
 def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
@@ -254,8 +255,8 @@ def sweep(
 
 def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Digits:
     """The middle two seconds of a slide, uint8 [1500, 4, 4]. Raises ConfigError for an unknown material."""
-    n = FORMAT.window
-    return _touch(world.tube(material), placement, rng, world, np.arange(n), np.ones(n, bool))
+    slid = np.arange(FORMAT.window)
+    return _touch(world.tube(material), placement, rng, world, slid, slid >= 0)
 
 
 def idle(n: int, rng: Generator, world: World = WORLD) -> Digits:
@@ -287,8 +288,7 @@ def placements(name: SetName, seed: int) -> list[Placement]:
 def sweep_set(name: SetName, seed: int, per_material: int | None = None, world: World = WORLD) -> SweepSet:
     """A set of the paper: windows uint8 [N, 1500, 4, 4], labels int64 [N] into MATERIALS, positions int64 [N].
 
-    per_material: windows of each tube at each position; None stands for the paper's count.
-    Raises ConfigError for an unknown set.
+    per_material: windows of each tube at each position (default: the paper's). Raises ConfigError for an unknown set.
     """
     places = placements(name, seed)
     each = SETS[name][1] if per_material is None else per_material

@@ -1,0 +1,166 @@
+"""The room of the simulator's calibration: the paper's baselines on simulated sweeps, beside its printed accuracies.
+
+In: seeds of simulated worlds. Out: the twenty accuracies of Figs. 4 to 7, how far they lie from the printed ones, and
+what they would be without each of the simulator's effects. No network is looked at: what the CNNs reach is a result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.sim import skin
+
+from . import baselines, methods, pool, sets
+from .protocols import Protocol
+
+Array = NDArray[Any]
+METHODS = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
+ATTACHMENTS = 5
+"""T-HARD is one attachment in the paper. One is luck: a seed's accuracy is the mean over so many."""
+LAB, REAL, HARD = 0, 1, tuple(range(2, 2 + ATTACHMENTS))
+"""The sets that `draw` joins, by their number in the group "set"."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Accuracies that the paper prints: of METHODS in this order, on `sets` under `protocol`."""
+
+    number: int
+    name: str
+    sets: tuple[int, ...]
+    protocol: str
+    printed: tuple[float, ...]
+
+
+FIGURES = (
+    Figure(4, "T-LAB, random 10-fold", (LAB,), "random:10", (0.85, 0.82, 0.85, 0.90, 0.96)),
+    Figure(5, "T-REAL, leave one position out", (REAL,), "leave:position", (0.78, 0.77, 0.79, 0.75, 0.86)),
+    Figure(6, "T-REAL, random 9-fold", (REAL,), "random:9", (0.80, 0.80, 0.83, 0.85, 0.93)),
+    Figure(
+        7,
+        "T-REAL to T-HARD",
+        (REAL, *HARD),
+        f"split:set={REAL}->{','.join(map(str, HARD))}",
+        (0.57, 0.58, 0.55, 0.50, 0.70),
+    ),
+)
+PRINTED = np.array([figure.printed for figure in FIGURES])
+"""[figures, methods]"""
+
+
+def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = None) -> sets.SweepSet:
+    """T-LAB, T-REAL and ATTACHMENTS times T-HARD of one seed, joined in this order.
+
+    Equal seeds draw the same places, attachments and noise in every world, so that worlds can be compared.
+    per_material: sweeps of each tube at each position; None stands for the paper's count.
+    """
+    parts = []
+    hard: list[tuple[skin.SetName, int]] = [("T-HARD", ATTACHMENTS * seed + i) for i in range(ATTACHMENTS)]
+    for name, its_seed in [("T-LAB", seed), ("T-REAL", seed), *hard]:
+        samples, labels, position = skin.sweep_set(name, its_seed, per_material, world)
+        groups = {"position": position}
+        parts.append(sets.SweepSet(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, f"{name}:{its_seed}"))
+    return sets.join(parts)
+
+
+def accuracies(sweeps: sets.SweepSet, seed: int) -> Array:
+    """The share of right answers, float64 [figures, methods], on what `draw` drew. seed: of the random folds."""
+    known = {method.name: method for method in baselines.METHODS}
+    given = {kind: methods.given(kind, sweeps) for kind in ("L", "H")}
+    shares = np.zeros(PRINTED.shape)
+    for i, figure in enumerate(FIGURES):
+        inside = np.isin(sweeps.group("set"), figure.sets)
+        part = sweeps.take(inside)
+        folds = Protocol(figure.protocol).folds(part, seed)
+        for j, name in enumerate(METHODS):
+            right = _right(known[name], given[known[name].input][inside], part.labels, folds)
+            shares[i, j] = right / sum(len(test) for _, test in folds)
+    return shares
+
+
+def _right(method: methods.Method, seen: Array, labels: Array, folds: Sequence[tuple[Array, Array]]) -> int:
+    """How many answers of all folds are right. Labels need no temperature and no graph: the bare estimator is asked."""
+    make = method.train.args[0]  # type: ignore[attr-defined]
+    seen = seen.astype(np.float64)
+    return sum(
+        int((make().fit(seen[train], labels[train]).predict(seen[test]) == labels[test]).sum()) for train, test in folds
+    )
+
+
+def measure(
+    seeds: Sequence[int],
+    ablate: bool,
+    log: Callable[[str], None] = lambda line: None,
+    world: skin.World = skin.WORLD,
+    jobs: int = -1,
+    per_material: int | None = None,
+) -> dict[str, Any]:
+    """The twenty accuracies, means over `seeds`, ready for JSON; with `ablate` also those without each effect.
+
+    jobs: processes, -1 one for each core; results do not depend on it.
+    """
+    worlds = {"": world} | {e: replace(world, off=world.off | {e}) for e in (skin.EFFECTS if ablate else ())}
+    tasks = [(without, seed) for without in worlds for seed in seeds]
+    progress = pool.Progress(len(tasks), log)
+    done: dict[tuple[str, int], Array] = {}
+    for task, shares in pool.results(_accuracies, tasks, (worlds, per_material), jobs):
+        done[task] = shares
+        progress(f"seed {task[1]}" + (f" without {task[0]}" if task[0] else ""))
+    by_seed = {without: np.array([done[without, seed] for seed in seeds]) for without in worlds}
+    ours = by_seed[""].mean(axis=0)
+    return {
+        "seeds": list(seeds), "attachments": ATTACHMENTS, "methods": list(METHODS),
+        "figures": [figure.name for figure in FIGURES], "printed": PRINTED.tolist(), "ours": ours.tolist(),
+        "spread": by_seed[""].std(axis=0).tolist(), **_match(ours),
+        "without": {
+            effect: {"ours": without.mean(axis=0).tolist(), **_match(without.mean(axis=0)),
+                     "change": (without.mean(axis=0) - ours).tolist(),
+                     "error": _standard_error(without - by_seed[""]).tolist()}
+            for effect, without in by_seed.items() if effect
+        },
+    }  # fmt: skip
+
+
+def _accuracies(task: tuple[str, int], worlds: dict[str, skin.World], per_material: int | None) -> Array:
+    without, seed = task
+    return accuracies(draw(seed, worlds[without], per_material), seed)
+
+
+def _match(ours: Array) -> dict[str, Any]:
+    away = ours - PRINTED
+    return {"difference": away.tolist(), "largest": float(abs(away).max()), "mean": float(abs(away).mean())}
+
+
+def _standard_error(values: Array) -> Array:
+    """Of the mean over the first axis; nothing is known of it where there is one value only, and it is 0."""
+    error: Array = values.std(axis=0) / np.sqrt(max(len(values) - 1, 1))
+    return error
+
+
+def table(result: dict[str, Any]) -> str:
+    """What `measure` gave, for reading: each accuracy as printed, ours with its spread over seeds, and what is between.
+
+    Below, where effects were switched off: by how much each accuracy changed, in hundredths.
+    """
+    seeds, width = result["seeds"], 21
+    text = [f"{'':<30}" + "".join(f"{name:<{width}}" for name in result["methods"])]
+    cells = (result[key] for key in ("figures", "printed", "ours", "spread", "difference"))
+    for name, *rows in zip(*cells, strict=True):
+        row = "".join(f"{f'{p:.2f} {o:.3f}±{s:.3f} {d:+.2f}':<{width}}" for p, o, s, d in zip(*rows, strict=True))
+        text.append(f"{name:<30}{row}".rstrip())
+    text.append(f"{_spoken(result)}; {len(seeds)} seeds, {result['attachments']} attachments of T-HARD each")
+    if result["without"]:
+        text += ["", f"{'without':<12}" + "".join(f"{name.split(',')[0]:<24}" for name in result["figures"])]
+    for effect, told in result["without"].items():
+        changes = "".join(f"{' '.join(f'{100 * v:+4.0f}' for v in row):<24} " for row in told["change"])
+        text.append(f"{effect:<12}{changes} {_spoken(told)}")
+    return "\n".join(text)
+
+
+def _spoken(match: dict[str, Any]) -> str:
+    return f"largest difference {match['largest']:.3f}, mean {match['mean']:.3f}"

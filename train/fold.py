@@ -1,0 +1,136 @@
+"""The room of one fold. In: a method, sweeps to train on and sweeps to test on. Out: a Fold, with logits and times.
+
+A fold is kept under a name made of all that it depends on, the data, the code and the versions too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import time
+import zipfile
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance import features, related
+from appliance.classifier import session
+from appliance.errors import FormatError
+
+from . import methods
+from .sets import SweepSet
+
+Array = NDArray[Any]
+TIMED_SWEEPS = 24
+"""How many test sweeps go one by one through the box's own session, for their time and to compare their labels."""
+AROUND = ("__main__", "calibrate", "chart", "evaluate", "export", "files", "ink", "page", "paper", "pool", "printed",
+          "score", "sets", "story", "stress", "stresses", "trial")  # fmt: skip
+"""Rooms of this package that do not decide what a fold gives: their code may change and the fold still holds."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One fold. train, test: numbers of sweeps."""
+
+    method: str
+    effort: methods.Effort
+    seed: int
+    train: Array
+    test: Array
+
+
+@dataclass(frozen=True)
+class Fold:
+    """What one fold gave. logits: float32 [n, K] of its test sweeps; ms: of one sweep, features and graph, the median.
+
+    agreement: share of the timed sweeps to which the exported graph gives the same label. ran: what was trained, where
+    the method has more to tell than its name. cost: the training's cross entropy, [iterations, 2], where it has one.
+    refused: why the method cannot work with this set; all else is empty then.
+    """
+
+    test: Array
+    logits: Array
+    fit_s: float
+    ms: float
+    agreement: float
+    ran: str = ""
+    cost: Array = field(default_factory=lambda: np.empty((0, 2)))
+    refused: str = ""
+
+    def save(self, path: Path) -> None:
+        """Write the fold, whole or not at all."""
+        packed = io.BytesIO()
+        np.savez(packed, **{k: np.asarray(getattr(self, k)) for k in self.__dataclass_fields__})
+        whole(path, packed.getvalue())
+
+    @classmethod
+    def load(cls, path: Path) -> Fold | None:
+        """What `save` wrote; None where there is nothing that can be read."""
+        try:
+            with np.load(path, allow_pickle=False) as z:
+                held = {k: z[k] for k in cls.__dataclass_fields__}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        plain = {k: v.item() if v.ndim == 0 else v for k, v in held.items()}
+        return cls(**plain)
+
+
+def run(task: Task, sweeps: SweepSet, given: Array) -> Fold:
+    """Train on one side, answer on the other. `given`: what the method's input asks for of all `sweeps`."""
+    (method,) = methods.find([task.method], task.effort)
+    start = time.perf_counter()
+    try:
+        model = method.train(sweeps.take(task.train), given[task.train], task.seed)
+    except FormatError as e:
+        return Fold(task.test, np.empty((0, len(sweeps.materials)), np.float32), 0.0, 0.0, 0.0, refused=str(e))
+    fit_s = time.perf_counter() - start
+    logits = np.asarray(model.logits(given[task.test]), np.float32)
+    if not np.isfinite(logits).all():
+        raise FormatError(f"{task.method} gave a logit that is no number; please report it with the set")
+    some = task.test[np.linspace(0, len(task.test) - 1, min(TIMED_SWEEPS, len(task.test))).astype(int)]
+    ms, labels = _as_the_box(method, model, sweeps, some)
+    agreement = float(np.mean(labels == logits[np.searchsorted(task.test, some)].argmax(1)))
+    cost = np.asarray(getattr(model, "cost", []), float).reshape(-1, 2)
+    return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost)
+
+
+def _as_the_box(method: methods.Method, model: methods.Model, sweeps: SweepSet, some: Array) -> tuple[float, Array]:
+    """Median time in ms of one sweep through features and session, and the labels [n] that come out."""
+    graph = session(model.graph().SerializeToString())
+    name, times, labels = graph.get_inputs()[0].name, [], []
+    for digits in sweeps.samples[some]:
+        start = time.perf_counter()
+        x = digits if method.input == "raw" else features.compute(method.input, digits, sweeps.rate_hz)
+        labels.append(int(graph.run(None, {name: x[None]})[0][0].argmax()))
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(times)), np.array(labels)
+
+
+def key(task: Task, data: str) -> str:
+    """A name for all that the fold depends on; data: the set's digest."""
+    return fingerprint([data, task.method, asdict(task.effort), task.seed, task.train.tolist(), task.test.tolist()])
+
+
+def fingerprint(about: Any, *rooms: str) -> str:
+    """32 hex digits of `about` (for JSON), the code that trains, that of AROUND's `rooms`, and the libraries."""
+    code = hashlib.sha256()
+    here = sorted(Path(__file__).parent.glob("*.py"))
+    paths = [path for path in here if path.stem in rooms or path.stem not in AROUND]
+    for path in (*paths, features.__file__, related.__file__):
+        code.update(Path(path).read_bytes())
+    versions = [version(name) for name in ("numpy", "scikit-learn", "torch")]
+    return hashlib.sha256(json.dumps([about, versions]).encode() + code.digest()).hexdigest()[:32]
+
+
+def whole(path: Path, content: bytes) -> None:
+    """Write a file, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_suffix(f".{os.getpid()}.part")
+    aside.write_bytes(content)
+    aside.replace(path)

@@ -1,0 +1,98 @@
+"""The room of methods: every way to name a material, behind one interface. In: a name. Out: a Method that trains Models.
+
+A model answers for many sweeps at once on the desktop, and gives the ONNX graph with which the box answers the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from appliance import features
+from appliance.errors import FormatError
+
+from .sets import SweepSet
+
+Array = NDArray[Any]
+ROOMS = ("baselines", "related", "sthmp", "minirocket", "nets")
+"""Modules of this package that each hold METHODS, or methods(effort) where they train networks."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long networks are trained, for all of them in one place.
+
+    share: of each network's usual iterations. paper_steps: of the paper's CNN; None stands for the paper's 4,000 on a
+    GPU and fewer on a processor. bfloat16: compute the paper's CNN so, where the processor can.
+    """
+
+    share: float = 1.0
+    paper_steps: int | None = None
+    bfloat16: bool = False
+
+
+USUAL = Effort()
+
+
+class Model(Protocol):
+    """A trained method. K: number of the training set's materials, whether or not each occurred in training."""
+
+    def logits(self, given: Array) -> Array:
+        """What the method's `input` asks for, of n sweeps -> float32 [n, K]; their softmax are honest probabilities.
+
+        given: digits [n, T, R, C] where `input` is "raw", else features float32 [n, F].
+        """
+        ...
+
+    def graph(self) -> onnx.ModelProto:
+        """What the box runs: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits` float32 [1, K]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to name a material.
+
+    about: one line with its source. input: "raw" or a key of appliance.features.KINDS.
+    train: (training sweeps, what `input` asks for of them, seed) -> Model; the same arguments give the same model.
+    extra: the optional dependency that it needs, named as in train/pyproject.toml.
+    """
+
+    name: str
+    about: str
+    input: str
+    train: Callable[[SweepSet, Array, int], Model]
+    extra: str = ""
+
+
+def given(kind: str, sweeps: SweepSet) -> Array:
+    """What a method with the input `kind` is given of `sweeps`: their digits, or float32 [N, F] as the box computes."""
+    if kind == "raw":
+        return sweeps.samples
+    return np.stack([features.compute(kind, digits, sweeps.rate_hz) for digits in sweeps.samples])
+
+
+def every(effort: Effort = USUAL) -> dict[str, Method]:
+    """All methods by name."""
+    rooms = [import_module(f"{__package__}.{room}") for room in ROOMS]
+    return {method.name: method for room in rooms for method in _of(room, effort)}
+
+
+def find(names: Sequence[str], effort: Effort = USUAL) -> list[Method]:
+    """The methods of these names. Raises FormatError naming one that is unknown."""
+    known = every(effort)
+    for name in names:
+        if name not in known:
+            raise FormatError(f"method {name!r} is unknown; use some of {', '.join(known)}")
+    return [known[name] for name in names]
+
+
+def _of(room: ModuleType, effort: Effort) -> Iterable[Method]:
+    return room.methods(effort) if hasattr(room, "methods") else room.METHODS

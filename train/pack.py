@@ -1,0 +1,197 @@
+"""The room where a trained model becomes a bundle. In: a graph, its sweeps, a folder. Out: the folder, or a refusal.
+
+Nothing leaves that does not do on this machine, through the box's own classifier, what was trained.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import platform
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+
+from appliance import bundle
+from appliance.classifier import Classifier, session, softmax
+from appliance.clock import SystemClock
+from appliance.errors import BundleError
+from appliance.sweep import Frames, Status, Sweep
+
+from .fit import figure, hold_out
+from .methods import Method, given
+from .sets import SweepSet
+
+Array = NDArray[Any]
+MOST_REFUSED = 0.05
+"""Share of held-out sweeps that the box may refuse (stuck taxels, say); more means that its thresholds do not fit."""
+
+
+class ExportRefused(BundleError):
+    """A model that changed on its way to the box, or would not be one there."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What goes into a bundle. model: `sweep` or `features` -> `logits`. input: as in the manifest.
+
+    train, held: what it was trained on and what it was not, parted by `held_by`. about: how it was made, figures: how
+    it did, for the manifest.
+    """
+
+    model: onnx.ModelProto
+    input: str
+    train: SweepSet
+    held: SweepSet
+    held_by: str
+    about: dict[str, Any]
+    figures: dict[str, Any] = field(default_factory=dict)
+
+
+def pack(
+    content: Content, target: Path, name: str, version: str, commit: str, full_scale: float | None = None
+) -> bundle.Manifest:
+    """Check `content` and put it at `target`, whole or not at all; an older bundle there is replaced.
+
+    commit: of the code, for the manifest. full_scale: the sensor's highest digit where it is not its type's.
+    Raises ExportRefused where a check fails, and BundleError where a label or the target cannot be used.
+    """
+    train, held = content.train, content.held
+    golden = golden_sweeps(train, run(content.model, given(content.input, train)))
+    files = {bundle.MODEL: content.model.SerializeToString(), bundle.GOLDEN: golden}
+    manifest = bundle.Manifest(
+        name=name, version=version, format=train.format, input=content.input, labels=train.materials,
+        thresholds=thresholds(train, full_scale), files={k: bundle.file_entry(v) for k, v in files.items()},
+        made={"commit": commit, "set": train.source, "machine": platform.machine(), "cpus": os.cpu_count(),
+              "torch": torch.__version__, "onnxruntime": onnxruntime.__version__} | content.about,
+    )  # fmt: skip
+    with _aside(target) as folder:
+        for file, data in files.items():
+            (folder / file).write_bytes(data)
+        (folder / bundle.MANIFEST).write_bytes(manifest.json())
+        figures = judge(folder, held, run(content.model, given(content.input, held)), f"held-out {content.held_by}")
+        manifest = replace(manifest, figures=figures | content.figures)
+        (folder / bundle.MANIFEST).write_bytes(manifest.json())
+        bundle.load(folder)
+    return manifest
+
+
+def trained(method: Method, sweeps: SweepSet, seed: int) -> Content:
+    """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, which judge it."""
+    train, held, by = hold_out(sweeps, seed)
+    model = method.train(train, given(method.input, train), seed)
+    about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
+    return Content(model.graph(), method.input, train, held, by, about)
+
+
+def run(model: onnx.ModelProto, inputs: Array) -> Array:
+    """What `model` gives for each of `inputs` (digits or features), float32 [n, size], in the box's kind of session."""
+    of_the_box, name = session(model.SerializeToString()), model.graph.input[0].name
+    return np.concatenate([of_the_box.run(None, {name: one[None]})[0] for one in inputs])
+
+
+def golden_sweeps(sweeps: SweepSet, logits: Array) -> bytes:
+    """An .npz of one training sweep of the first and the last material, and their logits.
+
+    Of those that are recognised it is the one whose probability is the median: neither so sure that a small fault does
+    not show, nor so unsure that rounding turns it. Raises ExportRefused where none is recognised.
+    """
+    index = []
+    for label in (0, len(sweeps.materials) - 1):
+        known = np.flatnonzero((sweeps.labels == label) & (logits.argmax(1) == label))
+        if not len(known):
+            raise ExportRefused(f"no training sweep of {sweeps.materials[label]!r} is recognised; train longer")
+        order = np.argsort(softmax(logits[known])[:, label], kind="stable")
+        index.append(known[order[len(order) // 2]])
+    packed = io.BytesIO()
+    np.savez_compressed(packed, samples=sweeps.samples[index], logits=logits[index])
+    return packed.getvalue()
+
+
+def thresholds(sweeps: SweepSet, full_scale: float | None) -> bundle.Thresholds:
+    """What a window must reach: a tenth of the weakest contact in training, the strongest taxel's mean."""
+    weakest = float(sweeps.samples.mean(axis=1, dtype=np.float64).max(axis=(1, 2)).min())
+    kind = sweeps.samples.dtype
+    top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
+    # below the weakest also where a tared skin was pulled, and its digits are negative
+    contact = weakest - 0.9 * abs(weakest)
+    return bundle.Thresholds(contact=contact, full_scale=float(top if full_scale is None else full_scale))
+
+
+def score(classifier: Classifier, sweeps: SweepSet, *, fused: bool = False) -> Array:
+    """Labels that the box gives, int64 [N] into the bundle's, -1 where it refuses the sweep.
+
+    fused: each sweep gets what the box says after all of its recording.
+    """
+    form, labels = sweeps.format, classifier.bundle.manifest.labels
+    t_ns, seq = (np.arange(form.window) * form.period_ns).astype(np.int64), np.arange(form.window)
+    recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
+    given = np.full(len(sweeps), -1)
+    for i in np.argsort(recording, kind="stable"):
+        frames = Frames(t_ns, seq, sweeps.samples[i])
+        verdict = classifier(Sweep(int(i), 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1)))
+        if verdict.label:
+            given[recording == recording[i] if fused else i] = labels.index(verdict.label)
+    return given
+
+
+def figures(classifier: Classifier, sweeps: SweepSet, protocol: str) -> dict[str, Any]:
+    """Accuracy by sweep, and by recording where one holds several; what the box refuses counts as wrong."""
+    right = score(classifier, sweeps) == sweeps.labels
+    told = {protocol: figure(int(right.sum()), len(sweeps))}
+    first = np.unique(sweeps.group("recording"), return_index=True)[1]
+    if len(first) < len(sweeps):
+        right = (score(classifier, sweeps, fused=True) == sweeps.labels)[first]
+        told[f"{protocol}, by recording"] = figure(int(right.sum()), len(first))
+    return told
+
+
+def judge(folder: Path, held: SweepSet, logits: Array, protocol: str) -> dict[str, Any]:
+    """Figures of the bundle in `folder` on `held`, run as the box runs it; `logits` [N, K]: what export saw there.
+
+    Raises ExportRefused where the box gives another label than export, or refuses too many sweeps.
+    """
+    box = Classifier(bundle.load(folder), SystemClock())
+    box.self_test()
+    given = score(box, held)
+    refused = given < 0
+    if other := int(np.sum((given != logits.argmax(1)) & ~refused)):
+        raise ExportRefused(f"the box labels {other} of {len(held)} held-out sweeps otherwise than export did")
+    if refused.mean() > MOST_REFUSED:
+        raise ExportRefused(
+            f"the box would refuse {refused.sum()} of {len(held)} held-out sweeps (limit {MOST_REFUSED:.0%}); "
+            f"see their thresholds {box.bundle.manifest.thresholds}, and drop sweeps with stuck taxels from the set"
+        )
+    return figures(box, held, protocol)
+
+
+@contextlib.contextmanager
+def _aside(target: Path) -> Iterator[Path]:
+    """A new folder beside `target` that takes its place when the block ends well, and vanishes when it does not."""
+    if target.exists() and not (target / bundle.MANIFEST).is_file():
+        raise ExportRefused(f"{target} is no bundle and will not be replaced; name another folder with --out")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as workplace:
+            new, old = Path(workplace) / "new", Path(workplace) / "old"
+            new.mkdir()
+            yield new
+            if target.exists():
+                target.rename(old)
+            try:
+                new.rename(target)
+            except OSError:
+                if old.exists():
+                    old.rename(target)
+                raise
+    except OSError as e:
+        raise ExportRefused(f"the bundle cannot be written to {target}: {e}; name another folder with --out") from e

@@ -1,0 +1,67 @@
+"""The room of counting: right answers of how many, and how sure that is. In: right or wrong, logits. Out: figures."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.classifier import softmax
+from appliance.sim.bench import commit
+from appliance.sim.score import wilson
+
+Array = NDArray[Any]
+DRAWS = 2000
+"""Of the bootstrap."""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """`right` of `total`."""
+
+    right: int
+    total: int
+
+    @classmethod
+    def of(cls, right: Array) -> Tally:
+        """Of booleans [n]."""
+        return cls(int(right.sum()), len(right))
+
+    def json(self) -> dict[str, int]:
+        """As scripts read it."""
+        return {"right": self.right, "total": self.total}
+
+
+def interval(right: Array, clusters: Array | None = None) -> tuple[float, float]:
+    """The 95 % interval of the share of `right` [n] (booleans, or shares over seeds).
+
+    Without clusters it is Wilson's. Where sweeps succeed or fail together, as those of one position do (clusters [n]),
+    it is the bootstrap's over clusters (percentiles of 2,000 draws), or Wilson's where that is wider: a bootstrap of
+    few clusters, or where all is right, is too sure.
+    """
+    low, high = wilson(float(right.sum()), len(right))
+    if clusters is not None:
+        member = np.unique(clusters, return_inverse=True)[1]
+        good, size = np.bincount(member, right), np.bincount(member)
+        drawn = np.random.default_rng(0).integers(len(size), size=(DRAWS, len(size)))
+        shares = good[drawn].sum(1) / size[drawn].sum(1)
+        low, high = min(low, np.quantile(shares, 0.025)), max(high, np.quantile(shares, 0.975))
+    return round(float(max(low, 0.0)), 4), round(float(min(high, 1.0)), 4)
+
+
+def fused(logits: Array, together: Array) -> tuple[Array, Array]:
+    """One log score [G, K] for each value of `together` [n], the product of its probabilities, and the number [G] of
+    the first sweep of each."""
+    _, first, member = np.unique(together, return_index=True, return_inverse=True)
+    scores = np.zeros((len(first), logits.shape[1]))
+    np.add.at(scores, member, np.log(np.maximum(softmax(logits), 1e-12)))  # floored as on the box
+    return scores, first
+
+
+def provenance() -> dict[str, str]:
+    """What a result file says of its origin, beside its sets and seeds."""
+    return {"commit": commit(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
