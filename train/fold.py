@@ -11,7 +11,7 @@ import json
 import os
 import time
 import zipfile
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from .sets import SweepSet
 Array = NDArray[Any]
 TIMED_SWEEPS = 24
 """How many test sweeps go one by one through the box's own session, for their time and to compare their labels."""
-AROUND = ("__main__", "calibrate", "chart", "evaluate", "export", "files", "ink", "page", "paper", "pool", "printed",
+AROUND = ("__main__", "calibrate", "chart", "evaluate", "export", "files", "ink", "options", "page", "paper", "pool", "printed",
           "score", "sets", "story", "stress", "stresses", "trial")  # fmt: skip
 """Rooms of this package that do not decide what a fold gives: their code may change and the fold still holds."""
 
@@ -114,7 +114,8 @@ def _as_the_box(method: methods.Method, model: methods.Model, sweeps: SweepSet, 
 
 def key(task: Task, data: str) -> str:
     """A name for all that the fold depends on; data: the set's digest."""
-    return fingerprint([data, task.method, asdict(task.effort), task.seed, task.train.tolist(), task.test.tolist()])
+    (method,) = methods.find([task.method], task.effort)
+    return fingerprint([data, method.name, method.effort, task.seed, task.train.tolist(), task.test.tolist()])
 
 
 def fingerprint(about: Any, *rooms: str) -> str:

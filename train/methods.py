@@ -62,7 +62,7 @@ class Method:
 
     about: one line with its source. input: "raw" or a key of appliance.features.KINDS.
     train: (training sweeps, what `input` asks for of them, seed) -> Model; the same arguments give the same model.
-    extra: the optional dependency that it needs, named as in train/pyproject.toml.
+    extra: the optional dependency that it needs, named as in train/pyproject.toml. effort: what an Effort changes in it.
     """
 
     name: str
@@ -70,6 +70,7 @@ class Method:
     input: str
     train: Callable[[SweepSet, Array, int], Model]
     extra: str = ""
+    effort: str = ""
 
 
 def given(kind: str, sweeps: SweepSet) -> Array:

@@ -187,8 +187,8 @@ def methods(effort: Effort = USUAL, log: Log = silent) -> tuple[Method, ...]:
     def network(name: str, about: str, build: Build, recipe: Recipe, calibrated: bool = True) -> Method:
         return Method(name, about, "raw", partial(
             train_network, build=build, recipe=recipe, calibrated=calibrated, log=log,
-            bfloat16=effort.bfloat16 and build is paper_cnn,
-        ))  # fmt: skip
+            bfloat16=(half := effort.bfloat16 and build is paper_cnn),
+        ), effort=f"{recipe.steps} iterations{', bfloat16' * half}")  # fmt: skip
 
     def shared(recipe: Recipe) -> Recipe:
         return replace(recipe, steps=max(round(recipe.steps * effort.share), LEAST_STEPS))
@@ -199,7 +199,8 @@ def methods(effort: Effort = USUAL, log: Log = silent) -> tuple[Method, ...]:
         network("paper-cnn", f"the paper's CNN on raw digits (section IV), {paper.steps} iterations", paper_cnn, paper, False),
         network("tactnet2", "TactNet-II as far as it is known (Tulbure and Baeuml 2018)", tactnet2, shared(TACTNET2_RECIPE)),
         network("recurrent", "gated recurrent unit over patches, the paper's future work", recurrent, shared(RECURRENT_RECIPE)),
-        Method("compact", "the box's own small network with a closed-form head", "raw", compact),
+        Method("compact", "the box's own small network with a closed-form head", "raw", compact,
+               effort=f"{compact.keywords['steps']} iterations"),
     )  # fmt: skip
 
 

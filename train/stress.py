@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,10 +86,9 @@ def run(
 
     Raises FormatError as `one`, and for an unknown method.
     """
-    methods.find(names, effort)
-    about = [digest(train), digest(trial.sweeps), trial.scene is not None, asdict(effort)]
-    tasks = {(name, seed): fingerprint([*about, name, seed], "stress", "stresses", "trial")
-             for name in names for seed in seeds}  # fmt: skip
+    about = [digest(train), digest(trial.sweeps), trial.scene is not None]
+    tasks = {(method.name, seed): fingerprint([*about, method.name, method.effort, seed], "stress", "stresses", "trial")
+             for method in methods.find(names, effort) for seed in seeds}  # fmt: skip
     paths = {task: where.cache / f"{key}.json" for task, key in tasks.items() if where.cache}
     done = {task: json.loads(path.read_text()) for task, path in paths.items() if path.exists()}
     left, progress = [task for task in tasks if task not in done], pool.Progress(len(tasks) - len(done), log)

@@ -69,7 +69,7 @@ class World:
     off: frozenset[str] = frozenset()
     tubes: tuple[Material, ...] = TUBES
     force_n: float = 1.0
-    force_spread: float = 0.07  # share of the force
+    force_spread: float = 0.10  # share of the force; half of the precision that the paper states
     pad_kpa_per_mm: float = 4.0
     pad_half_mm: float = 8.5  # along the tube; beyond it the pad bends away
     digits_per_kpa: float = 15.0
@@ -81,7 +81,7 @@ class World:
     damping_octaves_per_mm: float = -0.60  # and sooner, the further towards the finger's tip the skin sits;
     relief_per_mm: float = 0.12  # there it follows the relief more, as the logarithm of the height
     spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
-    spot_octaves: float = 0.13  # spread of pitch and rate likewise
+    spot_octaves: float = 0.125  # spread of pitch and rate likewise
 
     def __post_init__(self) -> None:
         if unknown := self.off - set(EFFECTS):
