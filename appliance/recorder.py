@@ -157,7 +157,7 @@ class Recorder:
         have = np.flatnonzero((self._seq[slots] == seq) & (seq >= 0))
         missing = np.setdiff1d(np.arange(pad, pad + fmt.window), have, assume_unique=True)
         frames = Frames(self._t_ns[slots], seq, self._taxels[slots])
-        status = Status.OK if _interpolate(frames, have, missing) else Status.GAP
+        status = Status.OK if interpolate(frames, have, missing) else Status.GAP
         cut = slice(pad, pad + fmt.window) if status is Status.OK else slice(0)
         frames = Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut])
         return Sweep(sweep.id, sweep.start_ns, stop_ns, status, frames, len(missing), now_ns, sweep.object)
@@ -168,7 +168,7 @@ class Recorder:
         return int(self._seq[k]) + round((t_ns - int(self._t_ns[k])) / self._format.period_ns)
 
 
-def _interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
+def interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
     """Fill `missing` rows of `frames` in place from their neighbours in `have`; False where a gap is too wide."""
     right = np.searchsorted(have, missing)
     if len(missing) and (right.min() == 0 or right.max() == len(have)):

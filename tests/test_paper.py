@@ -61,10 +61,10 @@ def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: 
     return Outcome(part, method, world, labels, SURE * np.eye(6, dtype=np.float32)[given], place, costs, told)
 
 
-def summary(quick: bool = False, cnn: bool = True) -> dict[str, Any]:
+def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
     """What `run` would tell of made-up outcomes, as it reads back from results.json."""
     outcomes = [outcome(p, m, w) for p in paper.FULL for m in (*paper.BASELINES, "compact") for w in (1, 2)]
-    outcomes += [outcome(p, "paper-cnn", right=0.9) for p in ("lopo", "hard") if cnn]
+    outcomes += [outcome(p, cnn, right=0.9) for p in ("lopo", "hard") if cnn]
     about = {"quick": quick, "commit": "c0ffee<", "took_s": 3}
     return json.loads(paper._lines(paper.summary(outcomes, paper.FULL) | about))
 
@@ -150,7 +150,7 @@ def test_summary_pools_worlds_and_keeps_each_result(told):
     assert row["share"][0] == round(row["right"] / 144, 4)
     assert len(told["results"]) == 4 * 6 * 2 + 2
     assert np.sum(told["confusion"]["H-svm"], 1).tolist() == [24] * 6
-    assert told["costs"] == [[[1, 1.7], [7, 0.5]]] * 2
+    assert told["costs"] == {"paper-cnn": [[[1, 1.7], [7, 0.5]]] * 2}
 
 
 def test_the_page_is_one_file_that_a_phone_can_read(made):
@@ -204,9 +204,16 @@ def test_hard_protocols_come_first(made):
 
 def test_a_plan_without_the_network_still_makes_a_page():
     """Figures 9 to 11 need the paper's CNN; all others are there."""
-    html, pictures = story.tell(summary(cnn=False))
+    html, pictures = story.tell(summary(cnn=""))
     assert set(FIGURES) - set(pictures) == {"figure-9", "figure-10", "figure-11", "figure-12"}
     assert not Reader(html).wrong
+
+
+def test_the_network_without_means_is_called_so():
+    """Where only sweeps without means were given to it, the page shows that and says so."""
+    html, pictures = story.tell(summary(cnn=printed.CNNS[1]))
+    assert set(pictures) == set(FIGURES)
+    assert "Fig. 11: paper-cnn, means out" in html
 
 
 def test_text_of_others_is_escaped():
@@ -220,10 +227,13 @@ def test_plans_name_methods_and_parts_that_exist():
     """Full and quick: every step's methods are known, its parts planned, and both hold every kind of figure."""
     known = set(paper.methods.every())
     for parts, steps in ((paper.FULL, paper.FULL_STEPS), (paper.QUICK, paper.QUICK_STEPS)):
-        ran = {(part, m) for step in steps for part in step.parts for m in step.methods}
-        assert {m for _, m in ran} == known
+        ran = {(part, m + step.means_removed * printed.MEANS_OUT) for step in steps for part in step.parts
+               for m in step.methods}  # fmt: skip
+        assert {m.removesuffix(printed.MEANS_OUT) for _, m in ran} == known
         assert {part for part, _ in ran} == set(parts) == set(story.TITLES)
-        assert {(p, m) for p in printed.ACCURACY for m in printed.ACCURACY[p]} <= ran
+        cnn = {(p, m) for p in printed.ACCURACY for m in printed.CNNS}
+        assert {(p, m) for p in printed.ACCURACY for m in printed.ACCURACY[p]} - cnn <= ran
+        assert {("lopo", printed.CNNS[1]), ("hard", printed.CNNS[0]), ("hard", printed.CNNS[1])} <= ran
 
 
 def test_run_writes_everything_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

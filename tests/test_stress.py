@@ -123,8 +123,8 @@ def test_stresses_by_name():
     assert [s.name for s in stresses.find(["hum", "dead"])] == ["hum", "dead"]
     with pytest.raises(FormatError, match="stress 'cold' is unknown; use some of shift-rows, "):
         stresses.find(["cold"])
-    physical = {"shift-rows", "turn", "force-down", "force-up", "window"}
-    instead = {"shift-grid", "turn-grid", "window-held"}
+    physical = {"shift-rows", "turn", "force-down", "force-up", "speed-down", "speed-up", "window"}
+    instead = {"shift-grid", "turn-grid", "window-held", "stretch", "shorten"}
     assert {s.name for s in stresses.usual(scene())} == set(BY_NAME) - instead
     assert {s.name for s in stresses.usual(Trial(small()))} == set(BY_NAME) - physical
 
@@ -168,6 +168,22 @@ def test_force_is_the_worlds():
     assert levels[0] < 0.7 * sound < 1.2 * sound < levels[1]
 
 
+def test_speed_is_the_fingers():
+    """Half as fast, the relief passes at half its frequencies; what friction shakes keeps its own."""
+    still = replace(skin.WORLD, off=frozenset({"vibration", "drift", "noise", "spot"}))
+    shaken = replace(skin.WORLD, off=frozenset({"texture", "drift", "noise", "spot"}))
+
+    def centre_hz(world: skin.World) -> float:
+        power = np.abs(np.fft.rfft(scene().scene.draw(world=world)[:, :, 1, 1].astype(float) - 60, axis=1)) ** 2
+        return float(np.exp(np.average(np.log(np.arange(4, 500)), weights=power[:, 4:500].sum(0))) / 2)
+
+    usual, slow, fast = (centre_hz(replace(still, speed=v)) for v in (1.0, 0.5, 1.5))
+    assert slow < 0.7 * usual < usual < 0.8 * fast
+    assert centre_hz(replace(shaken, speed=0.5)) == centre_hz(shaken)
+    drawn = scene().scene.draw(world=replace(skin.WORLD, speed=0.5))
+    assert (BY_NAME["speed-down"].apply(scene(), 0.5, 0) == drawn).all()
+
+
 def test_dead_stuck_and_noisy_taxels():
     """As many taxels as said, the others as they were; those dead at 1 are dead at 3 too."""
     trial = Trial(small())
@@ -196,10 +212,8 @@ def test_lost_frames_lie_on_the_line():
         assert np.allclose(got[i, :, 0, 1], want, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("name", "share", "hz"), [("speed-down", 0.5, 5), ("speed-up", 0.5, 15), ("speed-up", 0.2, 12)]
-)
-def test_speed_moves_frequencies(name: str, share: float, hz: float):
+@pytest.mark.parametrize(("name", "share", "hz"), [("stretch", 0.5, 5), ("shorten", 0.5, 15), ("shorten", 0.2, 12)])
+def test_stretching_moves_frequencies(name: str, share: float, hz: float):
     """A tone of 10 Hz becomes one of 5, 15 or 12 Hz, as strong as before."""
     tone = np.sin(2 * np.pi * 10 * np.arange(400) / 100).astype(np.float32).reshape(1, 400, 1, 1)
     sweeps = SweepSet(np.repeat(tone, 2, axis=0), np.arange(2), ("a", "b"), 100.0)

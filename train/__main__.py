@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,10 @@ from . import calibrate, chart, evaluate, export, fit, methods, options, pack, p
 from .fold import whole
 
 Add = Callable[[str, Callable[[argparse.Namespace], None], str], argparse.ArgumentParser]
+
+
+LOG_EVERY_S = 30
+_told_at = [time.monotonic()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -287,9 +292,12 @@ def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:
 
 
 def _progress(line: str) -> None:
-    """One line that is written over, for eyes only."""
+    """One line that is written over, for eyes; for a log one line in so many seconds."""
     if sys.stderr.isatty():
         print(f"\r{line}\033[K", end="", file=sys.stderr, flush=True)
+    elif time.monotonic() - _told_at[0] > LOG_EVERY_S:
+        _told_at[0] = time.monotonic()
+        print(line, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -152,9 +152,9 @@ def table(result: dict[str, Any]) -> str:
         text.append((name.ljust(32) + "".join(cell.ljust(20) for cell in cells)).rstrip())
     text.append(f"{_spoken(result)}; {len(result['seeds'])} seeds, {result['attachments']} attachments of T-HARD each")
     if result["without"]:
-        text += ["", ("without".ljust(12) + "".join(name.ljust(26) for name in result["figures"])).rstrip()]
+        text += ["", ("without".ljust(12) + "".join(name.ljust(28) for name in result["figures"])).rstrip()]
     for effect, told in result["without"].items():
-        changes = "".join("".join(f"{100 * v:+4.0f}" for v in row).ljust(26) for row in told["change"])
+        changes = "".join("".join(f"{100 * v:+4.0f}" for v in row).ljust(28) for row in told["change"])
         text.append(f"{effect:<12}{changes}{_spoken(told)}")
     return "\n".join(text)
 

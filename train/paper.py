@@ -60,12 +60,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Step:
-    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, for the time left only."""
+    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, for the time left only.
+
+    means_removed: of sweeps without each taxel's mean; then their names say so.
+    """
 
     methods: tuple[str, ...]
     parts: tuple[str, ...]
     worlds: tuple[int, ...]
     fold_s: float
+    means_removed: bool = False
 
 
 ALL = ("lopo", "hard", "lab", "random")
@@ -82,6 +86,7 @@ FULL_STEPS = (
     Step(("st-hmp",), ALL, (1,), 15),
     Step(("compact",), ALL, (1,), 15),
     Step(NETWORKS, ALL, (1,), 30),
+    Step(("paper-cnn",), ("hard", "lopo"), (1,), 200, means_removed=True),
     Step(("paper-cnn",), ("hard", "lopo"), (1,), 200),
 )
 QUICK = {
@@ -93,7 +98,8 @@ QUICK = {
 QUICK_STEPS = (
     Step(BASELINES, ALL, (1, 2), 0.3),
     Step((*NEIGHBOURS, "minirocket", "st-hmp", "compact", *NETWORKS), ("lopo", "hard"), (1,), 1),
-    Step(("paper-cnn",), ("hard", "lopo"), (1,), 15),
+    Step(("paper-cnn",), ("hard", "lopo"), (1,), 15, means_removed=True),
+    Step(("paper-cnn",), ("hard",), (1,), 15),
 )
 QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
 
@@ -120,8 +126,9 @@ class Outcome:
         test, sweeps = result.test, result.sweeps
         place = sweeps.group("position")[test] + 10_000 * world
         costs = [_thinned(fold.cost) for fold in result.folds if len(fold.cost)]
+        method = result.method + result.means_removed * printed.MEANS_OUT
         about = result.json() | {"part": part, "world": world}
-        return cls(part, result.method, world, sweeps.labels[test], result.logits, place, costs, about)
+        return cls(part, method, world, sweeps.labels[test], result.logits, place, costs, about)
 
     @property
     def right(self) -> Array:
@@ -169,7 +176,7 @@ def _outcomes(
             where_now = f"{i + 1}/{len(todo)} {part}, world {world}"  # noqa: B023
             log(f"{where_now}: {line}; in all about {spoken(pace * left)} left")  # noqa: B023
 
-        plan = Plan(step.methods, (parts[part].protocol,), (world,), effort=effort)
+        plan = Plan(step.methods, (parts[part].protocol,), (world,), step.means_removed, effort)
         for result in evaluate(parts[part].load(world), plan, where, count):
             yield Outcome.of(part, world, result)
         took = time.monotonic() - start
@@ -186,7 +193,7 @@ def summary(outcomes: Sequence[Outcome], parts: dict[str, Part], effort: Effort 
     return {
         "parts": {k: {"sets": part.sets, "only": part.only, "protocol": part.protocol} for k, part in parts.items()},
         "table": [_row(*key, those) for key, those in held.items()],
-        "costs": [cost.tolist() for o in lopo.get("paper-cnn", []) for cost in o.costs],
+        "costs": {m: [cost.tolist() for o in lopo[m] for cost in o.costs] for m in printed.CNNS if m in lopo},
         "confusion": {m: np.sum([o.told["confusion"] for o in those], 0).tolist() for m, those in lopo.items()},
         "several": {m: several(those) for m, those in lopo.items()},
         "explored": {m: explored(those) for m, those in lopo.items()},

@@ -150,6 +150,10 @@ def _gain(sign: int, x: Array, share: float, rng: Generator, trial: Trial) -> Ar
 
 
 def _speed(sign: int, x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+    return trial.scene.draw(world=replace(skin.WORLD, speed=1 + sign * share))
+
+
+def _stretch(sign: int, x: Array, share: float, rng: Generator, trial: Trial) -> Array:
     """All that happens is stretched in time about the window's middle; beyond its ends a sweep runs back."""
     frames = x.shape[1]
     spectrum = np.fft.rfft(np.concatenate([x[:, ::-1], x, x[:, ::-1]], axis=1), axis=1)
@@ -177,7 +181,7 @@ def _lost(x: Array, share: float, rng: Generator, trial: Trial) -> Array:
     number = np.arange(x.shape[1])
     for taxels, gone in zip(x, lost, strict=True):
         frames = Frames(number.copy(), number, taxels)
-        recorder._interpolate(frames, np.flatnonzero(~gone), np.flatnonzero(gone))
+        recorder.interpolate(frames, np.flatnonzero(~gone), np.flatnonzero(gone))
     return x
 
 
@@ -202,6 +206,8 @@ STRESSES = (
     Stress("turn", "degrees", TURNS, "skin turned on the finger, drawn anew", _turn, "simulated"),
     Stress("force-down", "share", HALVES, "pressed less, drawn anew", partial(_force, -1), "simulated"),
     Stress("force-up", "share", HALVES, "pressed more, drawn anew", partial(_force, 1), "simulated"),
+    Stress("speed-down", "share", HALVES, "slid slower, drawn anew", partial(_speed, -1), "simulated"),
+    Stress("speed-up", "share", HALVES, "slid faster, drawn anew", partial(_speed, 1), "simulated"),
     Stress("window", "ms", ERRORS_MS, "window too early or late, into the rest, drawn anew", _window, "simulated"),
     Stress("shift-grid", "rows", SHIFTS, "taxels read further on, edge mirrored, new gains", _shift_grid, "files"),
     Stress("turn-grid", "degrees", TURNS, "taxels read on a turned grid, edge mirrored, new gains", _turn_grid, "files"),
@@ -212,8 +218,8 @@ STRESSES = (
     Stress("gain-spread", "share", HALVES, "each taxel's gain off by up to this share", _gain_spread),
     Stress("gain-down", "share", HALVES, "all gains lower", partial(_gain, -1)),
     Stress("gain-up", "share", HALVES, "all gains higher", partial(_gain, 1)),
-    Stress("speed-down", "share", HALVES, "slower: all is stretched in time", partial(_speed, -1)),
-    Stress("speed-up", "share", HALVES, "faster: all is shortened in time", partial(_speed, 1)),
+    Stress("stretch", "share", HALVES, "slower: all is stretched in time", partial(_stretch, -1), "files"),
+    Stress("shorten", "share", HALVES, "faster: all is shortened in time", partial(_stretch, 1), "files"),
     Stress("drift", "of full load", (0, 0.02, 0.05, 0.1, 0.2), "offset of each taxel, from one to another", _drift),
     Stress("bits", "fewer than 8", (0, 1, 2, 3, 4), "steps of the set's range: 7, 6, 5, 4 bits", _bits),
     Stress("lost", "share", (0, 0.02, 0.05, 0.1, 0.2), "frames lost, at most two in a row, filled as the box does", _lost),

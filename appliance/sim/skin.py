@@ -68,6 +68,7 @@ class World:
 
     off: frozenset[str] = frozenset()
     tubes: tuple[Material, ...] = TUBES
+    speed: float = 1.0  # of sliding, of 3 cm/s; what friction shakes keeps its rate
     force_n: float = 1.0
     force_spread: float = 0.10  # share of the force; half of the precision that the paper states
     pad_kpa_per_mm: float = 4.0
@@ -228,7 +229,7 @@ def _touch(tube: Material, placement: Placement, rng: Generator, world: World, s
     tube = spot(tube, of_spot, world)
     kpa_per_mm = 1 / (1 / world.pad_kpa_per_mm + tube.softness_mm_per_kpa)
     depth = indentation(drift(len(slid), of_drift, world), kpa_per_mm, world)[:, None, None]
-    height = bedding + texture(tube, x, slid, of_texture, world)
+    height = bedding + texture(tube, x, np.rint(world.speed * slid).astype(np.int64), of_texture, world)
     pressure_kpa = kpa_per_mm * np.maximum(depth - gap(x, y, world) + height, 0)
     pressure_kpa *= 1 + vibration(tube, x, colour, moving, of_vibration, world)
     return digitize(world.digits_per_kpa * gain * pressure_kpa + noise(len(slid), of_noise, world))
@@ -255,8 +256,7 @@ def sweep(
 
 def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Digits:
     """The middle two seconds of a slide, uint8 [1500, 4, 4]. Raises ConfigError for an unknown material."""
-    slid = np.arange(FORMAT.window)
-    return _touch(world.tube(material), placement, rng, world, slid, slid >= 0)
+    return _touch(world.tube(material), placement, rng, world, np.arange(FORMAT.window), np.ones(FORMAT.window, bool))
 
 
 def idle(n: int, rng: Generator, world: World = WORLD) -> Digits:
