@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,6 @@ from . import calibrate, chart, evaluate, export, fit, methods, options, pack, p
 from .fold import whole
 
 Add = Callable[[str, Callable[[argparse.Namespace], None], str], argparse.ArgumentParser]
-
-
-LOG_EVERY_S = 30
-_told_at = [time.monotonic()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -162,7 +157,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
     done: list[dict[str, Any]] = []
     refused: dict[str, str] = {}
     print(evaluate.HEADER)
-    for result in evaluate.evaluate(sweeps, plan, options.where(args), _progress):
+    for result in evaluate.evaluate(sweeps, plan, options.where(args), options.Log()):
         if result.refused:
             refused[result.method] = result.refused
             continue
@@ -177,7 +172,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
 
 def run_paper(args: argparse.Namespace) -> None:
     """All of it; the page is named at the end."""
-    print(paper.run(args.out, args.quick, options.where(args), _progress, options.effort(args)))
+    print(paper.run(args.out, args.quick, options.where(args), options.Log(), options.effort(args)))
 
 
 def run_stress(args: argparse.Namespace) -> None:
@@ -192,7 +187,7 @@ def run_stress(args: argparse.Namespace) -> None:
         options.where(args),
         seeds=options.seeds(args),
         effort=options.effort(args),
-        log=_progress,
+        log=options.Log(),
     )
     told |= {"train": train.source, "digest": sets.digest(train), "format": str(train.format)} | score.provenance()
     table = stress.table(told)
@@ -208,7 +203,7 @@ def run_calibrate(args: argparse.Namespace) -> None:
     if not first.isdigit() or not (last or first).isdigit() or int(last or first) < int(first):
         raise FormatError(f"--seeds {args.seeds} cannot be read; write FIRST-LAST, e.g. 201-208")
     seeds = range(int(first), int(last or first) + 1)
-    told = calibrate.measure(seeds, args.ablate, _progress, jobs=args.jobs) | score.provenance()
+    told = calibrate.measure(seeds, args.ablate, options.Log(), jobs=args.jobs) | score.provenance()
     if args.json:
         whole(args.json, (json.dumps(told, indent=1) + "\n").encode())
     print(calibrate.table(told))
@@ -239,7 +234,7 @@ def run_fit(args: argparse.Namespace) -> None:
             rest.save(args.rest)
             print(f"rest: {len(rest)} sweeps in {args.rest}")
     recipe = fit.Recipe(steps=args.steps, row_shift=args.row_shift, stretch=args.stretch, keep_means=args.keep_means)
-    made = fit.fit(sweeps, args.seed, recipe, _progress)
+    made = fit.fit(sweeps, args.seed, recipe, options.Log())
     made.save(args.out)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; held-out {made.about['held_out_by']}: "
           f"{_spoken(made.about['validation'])}; {args.out}")  # fmt: skip
@@ -289,15 +284,6 @@ def _spoken(figure: dict[str, float]) -> str:
 def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:
     """Write a JSON list, one line each, whole or not at all."""
     whole(path, ("[\n" + ",\n".join(json.dumps(result) for result in results) + "\n]\n").encode())
-
-
-def _progress(line: str) -> None:
-    """One line that is written over, for eyes; for a log one line in so many seconds."""
-    if sys.stderr.isatty():
-        print(f"\r{line}\033[K", end="", file=sys.stderr, flush=True)
-    elif time.monotonic() - _told_at[0] > LOG_EVERY_S:
-        _told_at[0] = time.monotonic()
-        print(line, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

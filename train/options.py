@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+import time
 from pathlib import Path
 
 from appliance.errors import FormatError
@@ -10,6 +12,7 @@ from appliance.errors import FormatError
 from . import evaluate, methods, sets
 
 SET = "FILE (.npz, .h5), a folder of recordings or sim:NAME[:SEED[-LAST][:SWEEPS]]; several are joined"
+LOG_EVERY_S = 30
 
 
 def add_set(command: argparse.ArgumentParser) -> None:
@@ -62,3 +65,18 @@ def effort(args: argparse.Namespace) -> methods.Effort:
 def where(args: argparse.Namespace) -> evaluate.Where:
     """Where the work is done and kept."""
     return evaluate.Where(args.jobs, args.scheduler, args.cache)
+
+
+class Log:
+    """Tells how far it is: one line that is written over for eyes, one line in LOG_EVERY_S for a file."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+
+    def __call__(self, line: str) -> None:
+        """Tell `line`."""
+        if sys.stderr.isatty():
+            print(f"\r{line}\033[K", end="", file=sys.stderr, flush=True)
+        elif time.monotonic() - self._last > LOG_EVERY_S:
+            self._last = time.monotonic()
+            print(line, file=sys.stderr, flush=True)
