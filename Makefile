@@ -37,7 +37,7 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 1
 
 paper: $(DESKTOP) ## the paper's experiment, run again: docs/paper/ (goes on where it was interrupted)
-	$(BIN)/palpate-train paper --out docs/paper
+	$(BIN)/palpate-train paper $(PAPER)
 
 wheel: $(DESKTOP) ## build the wheel of the box into dist/
 	rm -rf build/lib build/bdist.* # setuptools would put what an older build left behind into the wheel

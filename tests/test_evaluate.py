@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -112,11 +113,13 @@ def test_what_was_interrupted_goes_on_where_it_was(tmp_path: Path, monkeypatch: 
     with pytest.raises(KeyboardInterrupt):
         every(tones(), where, "L-gauss")
     assert len(list(tmp_path.glob("*.npz"))) == 2
+    assert not every(tones(), replace(where, kept=True), "L-gauss")  # and nothing is trained, nothing half told
     (result,) = every(tones(), where, "L-gauss")
     assert len(calls) == 4
     (again,) = every(tones(), where, "L-gauss")
     assert len(calls) == 4
     assert np.array_equal(result.logits, again.logits)
+    assert np.array_equal(result.logits, every(tones(), replace(where, kept=True), "L-gauss")[0].logits)
     assert again.json()["window"] == every(tones(), HERE, "L-gauss")[0].json()["window"]
 
 

@@ -18,9 +18,11 @@ import numpy as np
 import pytest
 import threadpoolctl
 from distributed import Client
+from test_evaluate import tones
 
 from appliance.errors import FormatError
-from train import pool
+from train import evaluate, methods, pool
+from train.evaluate import Plan, Where
 
 
 def add(task: int, data: np.ndarray) -> float:
@@ -96,6 +98,18 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
         for process in processes:
             process.kill()
             process.wait()
+
+
+def test_a_cluster_gives_the_same_bits(cluster):
+    """An evaluation there and here: equal logits, of features with an SVM and of a network."""
+    plan = Plan(("L-svm", "recurrent"), ("leave:session",), effort=methods.Effort(0.02))
+    there, here = (
+        {result.method: result for result in evaluate.evaluate(tones(), plan, where)}
+        for where in (Where(scheduler=cluster[0], cache=None), Where(jobs=1, cache=None))
+    )
+    for name in plan.methods:
+        assert np.array_equal(there[name].logits, here[name].logits), name
+        assert there[name].json()["window"] == here[name].json()["window"]
 
 
 def noted(task: int, folder: str, data: np.ndarray) -> float:

@@ -80,6 +80,7 @@ def _add_shows(add: Add) -> None:
     one.add_argument(
         "--quick", action="store_true", help="small sets, hardly trained: everything is tried, nothing told"
     )
+    one.add_argument("--kept", action="store_true", help="train nothing, tell what an earlier run has finished")
     two = add("stress", run_stress, "put trained methods under what goes wrong, one thing at a time")
     options.add_set(two)
     two.add_argument("--test", required=True, metavar="SET", help="what is stressed; simulated, it is drawn anew")

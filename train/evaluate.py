@@ -107,11 +107,12 @@ class Plan:
 
 @dataclass(frozen=True)
 class Where:
-    """Where folds run and are kept: see pool.results. cache None: nowhere."""
+    """Where folds run and are kept: see pool.results. cache None: nowhere. kept: none is run, those kept must do."""
 
     jobs: int = -1
     scheduler: str = ""
     cache: Path | None = CACHE
+    kept: bool = False
 
 
 def evaluate(
@@ -143,7 +144,7 @@ def _folds(tasks: dict[Any, Task], shared: tuple[SweepSet, Array], where: Where)
     paths = {name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache}
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()
-    left = [named for named in tasks.items() if named[0] not in kept]
+    left = [named for named in tasks.items() if named[0] not in kept and not where.kept]
     for (name, _), fold in pool.results(_run, left, shared, where.jobs, where.scheduler):
         if where.cache:
             fold.save(paths[name])

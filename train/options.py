@@ -64,7 +64,7 @@ def effort(args: argparse.Namespace) -> methods.Effort:
 
 def where(args: argparse.Namespace) -> evaluate.Where:
     """Where the work is done and kept."""
-    return evaluate.Where(args.jobs, args.scheduler, args.cache)
+    return evaluate.Where(args.jobs, args.scheduler, args.cache, getattr(args, "kept", False))
 
 
 class Log:
