@@ -130,7 +130,7 @@ def evaluate(
             for name in same for split, folds in splits.items() for i, fold in enumerate(folds)
         }  # fmt: skip
         done: dict[Any, Fold] = {}
-        for (name, protocol, seed, i), fold in _folds(tasks, (sweeps, methods.given(kind, sweeps)), where):
+        for (name, protocol, seed, i), fold in _folds(tasks, sweeps, kind, where):
             done[name, protocol, seed, i] = fold
             progress(f"{name}, {protocol}, seed {seed}, fold {i + 1}")
             whole = [done.get((name, protocol, seed, k)) for k in range(len(splits[protocol, seed]))]
@@ -138,13 +138,14 @@ def evaluate(
                 yield Result(name, protocol, plan.means_removed, seed, sweeps, whole)  # type: ignore[arg-type]
 
 
-def _folds(tasks: dict[Any, Task], shared: tuple[SweepSet, Array], where: Where) -> Iterator[tuple[Any, Fold]]:
-    """Every task's Fold: those in the cache first, then the others as they finish."""
-    data = digest(shared[0])
+def _folds(tasks: dict[Any, Task], sweeps: SweepSet, kind: str, where: Where) -> Iterator[tuple[Any, Fold]]:
+    """Every task's Fold: those in the cache first, then the others as they finish. kind: what their methods are given."""
+    data = digest(sweeps)
     paths = {name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache}
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()
     left = [named for named in tasks.items() if named[0] not in kept and not where.kept]
+    shared = (sweeps, methods.given(kind, sweeps)) if left else ()
     for (name, _), fold in pool.results(_run, left, shared, where.jobs, where.scheduler):
         if where.cache:
             fold.save(paths[name])
