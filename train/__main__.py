@@ -23,6 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; its exit code. Troubles that have a name are one line on the error stream."""
     args = _parser().parse_args(argv)
     try:
+        score.provenance()  # the code that runs is that of now
         args.run(args)
     except ApplianceError as e:
         print(f"palpate-train: {e}", file=sys.stderr)

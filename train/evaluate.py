@@ -26,7 +26,7 @@ CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palp
 
 @dataclass(frozen=True)
 class Result:
-    """What a method did under a protocol with one seed. folds: in the order of the splitter."""
+    """What a method did under a protocol with one seed. folds: in the order of the splitter. origin: score.provenance."""
 
     method: str
     protocol: str
@@ -34,6 +34,7 @@ class Result:
     seed: int
     sweeps: SweepSet = field(repr=False)
     folds: list[Fold] = field(repr=False)
+    origin: dict[str, str] = field(default_factory=dict)
 
     @property
     def refused(self) -> str:
@@ -75,7 +76,7 @@ class Result:
             "folds": len(self.folds), "agreement": min(f.agreement for f in self.folds), "ran": ", ".join(ran),
             "materials": list(sweeps.materials), "confusion": confusion.tolist(), "set": sweeps.source,
             "digest": digest(sweeps), "format": asdict(sweeps.format),
-        } | provenance()  # fmt: skip
+        } | self.origin  # fmt: skip
 
 
 HEADER = f"{'method':<16} {'protocol':<22} means  {'windows':<30} {'recordings':<30} {'fit s':>7} {'ms':>7}"
@@ -119,7 +120,7 @@ def evaluate(
     sweeps: SweepSet, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
 ) -> Iterator[Result]:
     """Results as they are complete. Raises FormatError where a method or protocol is unknown or does not fit the set."""
-    known = methods.find(plan.methods, plan.effort)
+    known, origin = methods.find(plan.methods, plan.effort), provenance()
     sweeps = sweeps.without_means() if plan.means_removed else sweeps
     splits = {(p, s): Protocol(p).folds(sweeps, s) for p in plan.protocols for s in plan.seeds}
     progress = pool.Progress(len(known) * sum(map(len, splits.values())), log)
@@ -135,7 +136,7 @@ def evaluate(
             progress(f"{name}, {protocol}, seed {seed}, fold {i + 1}")
             whole = [done.get((name, protocol, seed, k)) for k in range(len(splits[protocol, seed]))]
             if all(whole):
-                yield Result(name, protocol, plan.means_removed, seed, sweeps, whole)  # type: ignore[arg-type]
+                yield Result(name, protocol, plan.means_removed, seed, sweeps, whole, origin)  # type: ignore[arg-type]
 
 
 def _folds(tasks: dict[Any, Task], sweeps: SweepSet, kind: str, where: Where) -> Iterator[tuple[Any, Fold]]:

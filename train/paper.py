@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.classifier import fuse, softmax
-from appliance.sim.bench import commit
 
 from . import methods, printed, related, score, sets, story
 from .evaluate import Plan, Result, Where, evaluate
@@ -152,7 +151,7 @@ def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effo
     outcomes = list(_outcomes(parts, steps, where, effort, log))
     told = summary(outcomes, parts, effort) | {
         "quick": quick,
-        "commit": commit(),
+        "commit": score.provenance()["commit"],
         "took_s": round(time.monotonic() - start),
     }
     out.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,8 @@ def fused(logits: Array, together: Array) -> tuple[Array, Array]:
     return scores, first
 
 
+@cache
 def provenance() -> dict[str, str]:
-    """What a result file says of its origin, beside its sets and seeds."""
+    """What a result file says of its origin, beside its sets and seeds; the commit as it was when first asked for, since
+    a long run may see others."""
     return {"commit": commit(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}

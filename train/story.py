@@ -74,7 +74,9 @@ class Story:
             best = max(held, key=lambda m: held[m][0])
             own = [_estimate(held[m]) if m in held else "–" for m in (BEST, *printed.CNNS)]
             lines.append([title, *own, f"{best} {_estimate(held[best])}"])
-        return page.heading("In short") + page.table(["", BEST, *printed.CNNS, "best of all"], lines, texts=(0,))
+        return page.heading("In short") + page.table(
+            ["", BEST, printed.CNNS[0], "– means out", "best of all"], lines, texts=(0,)
+        )
 
     def run(self) -> str:
         """Sets, methods, seeds, machine, iterations."""
