@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from appliance import features, series
 from appliance.errors import FormatError
 from appliance.related import correlation, spectrogram, static
-from train.related import exploration, explore
+from train.related import explore
 
 KINDS = ("static", "spectrogram", "correlation")
 RATE = 750.0
@@ -169,27 +169,6 @@ def test_later_sweeps_correct_the_first():
     assert explore(np.array([[0.0, -1e9]] + [[-12.0, 0.0]] * 4), 1)[0] == 1
 
 
-def test_exploration_of_a_set():
-    """Objects are material x group; sweeps that are sure take one each, vague ones more, and gain by it."""
-    rng = np.random.default_rng(0)
-    labels, groups = np.repeat([0, 1, 2], 40), np.tile(np.arange(120) % 4, 1)
-    sure = exploration(9.0 * np.eye(3)[labels], labels, groups, 0.9, rng)
-    assert (sure.right, sure.objects, sure.sweeps) == (12, 12, 12)
-    vague = np.eye(3)[labels] + rng.normal(0, 1, (120, 3))
-    told = exploration(vague, labels, groups, 0.95, np.random.default_rng(1), rounds=5)
-    assert told.objects == 60
-    assert 2 < told.mean_sweeps <= 10
-    assert told.accuracy > np.mean(vague.argmax(1) == labels) + 0.1
-    assert exploration(vague, labels, groups, 0.95, np.random.default_rng(1), rounds=5) == told
-
-
-def test_exploration_uses_an_object_up_and_no_other():
-    """Flat logits are never sure: each of two objects is used whole, and a group of two materials is two objects."""
-    labels = np.array([0, 0, 0, 1, 1])
-    told = exploration(np.zeros((5, 2)), labels, np.zeros(5, int), 0.9, np.random.default_rng(0))
-    assert (told.objects, told.sweeps, told.right) == (2, 5, 1)
-
-
 @pytest.mark.parametrize(
     ("log_p", "sure", "hint"),
     [(np.zeros((0, 3)), 0.9, "at least one of each"), (np.zeros((2, 3)), 1.5, "1.5 cannot be reached")],
@@ -198,9 +177,3 @@ def test_what_cannot_be_explored_is_named(log_p: np.ndarray, sure: float, hint: 
     """No sweep, and a certainty that is no probability."""
     with pytest.raises(FormatError, match=hint):
         explore(log_p, sure)
-
-
-def test_logits_that_do_not_fit_are_named():
-    """One label too few."""
-    with pytest.raises(FormatError, match="3 logits, 2 labels, 3 groups"):
-        exploration(np.zeros((3, 2)), np.zeros(2, int), np.zeros(3, int), 0.9, np.random.default_rng(0))

@@ -347,6 +347,16 @@ def test_the_table_says_where_each_falls():
     assert "- c: too short" in text
 
 
+def test_the_table_tells_what_becomes_of_sweeps_that_tell_nothing():
+    """How many methods do what, and the box's status where it is known."""
+    result = stress.merge([stress.one(FAKE, small(), Trial(small()), stresses.find(["hum"]), 0)])
+    lines = stress.table(
+        result | {"box": dict.fromkeys(("constant", "saturated"), "x") | {"one-frame": "short", "silent": "no-contact"}}
+    ).splitlines()
+    assert "- one-frame: 1 methods refused; the box: short" in lines
+    assert "- silent: 1 methods finite; the box: no-contact" in lines
+
+
 def test_one_task_travels_and_counts():
     """A task can be sent away and comes back as JSON; its numbers are those counted by hand."""
     sweeps, trial = small(), Trial(small())

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from appliance import bundle
 from appliance.bundle import Manifest
 from appliance.errors import ApplianceError, FormatError
 from appliance.sim.bench import commit
@@ -191,6 +192,7 @@ def run_stress(args: argparse.Namespace) -> None:
         effort=options.effort(args),
         log=options.Log(),
     )
+    told["box"] = stress.box_trouble(bundle.load(bundle.DEFAULT))
     told |= {"train": train.source, "digest": sets.digest(train), "format": str(train.format)} | score.provenance()
     table = stress.table(told)
     whole(args.out / "results.json", (json.dumps(told) + "\n").encode())

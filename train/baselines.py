@@ -237,14 +237,22 @@ def _tally(g: Graph, duels: str, classes: int) -> str:
     return g("Add", won, g("Div", total, bound))
 
 
-METHODS = (
-    Method("L-gauss", "L-features, a normal distribution a class (sec. III.C; Bishop 2006)", "L", partial(learn, Gauss)),
-    Method("L-knn", "L-features standardised, 4 nearest neighbours (sec. III.C)", "L",
-           partial(learn, lambda: make_pipeline(StandardScaler(), knn()))),
-    Method("L-svm", "L-features standardised, RBF SVM, one against one, gamma = 1/N (sec. III.C)", "L",
-           partial(learn, svm)),
-    Method("H-knn", "H-features, 4 nearest neighbours (sec. III.C)", "H", partial(learn, knn)),
-    Method("H-svm", "H-features standardised, RBF SVM, one against one, gamma = 1/N (sec. III.C)", "H",
-           partial(learn, svm)),
-)  # fmt: skip
+ESTIMATORS: dict[str, Callable[[], Estimator]] = {
+    "L-gauss": Gauss,
+    "L-knn": lambda: make_pipeline(StandardScaler(), knn()),
+    "L-svm": svm,
+    "H-knn": knn,
+    "H-svm": svm,
+}
 """The paper's classifiers on its own features. L-features have units (log, Hz, Hz): neighbours see them standardised."""
+ABOUT = (
+    "L-features, a normal distribution a class (sec. III.C; Bishop 2006)",
+    "L-features standardised, 4 nearest neighbours (sec. III.C)",
+    "L-features standardised, RBF SVM, one against one, gamma = 1/N (sec. III.C)",
+    "H-features, 4 nearest neighbours (sec. III.C)",
+    "H-features standardised, RBF SVM, one against one, gamma = 1/N (sec. III.C)",
+)
+METHODS = tuple(
+    Method(name, about, name[0], partial(learn, make))
+    for (name, make), about in zip(ESTIMATORS.items(), ABOUT, strict=True)
+)

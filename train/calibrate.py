@@ -19,7 +19,7 @@ from . import baselines, methods, pool, sets
 from .protocols import Protocol
 
 Array = NDArray[Any]
-METHODS = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
+METHODS = tuple(baselines.ESTIMATORS)
 ATTACHMENTS = 5
 """T-HARD is one attachment in the paper. One is luck: a seed's accuracy is the mean over so many."""
 LAB, REAL, HARD = 0, 1, tuple(range(2, 2 + ATTACHMENTS))
@@ -65,7 +65,6 @@ def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = N
 
 def accuracies(sweeps: sets.SweepSet, seed: int) -> Array:
     """The share of right answers, float64 [figures, methods], on what `draw` drew. seed: of the random folds."""
-    known = {method.name: method for method in baselines.METHODS}
     given = {kind: methods.given(kind, sweeps) for kind in ("L", "H")}
     shares = np.zeros(PRINTED.shape)
     for i, figure in enumerate(FIGURES):
@@ -73,14 +72,15 @@ def accuracies(sweeps: sets.SweepSet, seed: int) -> Array:
         part = sweeps.take(inside)
         folds = Protocol(figure.protocol).folds(part, seed)
         for j, name in enumerate(METHODS):
-            right = _right(known[name], given[known[name].input][inside], part.labels, folds)
+            right = _right(baselines.ESTIMATORS[name], given[name[0]][inside], part.labels, folds)
             shares[i, j] = right / sum(len(test) for _, test in folds)
     return shares
 
 
-def _right(method: methods.Method, seen: Array, labels: Array, folds: Sequence[tuple[Array, Array]]) -> int:
+def _right(
+    make: Callable[[], baselines.Estimator], seen: Array, labels: Array, folds: Sequence[tuple[Array, Array]]
+) -> int:
     """How many answers of all folds are right. Labels need no temperature and no graph: the bare estimator is asked."""
-    make = method.train.args[0]  # type: ignore[attr-defined]
     seen = seen.astype(np.float64)
     return sum(
         int((make().fit(seen[train], labels[train]).predict(seen[test]) == labels[test]).sum()) for train, test in folds

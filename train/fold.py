@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance import features, related
+from appliance import features, related, series
 from appliance.classifier import session
 from appliance.errors import FormatError
 
@@ -123,7 +123,7 @@ def fingerprint(about: Any, *rooms: str) -> str:
     code = hashlib.sha256()
     here = sorted(Path(__file__).parent.glob("*.py"))
     paths = [path for path in here if path.stem in rooms or path.stem not in AROUND]
-    for path in (*paths, features.__file__, related.__file__):
+    for path in (*paths, *(room.__file__ for room in (features, related, series))):
         code.update(Path(path).read_bytes())
     versions = [version(name) for name in ("numpy", "scikit-learn", "torch")]
     return hashlib.sha256(json.dumps([about, versions]).encode() + code.digest()).hexdigest()[:32]

@@ -6,7 +6,6 @@ also the exploration of Xu et al. 2013, for any method: sweeps are added until t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -51,25 +50,6 @@ METHODS = (
 Hoelscher et al.'s is linear."""
 
 
-@dataclass(frozen=True)
-class Exploration:
-    """How `objects` explorations ended: how many named the right material, and how many sweeps all took together."""
-
-    right: int
-    objects: int
-    sweeps: int
-
-    @property
-    def accuracy(self) -> float:
-        """Share of right names."""
-        return self.right / self.objects
-
-    @property
-    def mean_sweeps(self) -> float:
-        """Sweeps per object."""
-        return self.sweeps / self.objects
-
-
 def explore(log_probabilities: Array, sure: float) -> tuple[int, int]:
     """One object, sweep after sweep, until a label's posterior reaches `sure`: (label, sweeps used).
 
@@ -87,28 +67,3 @@ def explore(log_probabilities: Array, sure: float) -> tuple[int, int]:
     enough = posterior.max(axis=1) >= sure
     last = int(enough.argmax()) if enough.any() else len(enough) - 1
     return int(posterior[last].argmax()), last + 1
-
-
-def exploration(
-    logits: Array, labels: Array, groups: Array, sure: float, rng: np.random.Generator, rounds: int = 1
-) -> Exploration:
-    """Explore every object of a test set, `rounds` times, its sweeps drawn in random order without replacement.
-
-    logits: [N, K] of any method's test sweeps, labels: int [N]. groups: int [N]; sweeps with the same number and the
-    same label are of one object (an attachment of the skin, a recording). Raises FormatError as `explore`, and where
-    the three do not fit.
-    """
-    if not len(logits) == len(labels) == len(groups) or not len(logits):
-        raise FormatError(
-            f"{len(logits)} logits, {len(labels)} labels, {len(groups)} groups; give one of each for every sweep"
-        )
-    log_p = np.log(np.maximum(softmax(logits), np.exp(ABSENT)))
-    objects = np.unique(np.stack([labels, groups]), axis=1, return_inverse=True)[1].ravel()
-    right = sweeps = 0
-    for _ in range(rounds):
-        for number in range(objects.max() + 1):
-            order = rng.permutation(np.flatnonzero(objects == number))
-            label, used = explore(log_p[order], sure)
-            right += label == labels[order[0]]
-            sweeps += used
-    return Exploration(int(right), rounds * int(objects.max() + 1), sweeps)

@@ -7,6 +7,7 @@ tasks, wherever they ran. What a task returns, and the result, are plain numbers
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -141,7 +142,8 @@ def worst(result: Json, method: str, n: int = 5) -> list[Json]:
 
 
 def table(result: Json) -> str:
-    """Markdown: stresses x methods, at which severity each has lost five points; then each method's five worst."""
+    """Markdown: stresses x methods, at which severity each has lost five points; then each method's five worst, and what
+    becomes of sweeps that tell nothing: on the desktop, and on the box where `result` holds `box_trouble` as "box"."""
     entries = {name: entry for name, entry in result["methods"].items() if entry["curves"]}
     rows = [["accuracy lost by .05 at", *entries], ["---"] + ["---:"] * len(entries)]
     rows.append(["*no stress: accuracy*", *(f"{entry['clean']:.3f}" for entry in entries.values())])
@@ -154,6 +156,11 @@ def table(result: Json) -> str:
         hardest = ", ".join(f"{w['stress']} −{w['lost']:.2f}" for w in worst(result, name))
         lines.append(f"- {name}: worst, by the mean loss over all severities: {hardest}")
     lines += [f"- {name}: {entry['refused']}" for name, entry in result["methods"].items() if entry["refused"]]
+    lines += ["", "Sweeps that tell nothing:", ""]
+    for name in dict.fromkeys(name for entry in entries.values() for name in entry["trouble"]):
+        said = Counter(entry["trouble"][name].split(":")[0] for entry in entries.values())
+        desk = ", ".join(f"{n} methods {what}" for what, n in said.items())
+        lines.append(f"- {name}: {desk}" + (f"; the box: {result['box'][name]}" if "box" in result else ""))
     return "\n".join(lines) + "\n"
 
 
