@@ -8,6 +8,7 @@ worker first: one that dies takes nothing along but what it was computing, and t
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
@@ -35,6 +36,8 @@ def results(
     if scheduler and tasks:
         yield from _on_cluster(call, tasks, shared, scheduler)
     elif tasks:
+        # a process whose libraries have grown is replaced; nothing is lost by it
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
         yield from Parallel(jobs, return_as="generator_unordered", batch_size=1)(
             delayed(_one)(task, call, *shared) for task in tasks
         )
