@@ -38,3 +38,8 @@ CONFUSION = np.array(
 """Fig. 11, the CNN on T-REAL with a position left out: rows are the truth, in the order of skin.MATERIALS."""
 SEVERAL = {"H-svm": (0.86, None, 0.92), **dict.fromkeys(CNNS, (0.923, 0.973, 0.975))}
 """Fig. 13: one, two, three sweeps."""
+
+
+def short(method: str) -> str:
+    """A name that fits beside a bar."""
+    return method.removeprefix("paper-") if method.endswith(MEANS_OUT) else method

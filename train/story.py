@@ -192,13 +192,13 @@ class Story:
 
     def beyond(self) -> str:
         """All methods on all protocols."""
-        cells = {(m, COLUMNS[part]): tuple(row["share"]) for part, _ in _ordered(COLUMNS)
+        cells = {(printed.short(m), COLUMNS[part]): tuple(row["share"]) for part, _ in _ordered(COLUMNS)
                  for (p, m), row in self.rows.items() if p == part}  # fmt: skip
         return "\n".join([
             page.heading("Beyond the paper: all methods"),
             self.picture("methods", chart.grid({"": cells}, "all methods on all protocols"),
-                         "Per cent right and 95 % intervals, hard protocols first; the best with a position left out "
-                         "on top. Two columns on the right: random folds, only to show how they flatter."),
+                         "Per cent right and 95 % intervals, hard protocols first; the best on average on "
+                         "top. Two columns on the right: random folds, only to show how they flatter."),
             *(page.folded(TITLES[k], self.numbers([at for at in self.rows if at[0] == k], times=True)) for k in TITLES),
         ])  # fmt: skip
 
@@ -211,7 +211,7 @@ class Story:
     def bar(self, part: str, method: str) -> chart.Bar:
         """One row of a picture."""
         row = self.rows[part, method]
-        return chart.Bar(method, tuple(row["share"]), row["printed"])
+        return chart.Bar(printed.short(method), tuple(row["share"]), row["printed"])
 
     def numbers(self, those: Sequence[tuple[str, str]], times: bool = False) -> str:
         """What a picture shows, as a table; times: also how long it took."""
