@@ -42,4 +42,4 @@ SEVERAL = {"H-svm": (0.86, None, 0.92), **dict.fromkeys(CNNS, (0.923, 0.973, 0.9
 
 def short(method: str) -> str:
     """A name that fits beside a bar."""
-    return method.removeprefix("paper-") if method.endswith(MEANS_OUT) else method
+    return f"–{MEANS_OUT[1:]}" if method.endswith(MEANS_OUT) else method

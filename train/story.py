@@ -192,7 +192,7 @@ class Story:
 
     def beyond(self) -> str:
         """All methods on all protocols."""
-        cells = {(printed.short(m), COLUMNS[part]): tuple(row["share"]) for part, _ in _ordered(COLUMNS)
+        cells = {(m.replace("paper-cnn,", "cnn,"), COLUMNS[part]): tuple(row["share"]) for part, _ in _ordered(COLUMNS)
                  for (p, m), row in self.rows.items() if p == part}  # fmt: skip
         return "\n".join([
             page.heading("Beyond the paper: all methods"),
