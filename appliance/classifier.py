@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from .clock import Clock
 
 
+LEAST_PROBABILITY = 1e-12
+"""What a probability counts as at least when sweeps are fused: one that is sure beyond float64 cannot veto all others."""
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """What a look at the window found: ok, or why it is refused, and where."""
@@ -76,8 +80,7 @@ def fuse(scores: list[NDArray[np.float64]], how: str) -> NDArray[np.float64]:
     the most frequent label wins, of equally frequent ones the one seen first: two sweeps never differ from the first.
     """
     if how == "product":
-        # floored, so that one sweep that is sure beyond float64 cannot veto all others with log 0
-        return softmax(np.log(np.maximum(scores, 1e-12)).sum(axis=0))
+        return softmax(np.log(np.maximum(scores, LEAST_PROBABILITY)).sum(axis=0))
     labels = [int(np.argmax(s)) for s in scores]
     votes = np.bincount(labels, minlength=len(scores[0])) / len(labels)
     votes[max(labels, key=lambda k: votes[k])] += 1e-9  # max() keeps the first of equals; argmax must agree
@@ -105,7 +108,7 @@ class Classifier:
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window [T, R, C] of digits."""
         kind = self.bundle.manifest.input
-        given = taxels if kind == "raw" else features.compute(kind, taxels, self.bundle.format.rate_hz)
+        given = features.given(kind, taxels, self.bundle.format.rate_hz)
         result: NDArray[np.float32] = self._session.run(None, {self._input: given[None]})[0][0]
         return result
 

@@ -115,6 +115,11 @@ def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float
     return KINDS[kind](taxels, rate_hz).astype(np.float32)
 
 
+def given(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
+    """What a graph with the input `kind` is given of digits [T, R, C]: themselves where it is "raw", else `compute`."""
+    return taxels if kind == "raw" else compute(kind, taxels, rate_hz)
+
+
 def _clean(bins: float) -> float:
     """`bins` as the whole number that it is but for rounding: 0.1 s at 30 Hz is 3 frames, not 3.0000000000000004."""
     return float(round(bins)) if math.isclose(bins, round(bins), rel_tol=1e-9) else bins

@@ -22,7 +22,7 @@ from appliance.clock import SystemClock
 from appliance.errors import BundleError, FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import export, fit, networks, pack, sets
+from train import export, fit, graphs, networks, pack, sets
 from train.__main__ import main
 from train.fit import Fit, Recipe
 from train.networks import Compact
@@ -63,14 +63,14 @@ def negated(fitted: Fit) -> Fit:
     return replace(fitted, weights=fitted.weights | {"head.weight": -fitted.weights["head.weight"]})
 
 
-@pytest.mark.parametrize("dtype", networks.TENSOR)
+@pytest.mark.parametrize("dtype", graphs.TENSOR)
 def test_the_float_graph_is_the_network(dtype: str):
     """For each digit type: PyTorch's logits, fixed shapes, the expected nodes, the sensor's own digits going in."""
     form = SweepFormat(3, 2, 100.0, 128, dtype)
     torch.manual_seed(0)
     model = Compact(form, 3, 0.1, norm=False)
     weights = {k: v.numpy() for k, v in model.state_dict().items()}
-    graph = networks.with_head(networks.trunk(form, 0.1, weights), weights["head.weight"], weights["head.bias"])
+    graph = graphs.with_head(networks.trunk(form, 0.1, weights), weights["head.weight"], weights["head.bias"])
     digits = np.random.default_rng(0).integers(0, 200, (5, 128, 3, 2)).astype(dtype)
     with torch.no_grad():
         want = model(torch.from_numpy(digits.astype(np.float32))).numpy()
@@ -78,7 +78,7 @@ def test_the_float_graph_is_the_network(dtype: str):
     assert {n.op_type for n in graph.graph.node} == OPS
     assert all(size > 0 for shape in shapes(graph) for size in shape)
     (given,) = graph.graph.input
-    assert (given.name, given.type.tensor_type.elem_type) == ("sweep", networks.TENSOR[dtype])
+    assert (given.name, given.type.tensor_type.elem_type) == ("sweep", graphs.TENSOR[dtype])
     assert [d.dim_value for d in given.type.tensor_type.shape.dim] == [1, 128, 3, 2]
 
 
@@ -245,7 +245,7 @@ def test_the_default_bundle_is_what_the_box_needs():
 def test_yardsticks_are_what_they_are_called(tmp_path: Path):
     """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give six logits."""
     whole = networks.paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
-    assert networks.weight_count(whole) == 15_891_910
+    assert graphs.weight_count(whole) == 15_891_910
     assert main(["yardsticks", "--out", str(tmp_path / "new")]) == 0
     sizes = {}
     for path in (tmp_path / "new").iterdir():

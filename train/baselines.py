@@ -29,7 +29,7 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from appliance.classifier import session
+from appliance.classifier import LEAST_PROBABILITY, session
 from appliance.errors import FormatError
 
 from .fit import temperature
@@ -46,7 +46,7 @@ FOLDS = 5
 """At most so many parts of the training set are held out, one after another, to find the temperature."""
 SHARPER = 10
 """Votes are more modest than they need be, and fit.temperature only cools: it gets logits so many times as large."""
-ABSENT = math.log(1e-12)
+ABSENT = math.log(LEAST_PROBABILITY)
 """Log probability of a material without a sweep in training; the box's floor when it fuses."""
 LIMIT = 1e9
 """Features are cut off here, so that no broken reading overflows float32; no sound one comes near."""

@@ -26,7 +26,8 @@ CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palp
 
 @dataclass(frozen=True)
 class Result:
-    """What a method did under a protocol with one seed. folds: in the order of the splitter. origin: score.provenance."""
+    """What a method did under a protocol with one seed. folds: in the order of the splitter. origin: the set's digest and
+    score.provenance."""
 
     method: str
     protocol: str
@@ -75,7 +76,7 @@ class Result:
         return told | times | {
             "folds": len(self.folds), "agreement": min(f.agreement for f in self.folds), "ran": ", ".join(ran),
             "materials": list(sweeps.materials), "confusion": confusion.tolist(), "set": sweeps.source,
-            "digest": digest(sweeps), "format": asdict(sweeps.format),
+            "format": asdict(sweeps.format),
         } | self.origin  # fmt: skip
 
 
@@ -120,8 +121,9 @@ def evaluate(
     sweeps: SweepSet, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
 ) -> Iterator[Result]:
     """Results as they are complete. Raises FormatError where a method or protocol is unknown or does not fit the set."""
-    known, origin = methods.find(plan.methods, plan.effort), provenance()
+    known = methods.find(plan.methods, plan.effort)
     sweeps = sweeps.without_means() if plan.means_removed else sweeps
+    origin = {"digest": digest(sweeps)} | provenance()
     splits = {(p, s): Protocol(p).folds(sweeps, s) for p in plan.protocols for s in plan.seeds}
     progress = pool.Progress(len(known) * sum(map(len, splits.values())), log)
     for kind in dict.fromkeys(method.input for method in known):
@@ -131,7 +133,7 @@ def evaluate(
             for name in same for split, folds in splits.items() for i, fold in enumerate(folds)
         }  # fmt: skip
         done: dict[Any, Fold] = {}
-        for (name, protocol, seed, i), fold in _folds(tasks, sweeps, kind, where):
+        for (name, protocol, seed, i), fold in _folds(tasks, sweeps, origin["digest"], kind, where):
             done[name, protocol, seed, i] = fold
             progress(f"{name}, {protocol}, seed {seed}, fold {i + 1}")
             whole = [done.get((name, protocol, seed, k)) for k in range(len(splits[protocol, seed]))]
@@ -139,9 +141,11 @@ def evaluate(
                 yield Result(name, protocol, plan.means_removed, seed, sweeps, whole, origin)  # type: ignore[arg-type]
 
 
-def _folds(tasks: dict[Any, Task], sweeps: SweepSet, kind: str, where: Where) -> Iterator[tuple[Any, Fold]]:
-    """Every task's Fold: those in the cache first, then the others as they finish. kind: what their methods are given."""
-    data = digest(sweeps)
+def _folds(tasks: dict[Any, Task], sweeps: SweepSet, data: str, kind: str, where: Where) -> Iterator[tuple[Any, Fold]]:
+    """Every task's Fold: those in the cache first, then the others as they finish.
+
+    data: digest of `sweeps`. kind: what the tasks' methods are given of them.
+    """
     paths = {name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache}
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()

@@ -25,6 +25,7 @@ from appliance.sim import skin
 
 from . import networks
 from .fit import Fit, closed_form_head
+from .graphs import with_head
 from .pack import Content, ExportRefused, pack, run
 
 Array = NDArray[Any]
@@ -75,11 +76,11 @@ def export(
 def quantized(fit: Fit) -> tuple[onnx.ModelProto, Parity]:
     """The int8 model, its head refitted on what the int8 trunk gives. Raises ExportRefused where parity is broken."""
     trunk = networks.trunk(fit.train.format, fit.scale, fit.weights, fit.keep_means)
-    whole = networks.with_head(trunk, fit.weights["head.weight"], fit.weights["head.bias"])
+    whole = with_head(trunk, fit.weights["head.weight"], fit.weights["head.bias"])
     some = np.linspace(0, len(fit.train) - 1, min(CALIBRATION_SWEEPS, len(fit.train))).astype(int)
     int8_trunk = quantize(trunk, fit.train.samples[some])
     seen, held = run(int8_trunk, fit.train.samples), run(int8_trunk, fit.held.samples)
-    model = networks.with_head(int8_trunk, *closed_form_head(seen, fit.train.labels, held, fit.held.labels))
+    model = with_head(int8_trunk, *closed_form_head(seen, fit.train.labels, held, fit.held.labels))
     with torch.no_grad():
         torch_logits = fit.network()(torch.from_numpy(fit.held.samples.astype(np.float32))).numpy()
     float_logits, int8_logits = (run(m, fit.held.samples) for m in (whole, model))
@@ -133,7 +134,7 @@ def yardsticks(folder: Path, seed: int = 0) -> tuple[Path, Path]:
         torch.manual_seed(seed)
         state = networks.Compact(form, classes, 0.1, norm=False).state_dict()
     weights = {k: v.numpy() for k, v in state.items()}
-    compact = networks.with_head(networks.trunk(form, 0.1, weights), weights["head.weight"], weights["head.bias"])
+    compact = with_head(networks.trunk(form, 0.1, weights), weights["head.weight"], weights["head.bias"])
     digits = rng.integers(0, 256, (4, form.window, form.rows, form.cols), np.uint8)
     paper = quantize(networks.paper_cnn(form, classes, rng), digits, ("Conv", "Relu", "MaxPool", "Gemm"))
     folder.mkdir(parents=True, exist_ok=True)

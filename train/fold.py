@@ -12,6 +12,7 @@ import os
 import time
 import zipfile
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -106,7 +107,7 @@ def _as_the_box(method: methods.Method, model: methods.Model, sweeps: SweepSet, 
     name, times, labels = graph.get_inputs()[0].name, [], []
     for digits in sweeps.samples[some]:
         start = time.perf_counter()
-        x = digits if method.input == "raw" else features.compute(method.input, digits, sweeps.rate_hz)
+        x = features.given(method.input, digits, sweeps.rate_hz)
         labels.append(int(graph.run(None, {name: x[None]})[0][0].argmax()))
         times.append(time.perf_counter() - start)
     return 1e3 * float(np.median(times)), np.array(labels)
@@ -120,13 +121,19 @@ def key(task: Task, data: str) -> str:
 
 def fingerprint(about: Any, *rooms: str) -> str:
     """32 hex digits of `about` (for JSON), the code that trains, that of AROUND's `rooms`, and the libraries."""
+    versions = [version(name) for name in ("numpy", "scikit-learn", "torch")]
+    return hashlib.sha256(json.dumps([about, versions]).encode() + _code(rooms)).hexdigest()[:32]
+
+
+@cache
+def _code(rooms: tuple[str, ...]) -> bytes:
+    """SHA-256 of the code, read once: a process goes on with what it began with."""
     code = hashlib.sha256()
     here = sorted(Path(__file__).parent.glob("*.py"))
     paths = [path for path in here if path.stem in rooms or path.stem not in AROUND]
     for path in (*paths, *(room.__file__ for room in (features, related, series))):
         code.update(Path(path).read_bytes())
-    versions = [version(name) for name in ("numpy", "scikit-learn", "torch")]
-    return hashlib.sha256(json.dumps([about, versions]).encode() + code.digest()).hexdigest()[:32]
+    return code.digest()
 
 
 def whole(path: Path, content: bytes) -> None:

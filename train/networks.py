@@ -6,6 +6,7 @@ written with train/graphs.py and take the sensor's own digits.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import ceil
@@ -23,10 +24,8 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from appliance.errors import FormatError
 from appliance.sweep import SweepFormat
 
-from .graphs import TENSOR, Graph, centred, weight_count, with_head
+from .graphs import Graph, centred, with_head
 
-__all__ = ["TENSOR", "Compact", "Graph", "ImageNetwork", "Network", "Recurrent", "paper_cnn", "stages", "trunk",
-           "weight_count", "with_head"]  # fmt: skip
 CHANNELS = 32
 """Of each stage: the fewest for which Arm's symmetric int8 kernel is used."""
 FLOOR = 0.02
@@ -37,7 +36,7 @@ STATE, PATCHES, LEAST_PATCH = 64, 128, 8
 """Of Recurrent: size of its state, about how many patches it sees, frames of the shortest."""
 
 
-class Network(nn.Module):
+class Network(nn.Module, ABC):
     """What all networks share. `scale` makes digits about 1 after `offset`, or each taxel's own mean, is taken away.
 
     dropout: share of the features that the head misses in training.
@@ -54,9 +53,9 @@ class Network(nn.Module):
         x = digits.flatten(2).transpose(1, 2).float()
         return (x - (x.mean(2, keepdim=True) if self.offset is None else self.offset)) * self.scale
 
+    @abstractmethod
     def features(self, prepared: Tensor) -> Tensor:
         """[B, R * C, T] as `prepare` gives -> what the head sees of it [B, F]."""
-        raise NotImplementedError
 
     def judge(self, prepared: Tensor) -> Tensor:
         """[B, R * C, T] as `prepare` gives -> logits [B, K]; in training the head misses some features."""
@@ -76,9 +75,9 @@ class Network(nn.Module):
         """The same network, ready for inference."""
         return self.eval()
 
+    @abstractmethod
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K], as in inference."""
-        raise NotImplementedError
 
 
 def stages(window: int) -> tuple[tuple[int, int], ...]:

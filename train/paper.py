@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.classifier import fuse, softmax
+from appliance.classifier import LEAST_PROBABILITY, fuse, softmax
 
 from . import methods, printed, related, score, sets, story
 from .evaluate import Plan, Result, Where, evaluate
+from .fold import whole
 from .methods import USUAL, Effort
 from .pool import spoken
 
@@ -134,6 +136,11 @@ class Outcome:
         about = result.json() | {"part": part, "world": world}
         return cls(part, method, world, sweeps.labels[test], result.logits, place, costs, about)
 
+    @cached_property
+    def explorations(self) -> Array:
+        """What `objects` draws of it."""
+        return objects(self.labels, self.place, self.world)
+
     @property
     def right(self) -> Array:
         """Which [n] were named right."""
@@ -154,12 +161,11 @@ def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effo
         "commit": score.provenance()["commit"],
         "took_s": round(time.monotonic() - start),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "results.json").write_text(_lines(told))
+    whole(out / "results.json", _lines(told).encode())
     page, pictures = story.tell(told)
     for name, svg in pictures.items():
-        (out / f"{name}.svg").write_text(svg)
-    (out / "index.html").write_text(page)
+        whole(out / f"{name}.svg", svg.encode())
+    whole(out / "index.html", page.encode())
     return out / "index.html"
 
 
@@ -252,7 +258,7 @@ def several(those: Sequence[Outcome]) -> dict[str, list[list[float]]]:
 
 def _fused(outcome: Outcome, n: int, how: str) -> Array:
     scores = softmax(outcome.logits)
-    drawn = objects(outcome.labels, outcome.place, outcome.world)[:, :n]
+    drawn = outcome.explorations[:, :n]
     return np.array([fuse([scores[i] for i in row], how).argmax() for row in drawn]) == outcome.labels
 
 
@@ -262,8 +268,8 @@ def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
     for sure in SURE:
         right, used = [], []
         for o in those:
-            log_p = np.log(np.maximum(softmax(o.logits), 1e-12))
-            ends = [related.explore(log_p[row], sure) for row in objects(o.labels, o.place, o.world)]
+            log_p = np.log(np.maximum(softmax(o.logits), LEAST_PROBABILITY))
+            ends = [related.explore(log_p[row], sure) for row in o.explorations]
             labels, counts = np.array(ends).T
             right.append(labels == o.labels)
             used.append(counts)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.classifier import softmax
+from appliance.classifier import LEAST_PROBABILITY, softmax
 from appliance.sim.bench import commit
 from appliance.sim.score import wilson
 
@@ -59,7 +59,7 @@ def fused(logits: Array, together: Array) -> tuple[Array, Array]:
     the first sweep of each."""
     _, first, member = np.unique(together, return_index=True, return_inverse=True)
     scores = np.zeros((len(first), logits.shape[1]))
-    np.add.at(scores, member, np.log(np.maximum(softmax(logits), 1e-12)))  # floored as on the box
+    np.add.at(scores, member, np.log(np.maximum(softmax(logits), LEAST_PROBABILITY)))
     return scores, first
 
 
