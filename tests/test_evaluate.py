@@ -151,6 +151,15 @@ def test_a_fold_is_kept_under_all_that_it_depends_on(tmp_path: Path, monkeypatch
     assert fold.key(task, "data") not in names
 
 
+def test_a_fold_depends_on_the_code_that_its_method_runs():
+    """What a method imports, directly or not, counts; what stands around it and other methods' networks do not."""
+    assert {"nets", "networks", "loop", "graphs", "heads", "fold"} <= fold.reached((methods.home("paper-cnn"), "fold"))
+    classical = fold.reached((methods.home("L-svm"), "fold"))
+    assert {"baselines", "heads", "graphs"} <= classical
+    assert not {"nets", "networks", "compact", "evaluate", "score", "__main__"} & classical
+    assert all(methods.home(name) in methods.ROOMS for name in methods.every())
+
+
 @pytest.mark.parametrize(
     ("names", "protocol", "why"),
     [

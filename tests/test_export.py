@@ -22,10 +22,10 @@ from appliance.clock import SystemClock
 from appliance.errors import BundleError, FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import export, fit, graphs, networks, pack, sets
+from train import compact, export, fit, graphs, networks, pack, sets
 from train.__main__ import main
+from train.compact import Compact
 from train.fit import Fit, Recipe
-from train.networks import Compact
 from train.pack import ExportRefused
 
 OPS = {"Reshape", "Cast", "ConstantOfShape", "Gemm", "Transpose", "Conv", "Relu", "ReduceMean", "Concat", "Add", "Log"}
@@ -70,11 +70,11 @@ def test_the_float_graph_is_the_network(dtype: str):
     torch.manual_seed(0)
     model = Compact(form, 3, 0.1, norm=False)
     weights = {k: v.numpy() for k, v in model.state_dict().items()}
-    graph = graphs.with_head(networks.trunk(form, 0.1, weights), weights["head.weight"], weights["head.bias"])
+    graph = graphs.with_head(compact.trunk(form, 0.1, weights), weights["head.weight"], weights["head.bias"])
     digits = np.random.default_rng(0).integers(0, 200, (5, 128, 3, 2)).astype(dtype)
     with torch.no_grad():
         want = model(torch.from_numpy(digits.astype(np.float32))).numpy()
-    np.testing.assert_allclose(pack.run(graph, digits), want, atol=1e-4)
+    np.testing.assert_allclose(graphs.run(graph, digits), want, atol=1e-4)
     assert {n.op_type for n in graph.graph.node} == OPS
     assert all(size > 0 for shape in shapes(graph) for size in shape)
     (given,) = graph.graph.input
@@ -96,7 +96,7 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(packed: Path):
         weight, scale = (values[name] for name in maker[conv.input[1]].input[:2])
         assert weight.dtype == np.int8
         assert 60 <= np.abs(weight.astype(int)).max() <= 64
-        assert scale.shape == (networks.CHANNELS,)
+        assert scale.shape == (compact.CHANNELS,)
         assert [n.op_type for n in model.graph.node if conv.output[0] in n.input] == ["QuantizeLinear"]
     assert all(size > 0 for shape in shapes(model) for size in shape)
     run = session(model.SerializeToString())
@@ -106,7 +106,7 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(packed: Path):
 
 def test_quantizing_leaves_its_model_alone(fitted: Fit):
     """onnxruntime empties the model that it is given; ours still runs."""
-    trunk = networks.trunk(fitted.train.format, fitted.scale, fitted.weights)
+    trunk = compact.trunk(fitted.train.format, fitted.scale, fitted.weights)
     before = trunk.SerializeToString()
     export.quantize(trunk, fitted.train.samples[:4])
     assert trunk.SerializeToString() == before

@@ -13,7 +13,7 @@ from test_sets import easy
 from appliance.classifier import session, softmax
 from appliance.errors import FormatError
 from appliance.sweep import SweepFormat
-from train import headed, minirocket, pack
+from train import graphs, headed, minirocket
 from train.sets import SweepSet
 
 KINDS = {"uint8": (2, 2, 64), "int16": (3, 3, 40), "uint16": (1, 1, 9), "float32": (16, 1, 33)}
@@ -58,7 +58,7 @@ def test_the_graph_is_the_definition(dtype: str):
     sweep, (rows, cols, window) = digits(dtype)[0], KINDS[dtype]
     found = parameters(window, rows * cols)
     graph = minirocket.transform(SweepFormat(rows, cols, 50.0, window, dtype), found)
-    np.testing.assert_allclose(pack.run(graph, sweep[None])[0], by_definition(sweep, found), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(graphs.run(graph, sweep[None])[0], by_definition(sweep, found), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
@@ -70,7 +70,7 @@ def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
     graph = minirocket.transform(SweepFormat(rows, cols, 50.0, window, dtype), minirocket.fitted(given, 5))
     series = np.ascontiguousarray(given.reshape(len(given), window, -1).transpose(0, 2, 1), np.float32)
     want = aeon.MiniRocket(1000, random_state=5).fit(series).transform(series)
-    off = np.abs(pack.run(graph, given) - want)
+    off = np.abs(graphs.run(graph, given) - want)
     assert want.shape[1] == 924
     assert np.mean(off > 1e-6) < (0.01 if dtype == "float32" else 1e-9)
     assert off.max() <= 2 / (window - 8 * ((window - 1) // 8))
@@ -132,7 +132,7 @@ def test_the_temperature_comes_from_held_out_groups():
     sweeps = easy(20, pieces=4)
     graph = minirocket.transform(sweeps.format, parameters(64, 4))
     headed.headed(graph, spy, sweeps, sweeps.samples, 0)
-    every = pack.run(graph, sweeps.samples)
+    every = graphs.run(graph, sweeps.samples)
     there = np.array([(row == seen[0]).all(axis=1).any() for row in every])
     assert all(np.ptp(there[sweeps.group("recording") == r].astype(int)) == 0 for r in range(15))
     assert there.sum() == 48

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,19 +16,20 @@ from appliance.classifier import softmax
 from appliance.errors import FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import fit, loop, nets, networks, pack
-from train.loop import Recipe
+from train import compact, evaluate, family, fit, fold, graphs, loop, methods, nets, networks
+from train.fit import Recipe
 from train.methods import Effort, Method
 from train.sets import SweepSet
 
-NAMES = ("paper-cnn", "tactnet2", "recurrent", "compact")
+NETS = ("paper-cnn", "paper-cnn-centred", "tactnet2", "recurrent")
+NAMES = (*NETS, "compact")
 BRIEF = Effort(share=0.01, paper_steps=2)
 """Two to eight iterations: enough for what is not about accuracy."""
 
 
 def method(name: str, effort: Effort = BRIEF) -> Method:
     """The method of this name."""
-    return next(m for m in nets.methods(effort) if m.name == name)
+    return methods.find([name], effort)[0]
 
 
 def made(shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0) -> SweepSet:
@@ -48,7 +50,7 @@ def agrees(model: nets.Trained, samples: np.ndarray) -> None:
     want = model.logits(samples)
     assert want.dtype == np.float32
     assert np.isfinite(want).all()
-    have = pack.run(model.graph(), samples)
+    have = graphs.run(model.graph(), samples)
     np.testing.assert_allclose(have, want, atol=1e-3, rtol=1e-4)
 
 
@@ -63,7 +65,7 @@ def test_the_paper_s_cnn_is_the_paper_s():
     assert net.dense.in_features == 15 * 16 * 64
     r = nets.PAPER_RECIPE
     assert (r.batch, r.peak_rate, r.dropout, nets.PAPER_STEPS) == (50, 1e-4, 0.25, 4000)
-    assert (r.weight_decay, r.smoothing, r.ema, r.noise, r.gain, r.row_shift, r.adversarial) == (0,) * 7
+    assert (r.weight_decay, r.smoothing, r.ema, r.noise, r.gain, r.adversarial) == (0,) * 6
     assert not r.cycle
     other = nets.tactnet2(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
     assert sum(p.numel() for p in other.parameters()) == pytest.approx(1.84e6, rel=0.01)
@@ -140,11 +142,16 @@ def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str
 @pytest.mark.parametrize("name", NAMES)
 def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
     """Real sizes with random weights, or the smallest training: 1500 x 4 x 4 of uint8."""
-    build = {"paper-cnn": nets.paper_cnn, "tactnet2": nets.tactnet2, "recurrent": nets.recurrent}.get(name)
+    build = {
+        "paper-cnn": nets.paper_cnn,
+        "paper-cnn-centred": nets.paper_cnn_centred,
+        "tactnet2": nets.tactnet2,
+        "recurrent": nets.recurrent,
+    }.get(name)
     digits = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        form, plain = skin.FORMAT, networks.Compact(skin.FORMAT, 6, 0.1, norm=False)
+        form, plain = skin.FORMAT, compact.Compact(skin.FORMAT, 6, 0.1, norm=False)
         net = build(form, 6, digits) if build else plain
     agrees(nets.Trained(net.eval(), ""), digits)
 
@@ -235,7 +242,7 @@ def test_compact_is_what_palpate_train_fits():
     """The same network as `fit` gives, its logits moved; rows shift on a grid and not along a line."""
     s = easy(12)
     line = replace(s, samples=s.samples.reshape(len(s), 64, 4, 1))
-    for given, shift in ((s, nets.GRID_SHIFT), (line, 0.0)):
+    for given, shift in ((s, family.GRID_SHIFT), (line, 0.0)):
         same = fit.fit(given, 1, Recipe(steps=8, row_shift=shift)).network()
         with torch.no_grad():
             want = same(torch.from_numpy(given.samples.astype(np.float32))).numpy()
@@ -248,7 +255,7 @@ def test_a_window_too_short_is_named():
     s = made((12, 7, 2, 2), "int16")
     with pytest.raises(FormatError, match="a window of 7 frames is too short"):
         train("compact", s)
-    for name in NAMES[:3]:
+    for name in NETS:
         agrees(train(name, s), s.samples[:1])
 
 
@@ -267,16 +274,45 @@ def test_bfloat16_is_used_where_it_is_asked_for_and_there():
 
 def test_effort_is_kept():
     """Names, iterations and logs follow the effort; methods can be sent to another process."""
-    assert tuple(m.name for m in nets.METHODS) == NAMES
+    assert tuple(m.name for m in nets.METHODS) == NETS
     assert all(m.input == "raw" and "\n" not in m.about for m in nets.METHODS)
     if not torch.cuda.is_available():
         assert f"{nets.PROCESSOR_STEPS} iterations" in nets.METHODS[0].about
     assert "17 iterations" in method("paper-cnn", Effort(paper_steps=17)).about
     lines: list[str] = []
     s = easy(4)
-    nets.methods(BRIEF, lines.append)[2].train(s, s.samples, 1)
+    nets.methods(BRIEF, lines.append)[3].train(s, s.samples, 1)
     assert lines[-1].startswith("step 4/4 loss")
     again = pickle.loads(pickle.dumps(method("recurrent")))
     np.testing.assert_array_equal(
         again.train(s, s.samples, 1).logits(s.samples), train("recurrent", s).logits(s.samples)
     )
+
+
+@pytest.mark.parametrize("name", ["paper-cnn", "paper-cnn-centred"])
+def test_the_paper_s_cnn_has_an_int8_form(name: str):
+    """A quarter of the size, the same labels but for what quantization costs; centred, an offset changes nothing."""
+    s = easy(8)
+    model = train(name, s)
+    int8 = model.forms["int8"]
+    assert len(int8.graph().SerializeToString()) < 0.3 * len(model.graph().SerializeToString())
+    sure, rough = softmax(model.logits(s.samples)), softmax(int8.logits(s.samples))
+    np.testing.assert_allclose(rough, sure, atol=0.1)
+    assert not np.array_equal(rough, sure)
+    moved = softmax(model.logits(s.samples + np.float32(5)))
+    assert np.allclose(moved, sure, atol=1e-4) == (name == "paper-cnn-centred")
+
+
+def test_forms_are_kept_and_counted(tmp_path: Path):
+    """Logits of the other precision come back from the file as they were, and evaluate tells them beside the others."""
+    s = easy(12)
+    order = np.arange(len(s))
+    made_ = fold.run(fold.Task("paper-cnn", BRIEF, 1, order[::2], order[1::2]), s, s.samples)
+    made_.save(tmp_path / "fold.npz")
+    again = fold.Fold.load(tmp_path / "fold.npz")
+    assert set(again.forms) == {"int8"}
+    np.testing.assert_array_equal(again.forms["int8"], made_.forms["int8"])
+    told = evaluate.Result("paper-cnn", "random:2", False, 1, s, [again]).json()["forms"]["int8"]
+    assert told["window"]["right"] == int((made_.forms["int8"].argmax(1) == s.labels[made_.test]).sum())
+    assert told["agreement"] == np.mean(made_.forms["int8"].argmax(1) == made_.logits.argmax(1)).round(4)
+    assert 0 < told["probability_difference"] < 0.2

@@ -224,12 +224,16 @@ def test_text_of_others_is_escaped():
 
 
 def test_plans_name_methods_and_parts_that_exist():
-    """Full and quick: every step's methods are known, its parts planned, and both hold every kind of figure."""
+    """Full and quick: every step's methods are known, its parts planned, and both hold every kind of figure.
+
+    The paper's experiment leaves out the other sizes of our own network, and its CNN in the form that is not printed.
+    """
     known = set(paper.methods.every())
     for parts, steps in ((paper.FULL, paper.FULL_STEPS), (paper.QUICK, paper.QUICK_STEPS)):
         ran = {(part, m + step.means_removed * printed.MEANS_OUT) for step in steps for part in step.parts
                for m in step.methods}  # fmt: skip
-        assert {m.removesuffix(printed.MEANS_OUT) for _, m in ran} == known
+        left = known ^ {m.removesuffix(printed.MEANS_OUT) for _, m in ran}
+        assert left == {m for m in known if m.startswith("compact-")} | {"paper-cnn-centred"}
         assert {part for part, _ in ran} == set(parts) == set(story.TITLES)
         cnn = {(p, m) for p in printed.ACCURACY for m in printed.CNNS}
         assert {(p, m) for p in printed.ACCURACY for m in printed.ACCURACY[p]} - cnn <= ran

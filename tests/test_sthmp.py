@@ -12,7 +12,7 @@ from test_sets import easy
 from appliance.classifier import session, softmax
 from appliance.errors import FormatError
 from appliance.sweep import SweepFormat
-from train import pack, sthmp
+from train import graphs, sthmp
 from train.sets import SweepSet
 
 SETS = {"uint8": (4, 4, 90), "int16": (3, 3, 24), "uint16": (1, 1, 20), "float32": (16, 1, 128)}
@@ -90,7 +90,7 @@ def test_the_features_are_largest_codes_of_each_cell(dtype: str):
     sweep = (120 + 9 * np.random.default_rng(2).standard_normal((window, rows, cols))).astype(dtype)
     d = atoms(7, min(rows, 2), min(cols, 2))
     graph = sthmp.pooled(SweepFormat(rows, cols, 50.0, window, dtype), d, 0.1)
-    np.testing.assert_allclose(pack.run(graph, sweep[None])[0], by_loops(sweep, d, 0.1), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(graphs.run(graph, sweep[None])[0], by_loops(sweep, d, 0.1), rtol=0, atol=1e-3)
 
 
 def test_an_offset_changes_nothing():
@@ -99,8 +99,8 @@ def test_an_offset_changes_nothing():
     sweeps = rng.integers(0, 100, (2, 64, 4, 4)).astype(np.int16)
     graph = sthmp.pooled(SweepFormat(4, 4, 50.0, 64, "int16"), atoms(7), 0.03)
     moved = sweeps + rng.integers(-900, 900, (2, 1, 4, 4)).astype(np.int16)
-    np.testing.assert_allclose(pack.run(graph, moved), pack.run(graph, sweeps), rtol=0, atol=1e-3)
-    assert np.abs(pack.run(graph, sweeps[::-1]) - pack.run(graph, sweeps)).max() > 0.05
+    np.testing.assert_allclose(graphs.run(graph, moved), graphs.run(graph, sweeps), rtol=0, atol=1e-3)
+    assert np.abs(graphs.run(graph, sweeps[::-1]) - graphs.run(graph, sweeps)).max() > 0.05
 
 
 def test_the_dictionary_finds_what_patches_are_made_of(monkeypatch: pytest.MonkeyPatch):

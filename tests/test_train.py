@@ -14,10 +14,10 @@ from test_sets import easy
 from appliance.errors import FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import fit, loop, networks, sets
+from train import compact, fit, heads, loop, score, sets
 from train.__main__ import main
+from train.compact import Compact, stages
 from train.fit import Fit, Recipe
-from train.networks import Compact, stages
 
 QUICK = Recipe(steps=40)
 
@@ -36,7 +36,7 @@ def test_stages_follow_the_window():
         steps = window
         for kernel, stride in stages(window):
             steps = (steps - kernel) // stride + 1
-        assert steps >= (networks.LEAST_STEPS if window >= 108 else 1)
+        assert steps >= (compact.LEAST_STEPS if window >= 108 else 1)
     with pytest.raises(FormatError, match="a window of 15 frames is too short"):
         stages(15)
 
@@ -75,7 +75,7 @@ def test_row_shift_is_drawn_per_sweep():
     """Some sweeps stay, some go up, some down by one row; the row that comes in is its neighbour's, no stronger."""
     x = torch.arange(1, 9, dtype=torch.float32).reshape(1, 8, 1).expand(300, 8, 5)  # rows (1,2) (3,4) (5,6) (7,8)
     still = Recipe(row_shift=0.5, noise=0, gain=0)
-    y = loop.augment(x, 4, still, torch.Generator().manual_seed(0))[:, :, 0]
+    y = fit.vary(x, torch.Generator().manual_seed(0), 4, still)[:, :, 0]
     stays = (y[:, 2:6] == torch.tensor([3, 4, 5, 6])).all(1)
     up = (y[:, :6] == torch.tensor([3, 4, 5, 6, 7, 8])).all(1)
     down = (y[:, 2:] == torch.tensor([1, 2, 3, 4, 5, 6])).all(1)
@@ -93,7 +93,7 @@ def test_stretch_changes_speed_and_nothing_else():
     """A tone comes back at 0.7 to 1.3 times its rate, with its strength."""
     t = torch.arange(400) / 400
     x = torch.sin(2 * np.pi * 40 * t).expand(64, 1, 400)
-    y = loop.augment(x, 1, Recipe(stretch=0.3, noise=0, gain=0), torch.Generator().manual_seed(0))
+    y = fit.vary(x, torch.Generator().manual_seed(0), 1, Recipe(stretch=0.3, noise=0, gain=0))
     crossings = (y[:, 0, 1:] * y[:, 0, :-1] < 0).sum(1) / 2
     assert crossings.min() >= 26
     assert crossings.max() <= 54
@@ -104,7 +104,7 @@ def test_stretch_changes_speed_and_nothing_else():
 def test_gain_is_a_taxel_s_and_noise_a_frame_s():
     """The stated deviations, gain constant in time, the same draw for the same seed."""
     x = torch.ones(200, 4, 300)
-    y, again = (loop.augment(x, 2, Recipe(), torch.Generator().manual_seed(3)) for _ in range(2))
+    y, again = (loop.unsettled(x, Recipe(), torch.Generator().manual_seed(3)) for _ in range(2))
     assert torch.equal(y, again)
     assert y.mean(2).std().item() == pytest.approx(0.15, rel=0.1)
     assert y.std(2).mean().item() == pytest.approx(0.05, rel=0.05)
@@ -115,9 +115,9 @@ def test_temperature_finds_how_sure_to_be():
     rng = np.random.default_rng(0)
     honest = 2 * rng.standard_normal((4000, 4))
     labels = np.array([rng.choice(4, p=p) for p in np.exp(honest) / np.exp(honest).sum(1, keepdims=True)])
-    assert fit.temperature(5 * honest, labels) == pytest.approx(5, rel=0.1)
+    assert heads.temperature(5 * honest, labels) == pytest.approx(5, rel=0.1)
     sure = 50 * np.eye(3)[np.arange(9) % 3]
-    assert 50 / fit.temperature(sure, np.arange(9) % 3) < 6
+    assert 50 / heads.temperature(sure, np.arange(9) % 3) < 6
 
 
 def test_a_head_of_two_classes_has_two_logits():
@@ -125,14 +125,14 @@ def test_a_head_of_two_classes_has_two_logits():
     rng = np.random.default_rng(0)
     labels = np.arange(200) % 2
     seen = rng.standard_normal((200, 5)) + labels[:, None] * np.array([2, 0, 0, 0, 0])
-    weight, bias = fit.closed_form_head(seen, labels, seen, labels)
+    weight, bias = heads.closed_form_head(seen, labels, seen, labels)
     assert weight.shape == (2, 5)
     assert np.mean((seen @ weight.T + bias).argmax(1) == labels) > 0.8
 
 
 def test_figure_is_wilson_s():
     """55 of 60, the paper's T-HARD: .917 in [.819, .964]."""
-    assert fit.figure(55, 60) == {"accuracy": 0.9167, "n": 60, "low": 0.8193, "high": 0.9639}
+    assert score.figure(55, 60) == {"accuracy": 0.9167, "n": 60, "low": 0.8193, "high": 0.9639}
 
 
 def test_a_fit_learns_what_is_easy(fitted: Fit):

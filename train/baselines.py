@@ -32,8 +32,8 @@ from sklearn.svm import SVC
 from appliance.classifier import LEAST_PROBABILITY, session
 from appliance.errors import FormatError
 
-from .fit import temperature
 from .graphs import IR, OPSET, Graph
+from .heads import temperature
 from .methods import Method
 from .sets import SweepSet
 
@@ -45,7 +45,7 @@ DOUBT = 0.1
 FOLDS = 5
 """At most so many parts of the training set are held out, one after another, to find the temperature."""
 SHARPER = 10
-"""Votes are more modest than they need be, and fit.temperature only cools: it gets logits so many times as large."""
+"""Votes are more modest than they need be, and heads.temperature only cools: it gets logits so many times as large."""
 ABSENT = math.log(LEAST_PROBABILITY)
 """Log probability of a material without a sweep in training; the box's floor when it fuses."""
 LIMIT = 1e9

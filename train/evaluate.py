@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.classifier import softmax
+
 from . import methods, pool
 from .fold import Fold, Task, key, run
 from .protocols import Protocol
@@ -54,22 +56,14 @@ class Result:
 
     def json(self) -> dict[str, Any]:
         """What scripts read; every count with its 95 % interval."""
-        test, logits, sweeps = self.test, self.logits, self.sweeps
-        labels, recording = sweeps.labels[test], sweeps.group("recording")[test]
-        clusters = Protocol(self.protocol).clusters(sweeps)
-        clusters = None if clusters is None else clusters[test]
-        right = logits.argmax(1) == labels
+        logits, sweeps = self.logits, self.sweeps
         confusion = np.zeros((len(sweeps.materials),) * 2, int)
-        np.add.at(confusion, (labels, logits.argmax(1)), 1)
+        np.add.at(confusion, (sweeps.labels[self.test], logits.argmax(1)), 1)
         told: dict[str, Any] = {
             "method": self.method, "protocol": self.protocol, "means_removed": self.means_removed, "seed": self.seed,
-            "window": Tally.of(right).json(), "interval": interval(right, clusters),
-        }  # fmt: skip
-        if "recording" in sweeps.groups:
-            whole, first = fused(logits, recording)
-            right = whole.argmax(1) == labels[first]
-            told["recording"] = Tally.of(right).json()
-            told["recording_interval"] = interval(right, None if clusters is None else clusters[first])
+        } | self._counts(logits)  # fmt: skip
+        if forms := self.folds[0].forms:
+            told["forms"] = {name: self._form(name) for name in forms}
         times = {"fit_s": round(float(np.median([f.fit_s for f in self.folds])), 3),
                  "ms_p50": round(float(np.median([f.ms for f in self.folds])), 4)}  # fmt: skip
         ran = sorted({f.ran for f in self.folds} - {""})
@@ -78,6 +72,27 @@ class Result:
             "materials": list(sweeps.materials), "confusion": confusion.tolist(), "set": sweeps.source,
             "format": asdict(sweeps.format),
         } | self.origin  # fmt: skip
+
+    def _counts(self, logits: Array) -> dict[str, Any]:
+        """Right answers by window, and by recording where there are such."""
+        labels, recording = self.sweeps.labels[self.test], self.sweeps.group("recording")[self.test]
+        clusters = Protocol(self.protocol).clusters(self.sweeps)
+        clusters = None if clusters is None else clusters[self.test]
+        right = logits.argmax(1) == labels
+        told: dict[str, Any] = {"window": Tally.of(right).json(), "interval": interval(right, clusters)}
+        if "recording" in self.sweeps.groups:
+            whole, first = fused(logits, recording)
+            right = whole.argmax(1) == labels[first]
+            told["recording"] = Tally.of(right).json()
+            told["recording_interval"] = interval(right, None if clusters is None else clusters[first])
+        return told
+
+    def _form(self, name: str) -> dict[str, Any]:
+        """The same models in another precision: counts, share of equal labels, how far a probability differs."""
+        logits = np.concatenate([fold.forms[name] for fold in self.folds])
+        equal = float(np.mean(logits.argmax(1) == self.logits.argmax(1)))
+        apart = np.abs(softmax(logits) - softmax(self.logits)).max()
+        return self._counts(logits) | {"agreement": round(equal, 4), "probability_difference": round(float(apart), 4)}
 
 
 HEADER = f"{'method':<16} {'protocol':<22} means  {'windows':<30} {'recordings':<30} {'fit s':>7} {'ms':>7}"

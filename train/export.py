@@ -5,10 +5,6 @@ Nothing leaves whose int8 form answers otherwise than what was trained.
 
 from __future__ import annotations
 
-import contextlib
-import io
-import tempfile
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,21 +13,20 @@ import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
-from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
 from appliance import bundle
 from appliance.classifier import softmax
 from appliance.sim import skin
 
-from . import networks
-from .fit import Fit, closed_form_head
-from .graphs import with_head
-from .pack import Content, ExportRefused, pack, run
+from . import compact, networks
+from .fit import Fit
+from .graphs import run, with_head
+from .heads import closed_form_head
+from .nets import PAPER_INT8
+from .pack import Content, ExportRefused, pack
+from .quantize import quantize
 
 Array = NDArray[Any]
-CALIBRATION_SWEEPS = 96
-PERCENTILE = 99.9
-"""Of the values that int8 must reach: with their full range one outlier sweep takes the resolution from all others."""
 MOST_LOGIT_DIFFERENCE = 0.01
 """PyTorch against the float graph: the same sums in another order."""
 LEAST_AGREEMENT = 0.95
@@ -75,10 +70,9 @@ def export(
 
 def quantized(fit: Fit) -> tuple[onnx.ModelProto, Parity]:
     """The int8 model, its head refitted on what the int8 trunk gives. Raises ExportRefused where parity is broken."""
-    trunk = networks.trunk(fit.train.format, fit.scale, fit.weights, fit.keep_means)
+    trunk = compact.trunk(fit.train.format, fit.scale, fit.weights, fit.keep_means)
     whole = with_head(trunk, fit.weights["head.weight"], fit.weights["head.bias"])
-    some = np.linspace(0, len(fit.train) - 1, min(CALIBRATION_SWEEPS, len(fit.train))).astype(int)
-    int8_trunk = quantize(trunk, fit.train.samples[some])
+    int8_trunk = quantize(trunk, fit.train.samples)
     seen, held = run(int8_trunk, fit.train.samples), run(int8_trunk, fit.held.samples)
     model = with_head(int8_trunk, *closed_form_head(seen, fit.train.labels, held, fit.held.labels))
     with torch.no_grad():
@@ -93,37 +87,6 @@ def quantized(fit: Fit) -> tuple[onnx.ModelProto, Parity]:
     return model, parity
 
 
-def quantize(model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv", "Relu")) -> onnx.ModelProto:
-    """`model` with its nodes `ops` in int8, ranges found on `sweeps`: digits [n, T, R, C].
-
-    Weights keep to seven bits: two products of eight overflow the 16-bit sums of an x86 without VNNI, and then the
-    answer there is another than on Arm.
-    """
-    mine = onnx.ModelProto()
-    mine.CopyFrom(model)  # onnxruntime moves the weights of what it is given to a file
-    mine.metadata_props.add(key="onnx.quant.pre_process", value="onnxruntime.quant")  # nothing to simplify beforehand
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        path = Path(folder) / "int8.onnx"
-        quantize_static(
-            mine, path, _Reader(sweeps), QuantFormat.QDQ, list(ops), per_channel=True, reduce_range=True,
-            activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8,
-            calibrate_method=CalibrationMethod.Percentile, extra_options={"CalibPercentile": PERCENTILE},
-        )  # fmt: skip
-        return onnx.load(path)
-
-
-class _Reader(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime ships no types
-    """Hands sweeps to the calibration one by one."""
-
-    def __init__(self, sweeps: Array) -> None:
-        self._left = iter(sweeps)
-
-    def get_next(self) -> dict[str, Array] | None:
-        """The next input of the graph, None at the end."""
-        sweep = next(self._left, None)
-        return None if sweep is None else {"sweep": sweep[None]}
-
-
 def yardsticks(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     """Write what `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx, both with random weights.
 
@@ -132,13 +95,13 @@ def yardsticks(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     rng, form, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        state = networks.Compact(form, classes, 0.1, norm=False).state_dict()
+        state = compact.Compact(form, classes, 0.1, norm=False).state_dict()
     weights = {k: v.numpy() for k, v in state.items()}
-    compact = with_head(networks.trunk(form, 0.1, weights), weights["head.weight"], weights["head.bias"])
+    small = with_head(compact.trunk(form, 0.1, weights), weights["head.weight"], weights["head.bias"])
     digits = rng.integers(0, 256, (4, form.window, form.rows, form.cols), np.uint8)
-    paper = quantize(networks.paper_cnn(form, classes, rng), digits, ("Conv", "Relu", "MaxPool", "Gemm"))
+    paper = quantize(networks.paper_cnn(form, classes, rng), digits, PAPER_INT8)
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "fp32.onnx", folder / "paper_int8.onnx"
-    for path, model in zip(paths, (compact, paper), strict=True):
+    for path, model in zip(paths, (small, paper), strict=True):
         path.write_bytes(model.SerializeToString())
     return paths

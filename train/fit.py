@@ -8,29 +8,41 @@ changed.
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from torch import Generator, Tensor
 
 from appliance.errors import FormatError
-from appliance.sim.score import wilson
 from appliance.sim.sets import read
 
-from .loop import Cost, Log, Recipe, in_order, learn, one_thread, silent, tensors
-from .networks import Compact, Network
+from . import loop
+from .compact import Compact
+from .heads import closed_form_head, hold_out
+from .loop import Cost, Log, in_order, learn, one_thread, silent, tensors
+from .networks import Network, texture_scale
+from .score import figure
 from .sets import SweepSet
 
 Array = NDArray[Any]
-HELD_OUT = 0.2
-"""Share of the groups that training does not see: they give the temperature and the figures of validation."""
-TEMPERATURES = np.geomspace(1, 100, 200)
-"""From the LDA's own posteriors, which are never too modest, to hardly sure of anything."""
+
+
+@dataclass(frozen=True)
+class Recipe(loop.Recipe):
+    """How the compact network is trained.
+
+    row_shift: share of sweeps moved by one row of taxels. stretch: largest change of speed. Both are drawn per sweep.
+    keep_means: see Compact; the convolutions never see them, the closed-form head does.
+    """
+
+    row_shift: float = 0.0
+    stretch: float = 0.0
+    keep_means: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,32 +109,19 @@ def fit(sweeps: SweepSet, seed: int, recipe: Recipe, log: Log = silent) -> Fit:
     return fit_on(*hold_out(sweeps, seed), seed, recipe, log)
 
 
-def hold_out(sweeps: SweepSet, seed: int) -> tuple[SweepSet, SweepSet, str]:
-    """(to train on, held out, by what): whole positions where there are several and these allow it, else recordings.
-
-    Raises FormatError where the set has too few groups, or one sweep of a material would be all that is left.
-    """
-    if len(np.unique(sweeps.groups.get("position", 0))) > 1:
-        with suppress(FormatError):
-            return _parted(sweeps, "position", seed)
-    return _parted(sweeps, "recording", seed)
-
-
-def _parted(sweeps: SweepSet, by: str, seed: int) -> tuple[SweepSet, SweepSet, str]:
-    train, held = sweeps.split(by, 1 - HELD_OUT, seed)
-    counts = np.bincount(train.labels, minlength=len(sweeps.materials))
-    if 1 in counts:
-        one = sweeps.materials[int(np.flatnonzero(counts == 1)[0])]
-        raise FormatError(f"{sweeps.source}: split by {by!r} leaves one sweep of {one!r}; record more of it")
-    return train, held, by
-
-
 def fit_on(train: SweepSet, held: SweepSet, by: str, seed: int, recipe: Recipe, log: Log = silent) -> Fit:
     """Train on `train`; `held` gives temperature and validation. by: how they were parted, for the story."""
     scale = texture_scale(train.samples)
     with one_thread(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model, cost = learn(Compact(train.format, len(train.materials), scale), train, recipe, seed, log)
+        model, cost = learn(
+            Compact(train.format, len(train.materials), scale),
+            train,
+            recipe,
+            seed,
+            log,
+            vary=partial(vary, rows=train.format.rows, recipe=recipe),
+        )
         model.keep_means = recipe.keep_means
         seen, unseen = features(model, train), features(model, held)
     weight, bias = closed_form_head(seen, train.labels, unseen, held.labels)
@@ -132,51 +131,26 @@ def fit_on(train: SweepSet, held: SweepSet, by: str, seed: int, recipe: Recipe, 
     return Fit(weights, scale, train, held, about, cost)
 
 
-def texture_scale(samples: Array) -> float:
-    """What makes digits [N, T, R, C] of deviation 1 after each taxel's mean over each sweep is taken away."""
-    deviation = samples - samples.mean(axis=1, keepdims=True, dtype=np.float32)
-    return float(1 / max(np.sqrt(np.mean(deviation**2)), 1e-6))
+def vary(x: Tensor, rng: Generator, rows: int, recipe: Recipe) -> Tensor:
+    """Sweeps [B, R * C, T] as another attachment and speed would have given them."""
+    if recipe.row_shift:
+        grid = x.unflatten(1, (rows, -1))
+        moved = torch.rand(len(x), 1, generator=rng) < recipe.row_shift
+        source = torch.arange(rows) + moved * (2 * torch.randint(0, 2, (len(x), 1), generator=rng) - 1)
+        # nobody knows what lies under the row that comes in: as much as its neighbour feels, nothing, or between
+        level = torch.where((source < 0) | (source >= rows), torch.rand(len(x), 1, generator=rng), 1.0)
+        x = (grid[torch.arange(len(x))[:, None], source.clamp(0, rows - 1)] * level[..., None, None]).flatten(1, 2)
+    if recipe.stretch:
+        last = x.shape[2] - 1
+        speed = 1 + recipe.stretch * (2 * torch.rand(len(x), 1, generator=rng) - 1)
+        at = last - (last - torch.arange(last + 1) * speed).abs()  # past its end a sweep runs back
+        left = at.floor().clamp(0, last - 1)
+        take = left.long()[:, None].expand_as(x)
+        x = torch.lerp(x.gather(2, take), x.gather(2, take + 1), (at - left)[:, None])
+    return x
 
 
 @torch.no_grad()
 def features(model: Network, sweeps: SweepSet) -> Array:
     """What the head sees of each sweep, float32 [N, F]."""
     return np.concatenate([model.seen(x).numpy() for x in tensors(sweeps.samples, in_order(len(sweeps)))])
-
-
-def closed_form_head(seen: Array, labels: Array, held: Array, held_labels: Array) -> tuple[Array, Array]:
-    """Weight [K, F] and bias [K], float32, of shrinkage LDA on the features `seen` [N, F], as sure as `held` allows.
-
-    Raises FormatError where there is but one sweep of each material, which says nothing of how they vary.
-    """
-    if len(labels) <= len(np.unique(labels)):
-        raise FormatError(
-            f"{len(labels)} sweeps of as many materials are too few for a linear discriminant; record more"
-        )
-    lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(seen, labels)
-    weight, bias = lda.coef_, lda.intercept_
-    if len(weight) == 1:  # of two classes it gives only the difference
-        weight, bias = np.vstack([0 * weight, weight]), np.append(0, bias)
-    cooler = temperature(held @ weight.T + bias, held_labels)
-    return (weight / cooler).astype(np.float32), (bias / cooler).astype(np.float32)
-
-
-def temperature(logits: Array, labels: Array) -> float:
-    """The divisor of `logits` [N, K] with the best likelihood, each label believed to (N + 1) / (N + 2) as Platt does.
-
-    Without that doubt a few held-out sweeps, all right, would allow any certainty.
-    """
-    doubt = 1 / (len(labels) + 2)
-    costs = []
-    for t in TEMPERATURES:
-        z = logits / t
-        z = z - z.max(axis=1, keepdims=True)
-        log_p = z - np.log(np.exp(z).sum(axis=1, keepdims=True))
-        costs.append(-np.mean((1 - doubt) * log_p[np.arange(len(labels)), labels] + doubt * log_p.mean(axis=1)))
-    return float(TEMPERATURES[np.argmin(costs)])
-
-
-def figure(right: int, n: int) -> dict[str, Any]:
-    """An accuracy with n and its 95 % Wilson interval."""
-    low, high = wilson(right, n)
-    return {"accuracy": round(right / n, 4), "n": n, "low": round(low, 4), "high": round(high, 4)}

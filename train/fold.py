@@ -5,12 +5,14 @@ A fold is kept under a name made of all that it depends on, the data, the code a
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import io
 import json
 import os
 import time
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
@@ -30,9 +32,9 @@ from .sets import SweepSet
 Array = NDArray[Any]
 TIMED_SWEEPS = 24
 """How many test sweeps go one by one through the box's own session, for their time and to compare their labels."""
-AROUND = ("__main__", "calibrate", "chart", "evaluate", "export", "files", "ink", "options", "page", "paper", "pool", "printed",
-          "score", "sets", "story", "stress", "stresses", "trial")  # fmt: skip
-"""Rooms of this package that do not decide what a fold gives: their code may change and the fold still holds."""
+AROUND = ("evaluate", "files", "methods", "pool", "score", "sets")
+"""Rooms of this package that methods use and that do not decide what a fold gives: their code may change and the fold
+still holds. Of the sets the data themselves count."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class Fold:
 
     agreement: share of the timed sweeps to which the exported graph gives the same label. ran: what was trained, where
     the method has more to tell than its name. cost: the training's cross entropy, [iterations, 2], where it has one.
+    forms: logits float32 [n, K] of the same sweeps by the same model in other precisions.
     refused: why the method cannot work with this set; all else is empty then.
     """
 
@@ -63,11 +66,13 @@ class Fold:
     ran: str = ""
     cost: Array = field(default_factory=lambda: np.empty((0, 2)))
     refused: str = ""
+    forms: dict[str, Array] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
         """Write the fold, whole or not at all."""
         packed = io.BytesIO()
-        np.savez(packed, **{k: np.asarray(getattr(self, k)) for k in self.__dataclass_fields__})
+        forms = {FORM + name: logits for name, logits in self.forms.items()}
+        np.savez(packed, **{k: np.asarray(getattr(self, k)) for k in PLAIN}, **forms)
         whole(path, packed.getvalue())
 
     @classmethod
@@ -75,11 +80,16 @@ class Fold:
         """What `save` wrote; None where there is nothing that can be read."""
         try:
             with np.load(path, allow_pickle=False) as z:
-                held = {k: z[k] for k in cls.__dataclass_fields__}
+                held = {k: z[k] for k in PLAIN}
+                forms = {k.removeprefix(FORM): z[k] for k in z.files if k.startswith(FORM)}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
         plain = {k: v.item() if v.ndim == 0 else v for k, v in held.items()}
-        return cls(**plain)
+        return cls(**plain, forms=forms)
+
+
+FORM = "form "
+PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
 
 
 def run(task: Task, sweeps: SweepSet, given: Array) -> Fold:
@@ -91,14 +101,16 @@ def run(task: Task, sweeps: SweepSet, given: Array) -> Fold:
     except FormatError as e:
         return Fold(task.test, np.empty((0, len(sweeps.materials)), np.float32), 0.0, 0.0, 0.0, refused=str(e))
     fit_s = time.perf_counter() - start
-    logits = np.asarray(model.logits(given[task.test]), np.float32)
-    if not np.isfinite(logits).all():
+    models = {"": model} | dict(getattr(model, "forms", {}))
+    answers = {name: np.asarray(one.logits(given[task.test]), np.float32) for name, one in models.items()}
+    if not all(np.isfinite(logits).all() for logits in answers.values()):
         raise FormatError(f"{task.method} gave a logit that is no number; please report it with the set")
+    logits = answers.pop("")
     some = task.test[np.linspace(0, len(task.test) - 1, min(TIMED_SWEEPS, len(task.test))).astype(int)]
     ms, labels = _as_the_box(method, model, sweeps, some)
     agreement = float(np.mean(labels == logits[np.searchsorted(task.test, some)].argmax(1)))
     cost = np.asarray(getattr(model, "cost", []), float).reshape(-1, 2)
-    return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost)
+    return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers)
 
 
 def _as_the_box(method: methods.Method, model: methods.Model, sweeps: SweepSet, some: Array) -> tuple[float, Array]:
@@ -116,11 +128,12 @@ def _as_the_box(method: methods.Method, model: methods.Model, sweeps: SweepSet, 
 def key(task: Task, data: str) -> str:
     """A name for all that the fold depends on; data: the set's digest."""
     (method,) = methods.find([task.method], task.effort)
-    return fingerprint([data, method.name, method.effort, task.seed, task.train.tolist(), task.test.tolist()])
+    about = [data, method.name, method.effort, task.seed, task.train.tolist(), task.test.tolist()]
+    return fingerprint(about, methods.home(method.name), "fold")
 
 
 def fingerprint(about: Any, *rooms: str) -> str:
-    """32 hex digits of `about` (for JSON), the code that trains, that of AROUND's `rooms`, and the libraries."""
+    """32 hex digits of `about` (for JSON), the code of `rooms` and of all that these import here, and the libraries."""
     versions = [version(name) for name in ("numpy", "scikit-learn", "torch")]
     return hashlib.sha256(json.dumps([about, versions]).encode() + _code(rooms)).hexdigest()[:32]
 
@@ -129,11 +142,27 @@ def fingerprint(about: Any, *rooms: str) -> str:
 def _code(rooms: tuple[str, ...]) -> bytes:
     """SHA-256 of the code, read once: a process goes on with what it began with."""
     code = hashlib.sha256()
-    here = sorted(Path(__file__).parent.glob("*.py"))
-    paths = [path for path in here if path.stem in rooms or path.stem not in AROUND]
+    paths = [Path(__file__).with_name(f"{room}.py") for room in sorted(reached(rooms))]
     for path in (*paths, *(room.__file__ for room in (features, related, series))):
         code.update(Path(path).read_bytes())
     return code.digest()
+
+
+def reached(rooms: Sequence[str]) -> set[str]:
+    """`rooms` of this package and all that these import of it, directly or not, but for AROUND."""
+    found, left = set(AROUND), list(rooms)
+    while left:
+        if (room := left.pop()) not in found:
+            found.add(room)
+            left += _imported(room)
+    return found - set(AROUND)
+
+
+def _imported(room: str) -> list[str]:
+    """The rooms of this package that `room` imports."""
+    tree = ast.parse(Path(__file__).with_name(f"{room}.py").read_bytes())
+    here = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level]
+    return [name for node in here for name in ([node.module] if node.module else [alias.name for alias in node.names])]
 
 
 def whole(path: Path, content: bytes) -> None:

@@ -6,6 +6,7 @@ own digits, or features; all scaling is inside.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from appliance.classifier import session
 from appliance.sweep import SweepFormat
 
 TENSOR = {
@@ -85,6 +87,27 @@ def with_head(trunk: onnx.ModelProto, weight: NDArray[Any], bias: NDArray[Any]) 
     return whole
 
 
+@dataclass(frozen=True)
+class Graphed:
+    """A methods.Model that is nothing but its graph."""
+
+    model: onnx.ModelProto
+
+    def logits(self, given: NDArray[Any]) -> NDArray[Any]:
+        """Digits or features of n sweeps -> float32 [n, K]."""
+        return run(self.model, given)
+
+    def graph(self) -> onnx.ModelProto:
+        """The graph itself."""
+        return self.model
+
+
 def weight_count(model: onnx.ModelProto) -> int:
     """How many trained numbers a float graph holds: what is left of its constants without shapes and scalars."""
     return sum(int(np.prod(c.dims)) for c in model.graph.initializer if c.data_type == TensorProto.FLOAT and c.dims)
+
+
+def run(model: onnx.ModelProto, inputs: NDArray[Any]) -> NDArray[Any]:
+    """What `model` gives for each of `inputs` (digits or features), float32 [n, size], in the box's kind of session."""
+    of_the_box, name = session(model.SerializeToString()), model.graph.input[0].name
+    return np.concatenate([of_the_box.run(None, {name: one[None]})[0] for one in inputs])

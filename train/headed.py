@@ -16,16 +16,13 @@ from numpy.typing import NDArray
 
 from appliance.errors import FormatError
 
-from .fit import hold_out, temperature
-from .graphs import with_head
-from .pack import run
+from .graphs import run, with_head
+from .heads import ABSENT, hold_out, temperature
 from .sets import SweepSet
 
 Array = NDArray[Any]
 SHARPEST = 30.0
 """Margins are about 1 and need sharpening, while `temperature` only softens: what it starts from."""
-UNSEEN = -30.0
-"""Logit of a material that was not trained on; the best of the others is never below 0."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +67,7 @@ def headed(
         weight, bias = _centred(*fit(seen[part], labels[part]))
         factor = SHARPEST / temperature(SHARPEST * (seen[held] @ weight.T + bias), labels[held])
     whole_weight = np.zeros((len(sweeps.materials), seen.shape[1]), np.float32)
-    whole_bias = np.full(len(sweeps.materials), UNSEEN, np.float32)
+    whole_bias = np.full(len(sweeps.materials), ABSENT, np.float32)
     weight, bias = _centred(*fit(seen, labels))
     whole_weight[there], whole_bias[there] = weight * factor, bias * factor
     return Headed(features, whole_weight, whole_bias)

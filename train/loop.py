@@ -26,6 +26,7 @@ Log = Callable[[str], None]
 Cost = list[tuple[int, float]]
 """(iteration, cross entropy of its batch), eq. 11: what the paper's Fig. 9 shows."""
 Net = TypeVar("Net", bound=Network)
+Vary = Callable[[Tensor, Generator], Tensor]
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,7 @@ class Recipe:
     cycle: the rate rises to `peak_rate` and falls again; else it stays there. ema: share that the moving average of the
     weights keeps of itself each step. dropout: of the features before the head.
     noise and gain: standard deviations, of a scaled taxel and of its factor.
-    row_shift: share of sweeps moved by one row of taxels. stretch: largest change of speed. Both are drawn per sweep.
     adversarial: how far each digit, scaled, also moves to where the cost grows (fast gradient sign; Goodfellow 2015).
-    keep_means: see networks.Compact; the convolutions never see them, the closed-form head does.
     """
 
     steps: int = 800
@@ -49,15 +48,17 @@ class Recipe:
     dropout: float = 0.3
     noise: float = 0.05
     gain: float = 0.15
-    row_shift: float = 0.0
-    stretch: float = 0.0
     cycle: bool = True
     adversarial: float = 0.0
-    keep_means: bool = False
 
 
 def silent(line: str) -> None:
     """The log of nobody."""
+
+
+def as_it_is(x: Tensor, rng: Generator) -> Tensor:
+    """A scene in which nothing varies."""
+    return x
 
 
 @contextmanager
@@ -74,22 +75,8 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def augment(x: Tensor, rows: int, recipe: Recipe, rng: Generator) -> Tensor:
-    """Sweeps [B, R * C, T] as another attachment, speed and readout would have given them."""
-    if recipe.row_shift:
-        grid = x.unflatten(1, (rows, -1))
-        moved = torch.rand(len(x), 1, generator=rng) < recipe.row_shift
-        source = torch.arange(rows) + moved * (2 * torch.randint(0, 2, (len(x), 1), generator=rng) - 1)
-        # nobody knows what lies under the row that comes in: as much as its neighbour feels, nothing, or between
-        level = torch.where((source < 0) | (source >= rows), torch.rand(len(x), 1, generator=rng), 1.0)
-        x = (grid[torch.arange(len(x))[:, None], source.clamp(0, rows - 1)] * level[..., None, None]).flatten(1, 2)
-    if recipe.stretch:
-        last = x.shape[2] - 1
-        speed = 1 + recipe.stretch * (2 * torch.rand(len(x), 1, generator=rng) - 1)
-        at = last - (last - torch.arange(last + 1) * speed).abs()  # past its end a sweep runs back
-        left = at.floor().clamp(0, last - 1)
-        take = left.long()[:, None].expand_as(x)
-        x = torch.lerp(x.gather(2, take), x.gather(2, take + 1), (at - left)[:, None])
+def unsettled(x: Tensor, recipe: Recipe, rng: Generator) -> Tensor:
+    """Sweeps [B, R * C, T] with other gains and another noise."""
     if recipe.gain:
         x = x * (1 + recipe.gain * torch.randn(x.shape[:2], generator=rng)[..., None])
     return x + recipe.noise * torch.randn(x.shape, generator=rng) if recipe.noise else x
@@ -103,10 +90,11 @@ def learn(
     log: Log = silent,
     device: str = "cpu",
     bfloat16: bool = False,
+    vary: Vary = as_it_is,
 ) -> tuple[Net, Cost]:
     """Gradient training; gives the moving average of the weights, ready for inference on the processor, and the cost.
 
-    bfloat16: multiply in it. Draws what it needs from PyTorch's own generator too: seed and fork that outside.
+    vary: what the scene does to sweeps [B, R * C, T], drawn anew in each step, before gain and noise. bfloat16: multiply in it. Draws what it needs from PyTorch's own generator too: seed and fork that outside.
     """
     rng, n = torch.Generator().manual_seed(seed), len(sweeps)
     rounds = -(-recipe.steps * recipe.batch // n)
@@ -124,7 +112,7 @@ def learn(
     picks, cost = order.split(recipe.batch), []
     model.train().dropout = recipe.dropout
     for step, (pick, digits) in enumerate(zip(picks, tensors(sweeps.samples, picks), strict=True), 1):
-        x = augment(model.prepare(digits), model.form.rows, recipe, rng).to(device)
+        x = unsettled(vary(model.prepare(digits), rng), recipe, rng).to(device)
         optimizer.zero_grad()
         with torch.autocast(device, torch.bfloat16, enabled=bfloat16):
             cost.append((step, descend(model, x, labels[pick].to(device), recipe)))

@@ -21,7 +21,7 @@ from appliance.errors import FormatError
 from .sets import SweepSet
 
 Array = NDArray[Any]
-ROOMS = ("baselines", "related", "sthmp", "minirocket", "nets")
+ROOMS = ("baselines", "related", "sthmp", "minirocket", "nets", "family")
 """Modules of this package that each hold METHODS, or methods(effort) where they train networks."""
 
 
@@ -42,7 +42,11 @@ USUAL = Effort()
 
 
 class Model(Protocol):
-    """A trained method. K: number of the training set's materials, whether or not each occurred in training."""
+    """A trained method. K: number of the training set's materials, whether or not each occurred in training.
+
+    It may have more to tell, each by a name that fold.py knows: `ran`, `cost`, and `forms`, the same model in other
+    precisions as Models by name.
+    """
 
     def logits(self, given: Array) -> Array:
         """What the method's `input` asks for, of n sweeps -> float32 [n, K]; their softmax are honest probabilities.
@@ -84,6 +88,11 @@ def every(effort: Effort = USUAL) -> dict[str, Method]:
     """All methods by name."""
     rooms = [import_module(f"{__package__}.{room}") for room in ROOMS]
     return {method.name: method for room in rooms for method in _of(room, effort)}
+
+
+def home(name: str) -> str:
+    """The room that holds the method `name`, which is known."""
+    return next(room for room in ROOMS if name in {m.name for m in _of(import_module(f"{__package__}.{room}"), USUAL)})
 
 
 def find(names: Sequence[str], effort: Effort = USUAL) -> list[Method]:

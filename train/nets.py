@@ -1,41 +1,43 @@
-"""The room of neural methods. In: an Effort. Out: the METHODS paper-cnn, tactnet2, recurrent and compact.
+"""The room of neural methods. In: an Effort. Out: the METHODS paper-cnn, tactnet2 and recurrent.
 
-All four are networks of train/networks.py, trained by the one loop of train/loop.py on the materials that occur in
+All are networks of train/networks.py, trained by the one loop of train/loop.py on the materials that occur in
 training; a material that does not occur gets a logit that no sweep can lift.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from appliance.errors import FormatError
 from appliance.sweep import SweepFormat
 
-from .fit import fit_on, hold_out, temperature, texture_scale
+from .graphs import Graphed
+from .heads import hold_out, temperature
 from .loop import Cost, Log, Recipe, in_order, learn, one_thread, silent, tensors
-from .methods import USUAL, Effort, Method
-from .networks import PAPER, TACTNET2, ImageNetwork, Network, Recurrent
+from .methods import USUAL, Effort, Method, Model
+from .networks import PAPER, TACTNET2, ImageNetwork, Network, Recurrent, texture_scale
+from .quantize import quantize
 from .sets import SweepSet
 
 Array = NDArray[Any]
-ABSENT = -30.0
-"""Logit of a material that training never saw; the mean of the others is 0, so its probability is below 1e-12."""
+Rules = TypeVar("Rules", bound=Recipe)
 PAPER_STEPS, PROCESSOR_STEPS = 4000, 200
 """Iterations of the paper's CNN: the paper's (table I) on a GPU; fewer on a processor, where one core needs about a
 second and a half for each."""
 PAPER_RECIPE = Recipe(batch=50, peak_rate=1e-4, weight_decay=0.0, smoothing=0.0, ema=0.0, dropout=0.25, noise=0.0,
                       gain=0.0, cycle=False)  # fmt: skip
 """As printed (section IV.D); its p_d = .75 is the share that is kept."""
+PAPER_INT8 = ("Conv", "Relu", "MaxPool", "Gemm")
+"""Nodes of the paper's CNN that its int8 form has in int8."""
 TACTNET2_RECIPE = Recipe(steps=120, batch=32, peak_rate=2e-3, smoothing=0.0, ema=0.9, dropout=0.5, noise=0.0, gain=0.0,
                          adversarial=0.01)  # fmt: skip
 """Adversarial training as in Goodfellow et al. 2015, half of the cost; dropout as in Gal and Ghahramani 2016. The
@@ -43,21 +45,21 @@ numbers are ours, so that one core needs about half a minute for 480 sweeps; far
 positions held out inside a training set."""
 RECURRENT_RECIPE = Recipe(steps=400)
 """As the compact network's, with half the iterations."""
-COMPACT_RECIPE = Recipe()
 LEAST_STEPS = 2
 """However small the effort is."""
-GRID_SHIFT = 0.5
-"""Share of the training sweeps that `compact` moves by one row of taxels, where the taxels form a grid (as the bundle
-of the box does); in a line of taxels there is no row to be off by."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained network as a Model. ran: what was computed, and how. cost: (iteration, cross entropy) in training."""
+    """A trained network as a Model. ran: what was computed, and how. cost: (iteration, cross entropy) in training.
+
+    forms: the same in other precisions.
+    """
 
     network: Network
     ran: str
     cost: Cost = field(default_factory=list)
+    forms: Mapping[str, Model] = field(default_factory=dict)
 
     @torch.no_grad()
     def logits(self, given: Array) -> Array:
@@ -79,6 +81,11 @@ def paper_cnn(form: SweepFormat, classes: int, samples: Array) -> Network:
     15,891,910 parameters for 1500 x 4 x 4 and six materials.
     """
     return ImageNetwork(form, classes, *_statistics(samples), PAPER)
+
+
+def paper_cnn_centred(form: SweepFormat, classes: int, samples: Array) -> Network:
+    """The paper's CNN behind a layer that takes each taxel's mean away, as in the compact network."""
+    return ImageNetwork(form, classes, texture_scale(samples), None, PAPER)
 
 
 def tactnet2(form: SweepFormat, classes: int, samples: Array) -> Network:
@@ -111,60 +118,35 @@ def train_network(
     calibrated: bool,
     bfloat16: bool,
     log: Log,
+    int8: Sequence[str] = (),
 ) -> Trained:
     """Train what `build` gives. calibrated: hold some groups out for the temperature; else all are trained on, with 1.
 
+    int8: kinds of nodes that the form "int8" has in int8; where there are none there is no such form.
     Raises FormatError where only one material occurs.
     """
     known = replace(sweeps, samples=given).select(())
-    train, held = _parts(known, seed)[:2] if calibrated else (known, known)
+    train, held = parts(known, seed)[:2] if calibrated else (known, known)
     with _computing(seed) as device:
         half = bfloat16 and (device == "cuda" or bool(torch.cpu.get_capabilities().get("avx512_bf16")))
         network = build(train.format, len(train.materials), train.samples)
         network, cost = learn(network, train, recipe, seed, log, device, half)
-        trained = Trained(network, _ran(recipe, device, half, bfloat16), cost)
+        trained = Trained(network, ran(recipe, device, half, bfloat16), cost)
     cooler = temperature(trained.logits(held.samples), held.labels) if calibrated else 1.0
-    _spread(network, np.unique(sweeps.labels), len(sweeps.materials), cooler)
-    return trained
+    network.spread(np.unique(sweeps.labels), len(sweeps.materials), cooler)
+    return replace(trained, forms={"int8": Graphed(quantize(network.graph(), train.samples, int8))} if int8 else {})
 
 
-def train_compact(sweeps: SweepSet, given: Array, seed: int, *, steps: int, log: Log) -> Trained:
-    """Train the compact network and its closed-form head, as `palpate-train fit` does.
-
-    Raises FormatError where only one material occurs, each only once, or a window is too short.
-    """
-    known = replace(sweeps, samples=given).select(())
-    line = 1 in (known.format.rows, known.format.cols)
-    recipe = replace(COMPACT_RECIPE, steps=steps, row_shift=0.0 if line else GRID_SHIFT)
-    made = fit_on(*_parts(known, seed), seed, recipe, log)
-    network = made.network()
-    _spread(network, np.unique(sweeps.labels), len(sweeps.materials), 1.0)
-    return Trained(network, _ran(recipe, "cpu", False, False), made.cost)
-
-
-def _parts(sweeps: SweepSet, seed: int) -> tuple[SweepSet, SweepSet, str]:
-    """As fit.hold_out; too small a set is trained on whole, and there Platt's doubt alone bounds the temperature."""
+def parts(sweeps: SweepSet, seed: int) -> tuple[SweepSet, SweepSet, str]:
+    """As heads.hold_out; too small a set is trained on whole, and there Platt's doubt alone bounds the temperature."""
     try:
         return hold_out(sweeps, seed)
     except FormatError:
         return sweeps, sweeps, "nothing"
 
 
-@torch.no_grad()
-def _spread(network: Network, present: Array, classes: int, cooler: float) -> None:
-    """Give `network` a head for all `classes`, of which it learnt `present`; its logits are divided by `cooler`.
-
-    Moved so that the logits that were learnt add up to 0: no softmax changes, and ABSENT lies far below the largest.
-    """
-    old, new = network.head, nn.utils.skip_init(nn.Linear, network.head.in_features, classes)  # draws nothing
-    new.weight.zero_()
-    new.bias.fill_(ABSENT)
-    new.weight[present] = (old.weight - old.weight.mean(0)) / cooler
-    new.bias[present] = (old.bias - old.bias.mean()) / cooler
-    network.head = new
-
-
-def _ran(recipe: Recipe, device: str, half: bool, wanted: bool) -> str:
+def ran(recipe: Recipe, device: str, half: bool, wanted: bool) -> str:
+    """What was computed, and how."""
     digits = "bfloat16" if half else "float32 (no bfloat16 here)" if wanted else "float32"
     return f"{recipe.steps} iterations of {recipe.batch} in {digits} on {device}"
 
@@ -178,29 +160,29 @@ def _computing(seed: int) -> Iterator[str]:
         yield "cuda" if torch.cuda.is_available() else "cpu"
 
 
+def shortened(recipe: Rules, effort: Effort) -> Rules:
+    """`recipe` with as many iterations as `effort` asks for."""
+    return replace(recipe, steps=max(round(recipe.steps * effort.share), LEAST_STEPS))
+
+
 def methods(effort: Effort = USUAL, log: Log = silent) -> tuple[Method, ...]:
     """The neural methods, trained with this effort. log: is told of every iteration."""
     steps = effort.paper_steps
     if steps is None:
         steps = round((PAPER_STEPS if torch.cuda.is_available() else PROCESSOR_STEPS) * effort.share)
 
-    def network(name: str, about: str, build: Build, recipe: Recipe, calibrated: bool = True) -> Method:
+    def network(name: str, about: str, build: Build, recipe: Recipe, printed: bool = False) -> Method:
         return Method(name, about, "raw", partial(
-            train_network, build=build, recipe=recipe, calibrated=calibrated, log=log,
-            bfloat16=(half := effort.bfloat16 and build is paper_cnn),
+            train_network, build=build, recipe=recipe, calibrated=not printed, log=log,
+            bfloat16=(half := effort.bfloat16 and printed), int8=PAPER_INT8 if printed else (),
         ), effort=f"{recipe.steps} iterations{', bfloat16' * half}")  # fmt: skip
 
-    def shared(recipe: Recipe) -> Recipe:
-        return replace(recipe, steps=max(round(recipe.steps * effort.share), LEAST_STEPS))
-
     paper = replace(PAPER_RECIPE, steps=max(steps, LEAST_STEPS))
-    compact = partial(train_compact, steps=shared(COMPACT_RECIPE).steps, log=log)
     return (
-        network("paper-cnn", f"the paper's CNN on raw digits (section IV), {paper.steps} iterations", paper_cnn, paper, False),
-        network("tactnet2", "TactNet-II as far as it is known (Tulbure and Baeuml 2018)", tactnet2, shared(TACTNET2_RECIPE)),
-        network("recurrent", "gated recurrent unit over patches, the paper's future work", recurrent, shared(RECURRENT_RECIPE)),
-        Method("compact", "the box's own small network with a closed-form head", "raw", compact,
-               effort=f"{compact.keywords['steps']} iterations"),
+        network("paper-cnn", f"the paper's CNN on raw digits (section IV), {paper.steps} iterations", paper_cnn, paper, True),
+        network("paper-cnn-centred", "the same behind each taxel's mean, which it need not unlearn", paper_cnn_centred, paper, True),
+        network("tactnet2", "TactNet-II as far as it is known (Tulbure and Baeuml 2018)", tactnet2, shortened(TACTNET2_RECIPE, effort)),
+        network("recurrent", "gated recurrent unit over patches, the paper's future work", recurrent, shortened(RECURRENT_RECIPE, effort)),
     )  # fmt: skip
 
 

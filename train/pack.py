@@ -22,13 +22,15 @@ import torch
 from numpy.typing import NDArray
 
 from appliance import bundle
-from appliance.classifier import Classifier, session, softmax
+from appliance.classifier import Classifier, softmax
 from appliance.clock import SystemClock
 from appliance.errors import BundleError
 from appliance.sweep import Frames, Status, Sweep
 
-from .fit import figure, hold_out
+from .graphs import run
+from .heads import hold_out
 from .methods import Method, given
+from .score import figure
 from .sets import SweepSet
 
 Array = NDArray[Any]
@@ -91,12 +93,6 @@ def trained(method: Method, sweeps: SweepSet, seed: int) -> Content:
     model = method.train(train, given(method.input, train), seed)
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
     return Content(model.graph(), method.input, train, held, by, about)
-
-
-def run(model: onnx.ModelProto, inputs: Array) -> Array:
-    """What `model` gives for each of `inputs` (digits or features), float32 [n, size], in the box's kind of session."""
-    of_the_box, name = session(model.SerializeToString()), model.graph.input[0].name
-    return np.concatenate([of_the_box.run(None, {name: one[None]})[0] for one in inputs])
 
 
 def golden_sweeps(sweeps: SweepSet, logits: Array) -> bytes:

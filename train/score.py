@@ -63,6 +63,12 @@ def fused(logits: Array, together: Array) -> tuple[Array, Array]:
     return scores, first
 
 
+def figure(right: int, n: int) -> dict[str, Any]:
+    """An accuracy with n and its 95 % Wilson interval."""
+    low, high = wilson(right, n)
+    return {"accuracy": round(right / n, 4), "n": n, "low": round(low, 4), "high": round(high, 4)}
+
+
 @cache
 def provenance() -> dict[str, str]:
     """What a result file says of its origin, beside its sets and seeds; the commit as it was when first asked for, since

@@ -22,10 +22,9 @@ from sklearn.svm import LinearSVC
 from appliance.errors import FormatError
 from appliance.sweep import SweepFormat
 
-from .graphs import Graph
+from .graphs import Graph, run
 from .headed import Headed, headed
 from .methods import Method
-from .pack import run
 from .sets import SweepSet
 
 Array = NDArray[Any]

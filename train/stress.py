@@ -88,7 +88,7 @@ def run(
     Raises FormatError as `one`, and for an unknown method.
     """
     about = [digest(train), digest(trial.sweeps), trial.scene is not None]
-    tasks = {(method.name, seed): fingerprint([*about, method.name, method.effort, seed], "stress", "stresses", "trial")
+    tasks = {(method.name, seed): fingerprint([*about, method.name, method.effort, seed], methods.home(method.name), "stress")
              for method in methods.find(names, effort) for seed in seeds}  # fmt: skip
     paths = {task: where.cache / f"{key}.json" for task, key in tasks.items() if where.cache}
     done = {task: json.loads(path.read_text()) for task, path in paths.items() if path.exists()}
