@@ -15,15 +15,17 @@ from contextlib import ExitStack
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from . import __version__, bundle, config
+from . import bundle, config
+from .arguments import parser
 from .box import Box, World
 from .capture import CaptureWriter, Playback, keeper
 from .check import check
 from .classifier import Classifier
-from .clock import SystemClock
+from .clock import Clock, SystemClock
 from .config import Config
+from .early import Decider
 from .errors import ApplianceError, ConfigError, FormatError
 from .lines import Lines
 from .recorder import Recorder
@@ -35,14 +37,10 @@ from .trigger import GpioTrigger
 if TYPE_CHECKING:
     from .sim.stage import SimWorld
 
-EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments;
-3 configuration; 4 bundle; 6 gpio lines; 8 a file of another form; 130 interrupted. A skin or a serial port that is not
-there ends nothing: it is waited for, and `check` names it"""
-
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command; its exit code."""
-    args = _parser().parse_args(argv)
+    args = parser(RUNS).parse_args(argv)
     try:
         code: int = args.run(args)
         sys.stdout.flush()
@@ -59,46 +57,6 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as e:
         print(f"palpate: {e.filename or 'a file'}: {e.strerror}; check its path and who may use it", file=sys.stderr)
         return 1
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        "palpate", description="Names the material a robot has just touched.", epilog=EXIT_CODES
-    )
-    parser.add_argument("--version", action="version", version=f"palpate {__version__}")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--board", help="board file to use: firmware_config/board-NAME.toml")
-    common.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one value")
-    common.add_argument("--config-dir", type=Path, metavar="DIR", help="where sensor.toml and the board files are")
-    world = argparse.ArgumentParser(add_help=False)
-    world.add_argument(
-        "--sim", metavar="skin|replay:FILE", help="simulated tubes, or a sweep set, instead of the devices"
-    )
-    world.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
-    world.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
-    world.add_argument("--sweeps", type=int, metavar="N", help="stop after N answers")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def add(name: str, run: Callable[[argparse.Namespace], int], text: str, *parents: argparse.ArgumentParser) -> Any:
-        command = commands.add_parser(name, help=text, description=text, parents=[common, *parents], epilog=EXIT_CODES)
-        command.set_defaults(run=run)
-        return command
-
-    run = add("run", run_box, "classify sweeps until SIGTERM", world)
-    run.add_argument("--capture", type=Path, metavar="FILE", help="write everything that comes in to FILE, for replay")
-    run.add_argument("--keep", type=Path, metavar="DIR", help="save the window of each sweep to DIR, for replay")
-    demo = add("demo", run_demo, "watch simulated sweeps being classified", world)
-    demo.add_argument("--raw", action="store_true", help="print the sentences alone")
-    add("check", run_check, "self-test: bundle, golden sweeps, devices", world)
-    add("replay", run_replay, "play a capture or a saved sweep through the same rooms").add_argument("file", type=Path)
-    add("config", run_config, "print each value with its source")
-    bench = add("bench", run_bench, "measure latency, memory, start and processor share on this machine")
-    bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
-    bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")
-    bench.add_argument("--yardsticks", type=Path, default=Path("build/yardsticks"), help="fp32.onnx, paper_int8.onnx")
-    bench.add_argument("--part", choices=("memory", "stream"), help="one part alone, as JSON, playing --acts")
-    bench.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
-    return parser
 
 
 def _settings(args: argparse.Namespace) -> tuple[Config, bundle.Bundle]:
@@ -136,16 +94,16 @@ def _log(line: str) -> None:
 def build(
     settings: Config, model: bundle.Bundle, world: World, port: Port, stack: ExitStack, *,
     capture: CaptureWriter | None = None, keep: Callable[[Sweep], None] | None = None,
-    log: Callable[[str], None] = lambda line: None, also: Iterable[ResultSink] = (),
+    log: Callable[[str], None] = lambda line: None, also: Iterable[ResultSink] = (), labels: tuple[str, ...] = (),
 ) -> Box:  # fmt: skip
-    """Put the parts together; `stack` takes them apart again."""
+    """Put the parts together; `stack` takes them apart again. labels: what class bits must hold beside the bundle's."""
     settings = world.wire(settings)
     missing = next((k for k in ("start", "stop") if not getattr(settings.trigger, k)), None)
     if missing == "start" or (missing and settings.trigger.mode == "two-lines"):
         raise ConfigError(
             f"trigger.{missing} names no line, so no sweep can be cut; choose a board with --board, or use --sim"
         )
-    classifier = Classifier(model, world.clock, settings.classifier.fuse)
+    classifier = _classifier(settings, model, world.clock)
     classifier.self_test()
     trigger = stack.enter_context(GpioTrigger(settings.trigger, world.gpio))
     lines = stack.enter_context(Lines(settings.output, world.gpio, world.clock))
@@ -154,12 +112,28 @@ def build(
     stack.callback(port.close)
     sinks: list[ResultSink] = [port, *also]
     if settings.output.class_bits:
-        sinks.append(LineSink(lines, model.manifest.labels))
+        sinks.append(LineSink(lines, (*model.manifest.labels, *labels)))
     return Box(
-        sensor, trigger, Recorder(model.format, settings.sweep), classifier, world.clock, sinks=sinks,
+        sensor, trigger, Recorder(model.format, settings.sweep), classifier, world.clock,
+        early=_early(settings, classifier), sinks=sinks,
         port=port, panel=lines, state_s=settings.serial.state_s, source=world.source, log=log,
         tap=capture, keep=keep,
     )  # fmt: skip
+
+
+def _classifier(settings: Config, model: bundle.Bundle, clock: Clock) -> Classifier:
+    how = settings.classifier
+    return Classifier(model, clock, how.fuse, how.sure, how.most_sweeps)
+
+
+def _early(settings: Config, classifier: Classifier) -> Decider | None:
+    return Decider(classifier) if settings.classifier.early else None
+
+
+def _port(settings: Config, world: World) -> Port:
+    if settings.serial.port:
+        return SerialSink(settings.serial, world.clock, world.source)
+    return StdoutPort(world.source)
 
 
 def _stop_flag() -> Callable[[], bool]:
@@ -176,14 +150,11 @@ def run_box(args: argparse.Namespace) -> int:
     world = _world(args, lambda: model.format)
     stopped = _stop_flag()
     with ExitStack() as stack:
-        port: Port = StdoutPort(world.source)
-        if settings.serial.port:
-            port = SerialSink(settings.serial, world.clock, world.source)
         capture = CaptureWriter(args.capture, model.format, _log) if args.capture else None
         if capture:
             stack.callback(capture.close)
         keep = keeper(args.keep, model.format, _log) if args.keep else None
-        box = build(settings, model, world, port, stack, capture=capture, keep=keep, log=_log)
+        box = build(settings, model, world, _port(settings, world), stack, capture=capture, keep=keep, log=_log)
 
         def done() -> bool:
             enough = args.sweeps is not None and box.answered >= args.sweeps
@@ -221,20 +192,53 @@ def run_check(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
+def run_enrol(args: argparse.Namespace) -> int:
+    """`palpate enrol`: the box takes sweeps as always; of the good ones it makes a bundle with one label more."""
+    from . import enrol
+
+    settings, model = _settings(args)
+    settings = replace(settings, classifier=replace(settings.classifier, early=False))  # whole windows are wanted
+    enrol.admit(model, args.label)
+    enrol.check_place(args.out, args.replace)
+    world = _world(args, lambda: model.format)
+    stopped = _stop_flag()
+    with ExitStack() as stack:
+        taken = enrol.Taken(args.good, _log)
+        port = _port(settings, world)
+        box = build(
+            settings, model, world, port, stack, keep=taken.keep, log=_log, also=[taken], labels=(args.label,)
+        )  # fmt: skip
+        box.run(lambda: taken.enough or stopped() or world.finished(box.answered))
+    new = enrol.enrol(model, args.label, taken.windows())
+    for warning in new.warnings:
+        _log(f"warning: {warning}")
+    enrol.write(new.files, args.out, args.replace)
+    m = new.bundle.manifest
+    _log(f"{args.out}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)} labels; use it with classifier.bundle")
+    return 0
+
+
 def run_replay(args: argparse.Namespace) -> int:
     """`palpate replay`: all sentences of a capture, or that of one saved sweep."""
     settings, model = _settings(args)
     if args.file.suffix == ".npy":
         sweep, fmt = load(args.file)
         _same(args.file, fmt, model)
-        sys.stdout.buffer.write(result(Classifier(model, SystemClock())(sweep), "replay"))
+        classifier = _classifier(settings, model, SystemClock())
+        verdict = classifier(sweep) if sweep.share == 1 else Decider(classifier)(sweep)
+        if verdict is None:
+            raise FormatError(
+                f"{args.file} was answered early, which this bundle does not do; name the one it was kept with"
+            )
+        sys.stdout.buffer.write(result(verdict, "replay"))
         return 0
     play = Playback(args.file)
     _same(args.file, play.format, model)
-    classifier = Classifier(model, play, settings.classifier.fuse)
+    classifier = _classifier(settings, model, play)
     port = StdoutPort("replay", play.commands)
     recorder = Recorder(model.format, settings.sweep)
-    box = Box(play, play, recorder, classifier, play, sinks=[port], port=port, source="replay")
+    early = _early(settings, classifier)
+    box = Box(play, play, recorder, classifier, play, early=early, sinks=[port], port=port, source="replay")
     box.run(lambda: play.finished)
     return 0
 
@@ -278,6 +282,11 @@ def run_bench(args: argparse.Namespace) -> int:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
     return 0
 
+
+RUNS = {
+    "run": run_box, "demo": run_demo, "check": run_check, "enrol": run_enrol,
+    "replay": run_replay, "config": run_config, "bench": run_bench,
+}  # fmt: skip
 
 if __name__ == "__main__":
     sys.exit(main())

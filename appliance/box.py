@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from .classifier import Classifier
 from .clock import Clock
 from .config import Config
+from .early import Decider
 from .errors import ApplianceError
 from .recorder import Recorder
 from .sensor import Sensor, Tally
 from .sink import Command, Port, ResultSink, sentence
-from .sweep import Status, Sweep, Verdict
+from .sweep import Status, Sweep, SweepFormat, Verdict
 from .trigger import Edge, Trigger
 
 TARE_S = 0.5
@@ -29,8 +30,8 @@ TARE_S = 0.5
 class Panel(Protocol):
     """The lines that tell the robot how the box is."""
 
-    def show(self, *, ready: bool, busy: bool, fault: bool) -> None:
-        """Drive READY, BUSY and FAULT."""
+    def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
+        """Drive READY, BUSY, FAULT and DECIDED."""
         ...
 
 
@@ -70,21 +71,24 @@ class World:
 class Box:
     """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer, listen.
 
-    port: where commands come from and state sentences go, or None. panel: READY, BUSY, FAULT, or None.
+    early: answers sweeps that still go on, or None. panel: READY, BUSY, FAULT, DECIDED, or None.
+    port: where commands come from and state sentences go, or None.
     tap: takes note of edges and commands, for captures. keep: called with each sweep, for recordings.
     """
 
     def __init__(
         self, sensor: Sensor, trigger: Trigger, recorder: Recorder, classifier: Classifier, clock: Clock, *,
+        early: Decider | None = None,
         sinks: Sequence[ResultSink] = (), port: Port | None = None, panel: Panel | None = None,
         state_s: float = 1.0, source: str = "usb", log: Callable[[str], None] = lambda line: None,
         tap: Tap | None = None, keep: Callable[[Sweep], None] | None = None,
     ) -> None:  # fmt: skip
         self.answered = 0
         self._sensor, self._trigger, self._recorder, self._classifier = sensor, trigger, recorder, classifier
-        self._clock, self._sinks, self._port, self._panel = clock, sinks, port, panel
+        self._early, self._clock, self._sinks, self._port, self._panel = early, clock, sinks, port, panel
+        self._decided = False
         self._state_ns, self._source, self._log = round(state_s * 1e9), source, log
-        self._tap, self._keep = tap, keep
+        self._tap, self._keep = tap, keep or (lambda sweep: None)
         self._next_state_ns = clock.now_ns()
         self._troubles: dict[str, str] = {}
 
@@ -92,6 +96,11 @@ class Box:
     def tally(self) -> Tally:
         """What the sensor has counted since the start."""
         return self._sensor.tally
+
+    @property
+    def format(self) -> SweepFormat:
+        """The form of the sweeps that it takes."""
+        return self._classifier.bundle.format
 
     def newest_frame(self) -> NDArray[Any] | None:
         """The newest frame [R, C] of digits, None before the first."""
@@ -110,29 +119,56 @@ class Box:
         frames = self._sensor.read()
         now = self._clock.now_ns()
         self._recorder.put(frames, now)
+        # before the edges of this turn: a capture gives frames and edges in turns of their own
+        verdicts = self._decide(now)
         edges = self._trigger.edges(now)
         if self._tap and edges:
             self._tap.edges(now, edges)
-        able = self._sensor.state == "streaming" and not self._trigger.blind
-        self._recorder.trigger(edges, able, now)
+        self._recorder.trigger(edges, self._able, now)
         if self._sensor.state != "streaming":
             self._recorder.interrupt(Status.SENSOR_LOST, now)
-        if self._panel:
-            self._panel.show(ready=able and not self._recorder.sweeping, busy=self._recorder.sweeping, fault=not able)
-        verdicts = self._answer(self._recorder.finished(now))
+        self._show()
+        verdicts += self._answer(self._recorder.finished(now))
         self._report(now)
         return verdicts
+
+    @property
+    def _able(self) -> bool:
+        """True while a sweep could be taken."""
+        return self._sensor.state == "streaming" and not self._trigger.blind
+
+    def _show(self) -> None:
+        sweeping, able = self._recorder.sweeping, self._able
+        self._decided = self._decided and not sweeping
+        if self._panel:
+            self._panel.show(ready=able and not sweeping, busy=sweeping, fault=not able, decided=self._decided)
+
+    def _decide(self, now_ns: int) -> list[Verdict]:
+        """Answer the open sweep early, where that is wanted and possible."""
+        if not self._early:
+            return []
+        for sweep in self._recorder.so_far(self._early.steps, now_ns):
+            if verdict := self._early(sweep):
+                self._recorder.settle()
+                self._send(verdict)
+                self._decided = True
+                self._show()
+                self._keep(sweep)
+                return [verdict]
+        return []
 
     def _answer(self, sweeps: list[Sweep]) -> list[Verdict]:
         verdicts = [self._classifier(sweep) for sweep in sweeps]
         for verdict in verdicts:
-            for sink in self._sinks:
-                sink.send(verdict)
-        if self._keep:
-            for sweep in sweeps:
-                self._keep(sweep)
-        self.answered += len(verdicts)
+            self._send(verdict)
+        for sweep in sweeps:  # a disk takes its time, so after all answers
+            self._keep(sweep)
         return verdicts
+
+    def _send(self, verdict: Verdict) -> None:
+        for sink in self._sinks:
+            sink.send(verdict)
+        self.answered += 1
 
     def _report(self, now_ns: int) -> None:
         """Log what has changed, answer commands, say the state once in a while."""

@@ -12,6 +12,7 @@ from .box import World
 from .bundle import Bundle
 from .classifier import Classifier
 from .config import Config
+from .early import Decider
 from .errors import ApplianceError, PortError, SensorError
 from .lines import Lines
 from .sensor import UsbSensor
@@ -38,10 +39,14 @@ def check(settings: Config, load: Callable[[], Bundle], world: World) -> Iterato
     def bundle() -> str:
         loaded.append(load())
         m = loaded[0].manifest
-        return f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels"
+        enrolled = "".join(f", {label} enrolled from {n}" for label, n in loaded[0].enrolled.items())
+        return f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}"
 
     def golden() -> str:
-        worst = Classifier(loaded[0], world.clock).self_test()
+        classifier = Classifier(loaded[0], world.clock)
+        worst = classifier.self_test()
+        if settings.classifier.early:
+            Decider(classifier)
         return f"{len(loaded[0].golden)} sweeps, largest difference of a probability {worst:.2g}"
 
     yield _try("bundle", bundle)

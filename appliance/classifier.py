@@ -1,10 +1,12 @@
 """Bundle + Sweep -> Verdict: looks at the window before the network does, runs it, fuses the sweeps of one object.
 
-The graph takes the raw digits; nothing is scaled here. What is refused is refused by status, with its reason.
+The graph takes the raw digits; nothing is scaled here. What is refused is refused by status, with its reason: a faulty
+window, and a material that looks like none of those trained or enrolled.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,16 +15,18 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from . import features
-from .bundle import GOLDEN_TOLERANCE, Bundle, Thresholds
+from .bundle import GOLDEN_TOLERANCE, MEANS, Bundle, Thresholds
 from .errors import BundleError
+from .known import Means
 from .sweep import Status, Sweep, Verdict
 
 if TYPE_CHECKING:
     from .clock import Clock
 
 
+_NONE = np.empty(0)
 LEAST_PROBABILITY = 1e-12
-"""What a probability counts as at least when sweeps are fused: one that is sure beyond float64 cannot veto all others."""
+"""What a probability counts as at least when sweeps are fused: one sure beyond float64 cannot veto all others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,26 +95,47 @@ class Classifier:
     """Runs one bundle in one thread.
 
     Sweeps with the same `object` number above 0 are fused: a robot that never says NEW OBJECT gets each by itself.
-    Raises BundleError where onnxruntime refuses the model or its input and output are not the manifest's.
+    They are a sequential test: `unsure` asks for one more sweep of the object, until the probability is at least `sure`
+    (ok) or `most_sweeps` were fused (undecided: the answer is final). A robot that sweeps on all the same is answered
+    by the same rule, with all sweeps of the object in it: more evidence is never thrown away.
+    An unknown sweep takes no part in this. It has no probabilities that could be fused, and one touch beside the object
+    must not undo what the object's other sweeps said.
+
+    sure: 0 stands for the bundle's thresholds.unsure. most_sweeps: 0 for no limit.
+    Raises BundleError where onnxruntime refuses the model or its input and outputs are not the manifest's.
     """
 
-    def __init__(self, bundle: Bundle, clock: Clock, how: str = "product") -> None:
+    def __init__(
+        self, bundle: Bundle, clock: Clock, how: str = "product", sure: float = 0.0, most_sweeps: int = 0
+    ) -> None:
         self.bundle = bundle
-        self._clock = clock
-        self._how = how
+        self.sure = sure or bundle.manifest.thresholds.unsure
+        self._clock, self._how, self._most = clock, how, most_sweeps
         self._object = 0
         self._scores: list[NDArray[np.float64]] = []  # of the object's sweeps so far
         f = bundle.format
         self.tare: NDArray[np.float64] = np.zeros((f.rows, f.cols))
         self._session = session(bundle.model)
         self._input = _check_signature(self._session, bundle)
+        known, classes = bundle.manifest.known, bundle.classes
+        self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
+        # onnxruntime computes them all, but makes arrays only of those that are asked for
+        self._asked = ["logits"] * (not bundle.enrolled) + ["embedding"] * (self._means is not None)
 
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window [T, R, C] of digits."""
-        kind = self.bundle.manifest.input
-        given = features.given(kind, taxels, self.bundle.format.rate_hz)
-        result: NDArray[np.float32] = self._session.run(None, {self._input: given[None]})[0][0]
-        return result
+        return self._look(taxels)[0]
+
+    def early(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
+        """Logits float32 [D, K0] after each step of one window [T, R, C] of digits, of a model that has this output.
+
+        Frames that have not come yet may hold anything: the rows that need them mean nothing.
+        """
+        return self._run(["early"], taxels)[0]
+
+    def embedding(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
+        """Embedding float32 [r] of one window [T, R, C] of digits, of a model that has this output."""
+        return self._run(["embedding"], taxels)[0]
 
     def self_test(self) -> float:
         """Run the golden sweeps; the largest difference of a probability. Raises BundleError where a label differs."""
@@ -123,6 +148,19 @@ class Classifier:
                 f"golden sweeps {wrong.tolist()} get another label and probabilities differ by {worst:.3g} "
                 f"(limit {GOLDEN_TOLERANCE}): this machine does not run the model as it was exported"
             )
+        return max(worst, self._test_means(self._means)) if self._means else worst
+
+    def _test_means(self, means: Means) -> float:
+        """Whether the class means belong to the model: trained labels must come out as its own logits say."""
+        pairs = [self._run(["logits", "embedding"], g) for g in self.bundle.golden]
+        want = softmax(np.stack([logits for logits, _ in pairs]))
+        have = softmax(means.logits(means.distances(np.stack([z for _, z in pairs])))[:, : want.shape[1]])
+        worst = float(np.abs(have - want).max())
+        if not worst <= GOLDEN_TOLERANCE:
+            raise BundleError(
+                f"{MEANS} and the model's own logits differ by {worst:.3g} in a probability of the golden sweeps "
+                f"(limit {GOLDEN_TOLERANCE}): they are not of one training; export the bundle again"
+            )
         return worst
 
     def __call__(self, sweep: Sweep) -> Verdict:
@@ -131,17 +169,51 @@ class Classifier:
         if sweep.status is Status.OK:
             finding = inspect(sweep.frames.taxels, self.tare, self.bundle.manifest.thresholds)
         if finding.status is not Status.OK:
-            return self._verdict(sweep, finding, np.empty(0), 0)
+            return self._verdict(sweep, finding)
+        logits, strange = self._look(sweep.frames.taxels)
+        if strange:
+            return self._verdict(sweep, Finding(Status.UNKNOWN, strange))
+        return self.conclude(sweep, softmax(logits))
+
+    def conclude(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict:
+        """The verdict on a sound sweep with the probabilities `scores` [K], fused with its object's other sweeps."""
+        if math.isnan(scores[0]):  # softmax leaves all or none; digits of a float skin can overflow the network
+            return self._verdict(sweep, Finding(Status.UNKNOWN, "the model gives no number"))
         if sweep.object == 0 or sweep.object != self._object or self._how == "none":
             self._object, self._scores = sweep.object, []
-        self._scores.append(softmax(self.logits(sweep.frames.taxels)))
+        self._scores = [*self._scores, scores]
         fused = len(self._scores)
-        scores = fuse(self._scores, self._how) if fused > 1 else self._scores[0]
-        if scores.max() < self.bundle.manifest.thresholds.unsure:
-            finding = Finding(Status.UNSURE)
-        return self._verdict(sweep, finding, scores, fused)
+        if fused > 1:
+            scores = fuse(self._scores, self._how)
+        status = Status.OK
+        if scores.max() < self.sure:
+            status = Status.UNDECIDED if 0 < self._most <= fused else Status.UNSURE
+        return self._verdict(sweep, Finding(status), scores, fused)
 
-    def _verdict(self, sweep: Sweep, finding: Finding, scores: NDArray[np.float64], fused: int) -> Verdict:
+    def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
+        """As `conclude` where that gives ok; else None, and the sweep does not count: it goes on."""
+        before = self._object, self._scores
+        verdict = self.conclude(sweep, scores)
+        if verdict.status is Status.OK:
+            return verdict
+        self._object, self._scores = before
+        return None
+
+    def _run(self, outputs: list[str], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
+        """These outputs of the graph for one window, without the leading 1."""
+        given = features.given(self.bundle.manifest.input, taxels, self.bundle.format.rate_hz)
+        return [out[0] for out in self._session.run(outputs, {self._input: given[None]})]
+
+    def _look(self, taxels: NDArray[Any]) -> tuple[NDArray[np.float32], str]:
+        """Logits [K] of one window, and how strange it is: "" where it looks like a material that is known."""
+        gives = self._run(self._asked, taxels)
+        if self._means is None:
+            return gives[0], ""
+        distances = self._means.distances(gives[-1])
+        logits = self._means.logits(distances) if len(self._asked) == 1 else gives[0]
+        return logits, self._means.strange(distances)
+
+    def _verdict(self, sweep: Sweep, finding: Finding, scores: NDArray[np.float64] = _NONE, fused: int = 0) -> Verdict:
         label, best, second = "", 0.0, 0.0
         if len(scores):
             order = np.argsort(scores)
@@ -150,7 +222,7 @@ class Classifier:
         return Verdict(
             sweep=sweep.id, time_ns=now, status=finding.status, label=label, probability=float(best),
             margin=float(best - second), scores=scores, fused=fused, lost=sweep.lost,
-            latency_ns=now - sweep.complete_ns, bundle=self.bundle.id, detail=finding.detail,
+            latency_ns=now - sweep.complete_ns, bundle=self.bundle.id, detail=finding.detail, share=sweep.share,
         )  # fmt: skip
 
 
@@ -169,7 +241,7 @@ def session(model: bytes) -> ort.InferenceSession:
 
 
 def _check_signature(run: ort.InferenceSession, bundle: Bundle) -> str:
-    """The name of the one input, after its shape and type were compared with the manifest."""
+    """The name of the one input, after all shapes and types were compared with the manifest."""
     m, f = bundle.manifest, bundle.format
     if m.input == "raw":
         tensor = {
@@ -182,10 +254,28 @@ def _check_signature(run: ort.InferenceSession, bundle: Bundle) -> str:
     else:
         want = [([1, len(features.compute(m.input, bundle.golden[0], f.rate_hz))], "tensor(float)")]
     have = [(i.shape, i.type) for i in run.get_inputs()]
-    gives = [(o.shape, o.type) for o in run.get_outputs()]
-    if have != want or gives != [([1, len(m.labels)], "tensor(float)")]:
+    if have != want:
+        raise BundleError(f"the model takes {have}; the manifest asks for {want}")
+    gives = {o.name: (o.shape, o.type) for o in run.get_outputs()}
+    trained = len(m.labels) - len(bundle.enrolled)
+    forms: dict[str, list[int | None]] = {  # None: any number
+        "logits": [1, trained],
+        "early": [1, len(m.early.least) if m.early else None, trained],
+        "embedding": [1, bundle.classes.means.shape[1] if bundle.classes else None],
+    }
+    needed = {"logits"} | ({"early"} if m.early else set()) | ({"embedding"} if m.known else set())
+    if not needed <= gives.keys() <= forms.keys() or not all(_fits(gives[name], forms[name]) for name in gives):
         raise BundleError(
-            f"the model takes {have} and gives {gives}; the manifest asks for {want} and {len(m.labels)} logits"
+            f"the model gives {gives}; the manifest asks for {', '.join(sorted(needed))} and allows "
+            f"{forms} of tensor(float): export the bundle again"
         )
     name: str = run.get_inputs()[0].name
     return name
+
+
+def _fits(has: tuple[list[Any], str], form: list[int | None]) -> bool:
+    """Whether an output has this shape, None standing for any number."""
+    shape, kind = has
+    if kind != "tensor(float)" or len(shape) != len(form):
+        return False
+    return all(type(n) is int and n > 0 and want in (None, n) for n, want in zip(shape, form, strict=True))

@@ -13,22 +13,13 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 from .errors import ConfigError
+from .keys import Key, gpio_line, number
 
 SITE = Path("/etc/palpate/palpate.toml")
 """What the person who set up this robot has changed; may be missing."""
-
-_Number = TypeVar("_Number", int, float)
-
-
-def _number(default: _Number, least: _Number, most: _Number, **more: object) -> _Number:
-    return field(default=default, metadata={"least": least, "most": most, **more})
-
-
-def _line() -> str:
-    return field(default="", metadata={"line": True})
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +32,14 @@ class SensorConfig:
     lost after so long without a frame. retry_ms: how often a missing skin is looked for.
     """
 
-    vendor_id: int = _number(0x1209, 1, 0xFFFF, hex=True)
-    product_id: int = _number(0x7AC7, 1, 0xFFFF, hex=True)
+    vendor_id: int = number(0x1209, 1, 0xFFFF, hex=True)
+    product_id: int = number(0x7AC7, 1, 0xFFFF, hex=True)
     serial: str = ""
     link: Literal["vendor", "acm"] = "vendor"
-    read_bytes: int = _number(4096, 512, 1 << 20, step=512)
-    timeout_ms: int = _number(100, 1, 10_000)
-    silence_ms: int = _number(500, 1, 60_000)
-    retry_ms: int = _number(250, 1, 60_000)
+    read_bytes: int = number(4096, 512, 1 << 20, step=512)
+    timeout_ms: int = number(100, 1, 10_000)
+    silence_ms: int = number(500, 1, 60_000)
+    retry_ms: int = number(250, 1, 60_000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,39 +53,42 @@ class TriggerConfig:
     """
 
     mode: Literal["two-lines", "one-line"] = "two-lines"
-    start: str = _line()
-    stop: str = _line()
-    new_object: str = _line()
+    start: str = gpio_line()
+    stop: str = gpio_line()
+    new_object: str = gpio_line()
     active_low: bool = False
     bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
-    glitch_us: int = _number(500, 1, 1_000_000)
-    storm_edges: int = _number(2000, 2, 1_000_000)
+    glitch_us: int = number(500, 1, 1_000_000)
+    storm_edges: int = number(2000, 2, 1_000_000)
 
 
 @dataclass(frozen=True, slots=True)
 class OutputConfig:
-    """The box's lines to the robot: ready, busy, result_valid, fault as in PROTOCOL.md, part 3. "" is not wired.
+    """The box's lines to the robot: ready, busy, result_valid, fault, decided as in PROTOCOL.md, part 3. "" is not wired.
 
     class_bits: the answer's code, lowest bit first. settle_us: how long they stand before `result_valid` rises.
     """
 
-    ready: str = _line()
-    busy: str = _line()
-    result_valid: str = _line()
-    fault: str = _line()
+    ready: str = gpio_line()
+    busy: str = gpio_line()
+    result_valid: str = gpio_line()
+    fault: str = gpio_line()
+    decided: str = gpio_line()
     class_bits: tuple[str, ...] = field(default=(), metadata={"line": True})
-    settle_us: int = _number(200, 1, 1_000_000)
+    settle_us: int = number(200, 1, 1_000_000)
 
 
 @dataclass(frozen=True, slots=True)
 class SweepConfig:
     """What may be a sweep. longest_s: without a stop edge for so long the sweep is answered `long`.
 
-    late_ms: how long frames of the window may come after the stop edge.
+    late_ms: how long frames of the window may come after the stop edge. lead_ms: from the start edge to the first frame
+    of the window of early answers (500 is the middle of the paper's three seconds).
     """
 
-    longest_s: float = _number(12.0, 0.1, 3600.0)
-    late_ms: int = _number(500, 1, 60_000)
+    longest_s: float = number(12.0, 0.1, 3600.0)
+    late_ms: int = number(500, 1, 60_000)
+    lead_ms: int = number(500, 0, 60_000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,20 +99,25 @@ class SerialConfig:
     """
 
     port: str = ""
-    baud: int = _number(115200, 1200, 4_000_000)
-    queue: int = _number(64, 1, 65_536)
-    state_s: float = _number(1.0, 0.05, 3600.0)
+    baud: int = number(115200, 1200, 4_000_000)
+    queue: int = number(64, 1, 65_536)
+    state_s: float = number(1.0, 0.05, 3600.0)
 
 
 @dataclass(frozen=True, slots=True)
 class ClassifierConfig:
     """The network. bundle: a bundle's path, "" for the packaged one.
 
-    fuse: how the sweeps of one object become one answer; "none": they do not.
+    fuse: how the sweeps of one object become one answer; "none": they do not. early: answer while the finger still
+    slides, as soon as the bundle is sure. sure: least probability for status ok; 0 takes the bundle's own threshold.
+    most_sweeps: fused sweeps of one object without `sure` after which the answer is `undecided`; 0 is no limit.
     """
 
     bundle: str = ""
     fuse: Literal["product", "vote", "none"] = "product"
+    early: bool = False
+    sure: float = number(0.0, 0.0, 1.0)
+    most_sweeps: int = number(0, 0, 1000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,43 +137,10 @@ class Config:
     sources: Mapping[str, str] = field(compare=False)
 
 
-@dataclass(frozen=True, slots=True)
-class _Key:
-    """A field as a key of the files."""
-
-    hint: Any
-    default: Any
-    limits: Mapping[str, Any]
-
-    def fit(self, value: Any) -> Any:
-        """`value` as the field's type, or None where it is not allowed."""
-        if get_origin(self.hint) is Literal:
-            return value if value in get_args(self.hint) else None
-        if get_origin(self.hint) is tuple:
-            names = isinstance(value, list) and all(isinstance(v, str) and v for v in value)
-            return tuple(value) if names else None
-        if self.hint in (str, bool):
-            return value if type(value) is self.hint else None
-        if type(value) not in (int, self.hint) or not self.limits["least"] <= value <= self.limits["most"]:
-            return None
-        return None if "step" in self.limits and value % self.limits["step"] else self.hint(value)
-
-    @property
-    def allowed(self) -> str:
-        """What `fit` takes, for a person."""
-        if get_origin(self.hint) is Literal:
-            return "one of " + ", ".join(json.dumps(v) for v in get_args(self.hint))
-        if self.hint not in (int, float):
-            return {bool: "true or false", str: "a string in quotes"}.get(self.hint, 'names such as ["GPIO16"]')
-        kind = "a whole number" if self.hint is int else "a number"
-        kind = f"a multiple of {self.limits['step']}" if "step" in self.limits else kind
-        return f"{kind} from {self.limits['least']} to {self.limits['most']}"
-
-
 _SECTIONS: Mapping[str, Any] = MappingProxyType({n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)})
-_KEYS: Mapping[str, _Key] = MappingProxyType(
+_KEYS: Mapping[str, Key] = MappingProxyType(
     {
-        f"{section}.{f.name}": _Key(get_type_hints(group)[f.name], f.default, f.metadata)
+        f"{section}.{f.name}": Key(get_type_hints(group)[f.name], f.default, f.metadata)
         for section, group in _SECTIONS.items()
         for f in fields(group)
     }

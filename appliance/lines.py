@@ -1,5 +1,5 @@
-"""The lines room: GPIO by name. In: line names and the module gpiod. Out: requests, and READY, BUSY, FAULT, class bits,
-RESULT VALID as levels.
+"""The lines room: GPIO by name. In: line names and the module gpiod. Out: requests, and READY, BUSY, FAULT, DECIDED,
+class bits, RESULT VALID as levels.
 
 Everything goes through libgpiod v2; the module itself (`import gpiod`, or the simulator's double) is passed in.
 """
@@ -131,13 +131,13 @@ class Lines:
 
     def __init__(self, config: OutputConfig, gpio: Any, clock: Clock) -> None:
         check_binding(gpio)
-        self._ready, self._busy, self._fault = config.ready, config.busy, config.fault
+        self._panel = config.ready, config.busy, config.fault, config.decided
         self._valid, self._bits = config.result_valid, config.class_bits
         self._settle_ns = config.settle_us * 1000
         self._clock, self._value = clock, gpio.line.Value
-        names = [name for name in (self._ready, self._busy, self._fault, self._valid, *self._bits) if name]
+        names = [name for name in (*self._panel, self._valid, *self._bits) if name]
         self._levels = dict.fromkeys(names, False)
-        self._shown = False, False, False
+        self._shown = False, False, False, False
         settings = gpio.LineSettings(direction=gpio.line.Direction.OUTPUT, output_value=self._value.INACTIVE)
         with ExitStack() as stack:
             self._requests = request_lines(gpio, names, settings, stack)
@@ -148,14 +148,14 @@ class Lines:
         """How many codes the class bits can tell apart: 2 to the number of bits."""
         return 1 << len(self._bits)
 
-    def show(self, *, ready: bool, busy: bool, fault: bool) -> None:
-        """Drive READY, BUSY and FAULT; writes only what has changed. RESULT VALID falls when a sweep begins."""
-        if (ready, busy, fault) == self._shown:
+    def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
+        """Drive READY, BUSY, FAULT, DECIDED; writes only what has changed. RESULT VALID falls when a sweep begins."""
+        if (ready, busy, fault, decided) == self._shown:
             return
         if busy and not self._shown[1]:
             self.result(None)
-        self._shown = ready, busy, fault
-        self._write({self._ready: ready, self._busy: busy, self._fault: fault})
+        self._shown = ready, busy, fault, decided
+        self._write(dict(zip(self._panel, self._shown, strict=True)))
 
     def result(self, code: int | None) -> None:
         """Show a class: RESULT VALID falls, the class bits change, and `settle_us` later RESULT VALID rises.

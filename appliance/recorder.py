@@ -1,12 +1,13 @@
 """Ring of frames + trigger edges -> Sweep: one answer to each trigger, whatever becomes of it.
 
-In: Frames from the sensor, edges from the trigger. Out: Sweeps, whole windows or a status that says why there is none.
-The window is the middle of the sweep (paper, sec. II.B), found by time and cut by sequence number.
+In: Frames from the sensor, edges from the trigger. Out: Sweeps, whole windows or a status that says why there is none,
+and the open sweep so far, for early answers. The window is the middle of the sweep (paper, sec. II.B), found by time
+and cut by sequence number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,12 +24,17 @@ MAX_GAP = 2
 
 @dataclass(slots=True)
 class _Open:
-    """A sweep between its edges. answered: it has had its answer, only its stop edge is still awaited."""
+    """A sweep between its edges. answered: it has had its answer, only its stop edge is still awaited.
+
+    first: number of the first frame that counts for an early answer, once it is there. step: how often it was looked at.
+    """
 
     id: int
     object: int
     start_ns: int
     answered: bool = False
+    first: int | None = None
+    step: int = 0
 
 
 class Recorder:
@@ -37,7 +43,7 @@ class Recorder:
     def __init__(self, fmt: SweepFormat, config: SweepConfig) -> None:
         self._format = fmt
         self._longest_ns = round(config.longest_s * 1e9)
-        self._late_ns = config.late_ms * 1_000_000
+        self._late_ns, self._lead_ns = config.late_ms * 1_000_000, config.lead_ms * 1_000_000
         self._size = fmt.window + 2 * MAX_GAP + int((config.longest_s + config.late_ms / 1000 + 1) * fmt.rate_hz)
         # slot = seq % size: a frame's place is known without searching, and what was not overwritten is not lost
         self._seq = np.full(self._size, -1, np.int64)
@@ -109,6 +115,36 @@ class Recorder:
         done, self._done = self._done, []
         return sorted(done, key=lambda s: s.id)
 
+    def so_far(self, steps: int, now_ns: int) -> Iterator[Sweep]:
+        """The open sweep at each of its steps that has come since the last call, until `settle` says it is answered.
+
+        steps: D; step d = 1..D comes with frame ceil(d * window / (D + 1)) of the window that begins `lead_ms` after the
+        start edge, and gives a Sweep of just these frames. Which frames came together changes nothing. Beyond a gap that
+        cannot be filled there is no step.
+        """
+        sweep = self._open
+        while sweep and not sweep.answered and not self._closing and sweep.step < steps:
+            if sweep.first is None:
+                begin_ns = sweep.start_ns + self._lead_ns
+                if self._newest < 0 or self._t_ns[self._newest % self._size] < begin_ns:
+                    return
+                sweep.first = self._seq_at(begin_ns)
+            n = -(-(sweep.step + 1) * self._format.window // (steps + 1))
+            if self._newest < sweep.first + n - 1:
+                return
+            sweep.step += 1
+            frames, lost = self._window(sweep.first, n)
+            if len(frames):
+                yield Sweep(
+                    sweep.id, sweep.start_ns, int(frames.t_ns[-1]), Status.OK, frames, lost, now_ns, sweep.object,
+                    share=sweep.step / (steps + 1),
+                )  # fmt: skip
+
+    def settle(self) -> None:
+        """The open sweep has had an early answer: its stop edge will be silent."""
+        if self._open:
+            self._open.answered = True
+
     def latest(self, n: int) -> NDArray[Any] | None:
         """The newest `n` frames [n, R, C], for a tare; None where they are not all there."""
         window = np.arange(self._newest - n + 1, self._newest + 1)
@@ -147,20 +183,25 @@ class Recorder:
 
     def _cut(self, sweep: _Open, stop_ns: int, now_ns: int) -> Sweep | None:
         """The sweep with its window, or None while its frames may still come."""
-        fmt, pad = self._format, MAX_GAP
-        first = self._seq_at((sweep.start_ns + stop_ns) / 2) - fmt.window // 2
+        window = self._format.window
+        first = self._seq_at((sweep.start_ns + stop_ns) / 2) - window // 2
         late = now_ns > stop_ns + self._late_ns
-        if self._newest < first + fmt.window - 1 and not late:
+        if self._newest < first + window - 1 and not late:
             return None
-        seq = np.arange(first - pad, first + fmt.window + pad)
+        frames, lost = self._window(first, window)
+        status = Status.OK if len(frames) else Status.GAP
+        return Sweep(sweep.id, sweep.start_ns, stop_ns, status, frames, lost, now_ns, sweep.object)
+
+    def _window(self, first: int, n: int) -> tuple[Frames, int]:
+        """Frames `first` to `first + n` and how many of them are missing: filled, or no frames where a gap is too wide."""
+        pad = MAX_GAP
+        seq = np.arange(first - pad, first + n + pad)
         slots = seq % self._size
         have = np.flatnonzero((self._seq[slots] == seq) & (seq >= 0))
-        missing = np.setdiff1d(np.arange(pad, pad + fmt.window), have, assume_unique=True)
+        missing = np.setdiff1d(np.arange(pad, pad + n), have, assume_unique=True)
         frames = Frames(self._t_ns[slots], seq, self._taxels[slots])
-        status = Status.OK if interpolate(frames, have, missing) else Status.GAP
-        cut = slice(pad, pad + fmt.window) if status is Status.OK else slice(0)
-        frames = Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut])
-        return Sweep(sweep.id, sweep.start_ns, stop_ns, status, frames, len(missing), now_ns, sweep.object)
+        cut = slice(pad, pad + n) if interpolate(frames, have, missing) else slice(0)
+        return Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut]), len(missing)
 
     def _seq_at(self, t_ns: float) -> int:
         """Number of the frame taken nearest to `t_ns`, reckoned from the nearest frame that is there."""

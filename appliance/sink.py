@@ -83,7 +83,7 @@ def result(v: Verdict, source: str) -> bytes:
     """The RES sentence of a verdict; `source` says where the frames came from (usb, sim, replay)."""
     return sentence(
         "RES", v.sweep, f"{v.time_ns / 1e9:.3f}", v.status, v.label, f"{v.probability:.3f}", f"{v.margin:.3f}",
-        v.fused, v.lost, f"{v.latency_ns / 1e6:.2f}", v.bundle, source, v.detail,
+        v.fused, v.lost, f"{v.latency_ns / 1e6:.2f}", v.bundle, source, f"{v.share:.2f}", v.detail,
     )  # fmt: skip
 
 

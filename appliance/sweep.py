@@ -30,6 +30,8 @@ class Status(StrEnum):
 
     OK = "ok"
     UNSURE = "unsure"
+    UNDECIDED = "undecided"
+    UNKNOWN = "unknown"
     SHORT = "short"
     LONG = "long"
     GAP = "gap"
@@ -47,7 +49,7 @@ class Status(StrEnum):
     @property
     def classified(self) -> bool:
         """True where a label was computed."""
-        return self in (Status.OK, Status.UNSURE)
+        return self in (Status.OK, Status.UNSURE, Status.UNDECIDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +122,9 @@ class Frames:
 class Sweep:
     """One sweep as the recorder cut it. `frames` is the middle window where `status` is ok, and empty otherwise.
 
-    start_ns, stop_ns: trigger edges, host monotonic (equal where one is missing).
+    share: 1, or less for a sweep that still goes on: so much of a window's frames, counted from `sweep.lead_ms` after
+    the start edge; `frames` are these, all that there are.
+    start_ns, stop_ns: trigger edges, host monotonic (equal where one is missing; before the stop edge the last frame).
     lost: frames of the window that never came; where `status` is ok they were interpolated.
     complete_ns: when the last thing needed (stop edge or frame) was in hand.
     object: counts NEW OBJECT signals; 0 before the first, when sweeps stand alone and are not fused.
@@ -137,6 +141,7 @@ class Sweep:
     material: str = ""
     position: str = ""
     session: str = ""
+    share: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +150,8 @@ class Verdict:
 
     scores: float64 [C] probabilities of this sweep, or of all fused sweeps; empty where nothing was classified.
     margin: probability of the label minus that of the next one. detail: what the status is about ("taxel 2,3").
-    latency_ns: from `Sweep.complete_ns` to the verdict.
+    latency_ns: from `Sweep.complete_ns` to the verdict. share: how much of the window was used: less
+    than 1 in an early answer.
     """
 
     sweep: int
@@ -160,6 +166,7 @@ class Verdict:
     latency_ns: int
     bundle: str
     detail: str = ""
+    share: float = 1.0
 
 
 def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:

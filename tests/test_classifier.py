@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import toy
 from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance import bundle
-from appliance.bundle import Bundle, Thresholds
+from appliance.bundle import Bundle, Early, Thresholds
 from appliance.classifier import Classifier, fuse, inspect, softmax
 from appliance.errors import BundleError
 from appliance.sim import skin
@@ -269,3 +270,320 @@ def test_a_model_that_is_none_or_another(default_bundle: Bundle):
     manifest = replace(default_bundle.manifest, format=replace(skin.FORMAT, window=100))
     with pytest.raises(BundleError, match="the manifest asks for"):
         Classifier(replace(default_bundle, manifest=manifest), VirtualClock())
+
+
+EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
+KNOWN = {"limit": 9.0, "temperature": 2.0}
+
+
+def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **changes) -> Path:
+    """A toy bundle whose manifest says something else, or whose means.npz holds something else."""
+    folder = toy.put(tmp_path / "toy", toy.files())
+    if arrays is not None:
+        (folder / bundle.MEANS).write_bytes(toy.npz(**arrays))
+        files = json.loads((folder / bundle.MANIFEST).read_text())["files"]
+        changes["files"] = files | {bundle.MEANS: bundle.file_entry((folder / bundle.MEANS).read_bytes())}
+    edit(folder, **changes)
+    return folder
+
+
+def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bundle):
+    """Without the new fields; what schema 2 writes is read again as it was."""
+    folder = copy(tmp_path)
+    old = json.loads((folder / bundle.MANIFEST).read_text())
+    (folder / bundle.MANIFEST).write_text(
+        json.dumps({k: v for k, v in old.items() if k not in ("early", "known")} | {"schema": 1})
+    )
+    read = bundle.load(folder)
+    assert (read.manifest.early, read.manifest.known, read.classes, read.enrolled) == (None, None, None, {})
+    new = toy.load(tmp_path / "toy", early=Early((0.9, 0.8, 2.0), 2), outputs=(*toy.OUTPUTS, "early"))
+    assert new.manifest.schema == 2
+    assert bundle.Manifest.parse(new.manifest.json()) == new.manifest
+    assert new.manifest.early == Early((0.9, 0.8, 2.0), 2)
+    assert new.manifest.known == toy.KNOWN
+    assert new.classes is not None
+    assert new.classes.means.tolist() == toy.MEANS.tolist()
+    arrays = {k: v for k, v in toy.means().items() if k != "spread"}
+    plain = toy.load(tmp_path / "plain", arrays=arrays).classes
+    assert plain is not None
+    assert plain.spread.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "hint"),
+    [
+        ({"early": EARLY | {"least": []}}, "one for each step"),
+        ({"early": EARLY | {"least": [0.5, 0.0]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": [0.5, -1]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": [0.5, float("nan")]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": [0.5, True]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": [0.5, "0.5"]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": 0.5}}, "manifest cannot be read"),
+        ({"early": EARLY | {"agree": 0}}, "from 1 on"),
+        ({"early": EARLY | {"agree": 1.0}}, "from 1 on"),
+        ({"early": EARLY | {"agree": True}}, "from 1 on"),
+        ({"early": {"least": [0.9]}}, "agree"),
+        ({"early": {"agree": 1}}, "least"),
+        ({"early": [0.9]}, "manifest cannot be read"),
+        ({"early": EARLY | {"extra": 1}}, "extra"),
+        ({"early": EARLY, "input": "L"}, "needs the whole window"),
+        ({"known": KNOWN | {"limit": 0}}, "known.limit 0 must"),
+        ({"known": KNOWN | {"limit": float("inf")}}, "known.limit inf must"),
+        ({"known": KNOWN | {"temperature": -1.0}}, "known.temperature -1.0 must"),
+        ({"known": KNOWN | {"temperature": None}}, "known.temperature None must"),
+        ({"known": {"limit": 9.0}}, "temperature"),
+        ({"known": None}, "both `known` and means.npz"),
+        ({"schema": 1}, "schema 1 has no"),
+    ],
+)
+def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: str):
+    """Numbers that make no sense, fields that are missing or unknown, one half without the other."""
+    with pytest.raises(BundleError, match=hint):
+        bundle.load(spoiled(tmp_path, **changes))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "hint"),
+    [
+        (toy.means(means=toy.MEANS[:2]), "means float32 "),
+        (toy.means(means=toy.MEANS[:, :0]), "means float32 "),
+        (toy.means(means=toy.MEANS[0]), "means float32 "),
+        (toy.means(means=toy.MEANS.astype(float)), "means float64"),
+        (toy.means(means=toy.MEANS * np.float32("nan")), "means that are not finite"),
+        (toy.means(bias=np.zeros(2, np.float32)), "bias float32 "),
+        (toy.means(bias=np.float32([0, np.inf, 0])), "bias that are not finite"),
+        (toy.means(spread=np.ones(3)), "spread float64"),
+        (toy.means(spread=np.float32([1, 1])), "spread float32 "),
+        (toy.means(spread=np.float32([1, 1, 0])), "spread .* must be above 0"),
+        (toy.means(sweeps=np.zeros(3, np.int32)), "sweeps int32"),
+        (toy.means(sweeps=np.array([0, 0, -1])), "trained labels .0. come first"),
+        (toy.means(sweeps=np.array([0, 5, 0])), "trained labels .0. come first"),
+        (toy.means(sweeps=np.array([5, 0, 0])), "trained labels .0. come first"),
+        (toy.means(sweeps=np.array([5, 5, 5])), "trained labels .0. come first"),
+        ({k: v for k, v in toy.means().items() if k != "bias"}, "means.npz cannot be read"),
+        (toy.means(bias=np.array([object()] * 3)), "means.npz cannot be read"),
+    ],
+)
+def test_broken_means_are_named(tmp_path: Path, arrays: dict, hint: str):
+    """Counts against labels, types, numbers that are none, an order that is none, objects."""
+    with pytest.raises(BundleError, match=hint):
+        bundle.load(spoiled(tmp_path, arrays))
+
+
+def test_early_heads_and_enrolled_labels_exclude_each_other(tmp_path: Path):
+    """A head that was never trained on a label would never name it."""
+    with pytest.raises(BundleError, match="do not know the enrolled labels"):
+        bundle.load(spoiled(tmp_path, toy.means(sweeps=np.array([0, 0, 5])), early=EARLY))
+
+
+@pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"nonsense", toy.npy(np.arange(3))])
+def test_means_that_are_no_npz(tmp_path: Path, data: bytes):
+    """Whatever the file holds, it is named."""
+    folder = spoiled(tmp_path)
+    (folder / bundle.MEANS).write_bytes(data)
+    files = json.loads((folder / bundle.MANIFEST).read_text())["files"]
+    edit(folder, files=files | {bundle.MEANS: bundle.file_entry(data)})
+    with pytest.raises(BundleError, match=r"means\.npz cannot be read"):
+        bundle.load(folder)
+    (folder / bundle.MEANS).write_bytes(b"other")
+    with pytest.raises(BundleError, match=r"means\.npz was altered"):
+        bundle.load(folder)
+
+
+@pytest.mark.parametrize(
+    ("more", "fine"),
+    [
+        ({"known": None, "outputs": ("logits",)}, True),
+        ({"known": None, "outputs": ("logits", "embedding", "early")}, True),
+        ({"outputs": ("logits", "embedding", "early"), "early": Early((0.9,) * 3, 1)}, True),
+        ({"outputs": ("logits",)}, False),  # known without embedding
+        ({"early": Early((0.9,) * 3, 1)}, False),  # no early
+        ({"outputs": ("logits", "embedding", "early"), "early": Early((0.9,) * 2, 1)}, False),  # another D
+        ({"known": None, "outputs": ("embedding",)}, False),  # no logits
+        ({"known": None, "outputs": ("logits", "more")}, False),
+        ({"known": None, "outputs": ("logits",), "labels": 2}, False),  # another K
+        ({"arrays": toy.means(means=np.eye(3, 5, dtype=np.float32))}, False),  # another r
+        ({"arrays": toy.means(sweeps=np.array([0, 0, 5]))}, False),  # K0 = 2, the model knows 3
+        ({"arrays": toy.means(sweeps=np.array([0, 0, 5])), "labels": 2}, True),
+    ],
+)
+def test_outputs_of_the_model_are_those_of_the_manifest(tmp_path: Path, more: dict, fine: bool):
+    """What is needed is there, what is there fits, what is unknown is refused."""
+    it = toy.load(tmp_path / "toy", **more)
+    if fine:
+        Classifier(it, VirtualClock())
+    else:
+        with pytest.raises(BundleError, match="the manifest asks for"):
+            Classifier(it, VirtualClock())
+
+
+def test_a_far_sweep_is_unknown(tmp_path: Path):
+    """Squared distance to the nearest mean against the limit: at 3 deviations known, beyond not; no label, no score."""
+    it = Classifier(toy.load(tmp_path / "toy"), VirtualClock())
+    assert it(toy.sweep(-3, 0)).label == "a"
+    v = it(toy.sweep(-3, -0.5))
+    assert (v.status, v.label, v.probability, v.margin, v.fused, len(v.scores)) == (Status.UNKNOWN, "", 0, 0, 0, 0)
+    assert v.detail == "squared distance 9.25 from a, limit 9"
+    assert it(toy.sweep(6, 6)).status is Status.UNKNOWN
+    assert it(toy.sweep(9, 0)).label == "b"
+
+
+def test_a_faulty_window_is_not_unknown(tmp_path: Path):
+    """What the window itself tells comes first."""
+    it = Classifier(toy.load(tmp_path / "toy"), VirtualClock())
+    assert it(sweep_of(np.zeros((20, 2, 2), np.int16))).status is Status.NO_CONTACT
+
+
+def test_an_unknown_sweep_does_not_count_for_its_object(tmp_path: Path):
+    """The object's other sweeps stay, and are not diluted."""
+    it = Classifier(toy.load(tmp_path / "toy"), VirtualClock())
+    one = it(toy.sweep(2.9, 0, object=1))
+    assert it(toy.sweep(30, 30, object=1)).status is Status.UNKNOWN
+    two = it(toy.sweep(2.9, 0, object=1))
+    assert (one.fused, two.fused) == (1, 2)
+    assert two.scores == pytest.approx(fuse([one.scores, one.scores], "product"))
+
+
+def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
+    """A float skin far beyond all reason overflows the network: no label, no NaN, and the object is not poisoned."""
+    fmt = replace(toy.FORMAT, dtype="float32")
+    made = toy.files(fmt=fmt, outputs=("logits",), known=None)
+    limits = replace(bundle.Manifest.parse(made[bundle.MANIFEST]).thresholds, full_scale=3e38)
+    made[bundle.MANIFEST] = replace(bundle.Manifest.parse(made[bundle.MANIFEST]), thresholds=limits).json()
+    it = Classifier(bundle.load(toy.put(tmp_path / "toy", made)), VirtualClock())
+    far = toy.sweep(0, 0, object=1, fmt=fmt)
+    far.frames.taxels[::2, 0, :] = 2e38
+    with np.errstate(invalid="ignore"):
+        v = it(far)
+    assert (v.status, v.label, v.probability, v.detail) == (Status.UNKNOWN, "", 0, "the model gives no number")
+    assert it(toy.sweep(0, 0, object=1, fmt=fmt)).fused == 1
+
+
+def borderline(**more) -> tuple[Sweep, float]:
+    """A sweep that is "a" with a probability of 1 / (1 + exp(-.6)) = .65 (two labels count), and that probability."""
+    return toy.sweep(2.8, -1, **more), 1 / (1 + np.exp(-0.6))
+
+
+def test_sweeps_are_asked_for_until_one_is_sure(tmp_path: Path):
+    """Unsure, unsure, ok: after n sweeps the odds are those of one to the power n. A further one is fused too."""
+    it = Classifier(toy.load(tmp_path / "toy"), VirtualClock(), sure=0.85, most_sweeps=5)
+    given = [it(borderline(object=1)[0]) for _ in range(4)]
+    p = borderline()[1]
+    assert [v.status for v in given] == [Status.UNSURE, Status.UNSURE, Status.OK, Status.OK]
+    assert [v.fused for v in given] == [1, 2, 3, 4]
+    for v in given:
+        assert v.label == "a"
+        odds = (p / (1 - p)) ** v.fused
+        assert v.probability == pytest.approx(odds / (1 + odds), abs=2e-3)
+    assert it(borderline(object=2)[0]).status is Status.UNSURE
+
+
+def test_at_the_limit_the_answer_is_final(tmp_path: Path):
+    """Undecided with label and probability; a robot that goes on is answered by the same rule, and may become sure."""
+    it = Classifier(toy.load(tmp_path / "toy"), VirtualClock(), sure=0.85, most_sweeps=2)
+    given = [it(borderline(object=1)[0]) for _ in range(3)]
+    assert [v.status for v in given] == [Status.UNSURE, Status.UNDECIDED, Status.OK]
+    assert given[1].label == "a"
+    assert 0.7 < given[1].probability < 0.85
+    against = it(replace(toy.sweep(3.2, -1), object=1))
+    assert (against.status, against.fused) == (Status.UNDECIDED, 4)
+
+
+@pytest.mark.parametrize("more", [{"object": 0}, {"object": 1, "how": "none"}])
+def test_sweeps_that_stand_alone_never_reach_the_limit(tmp_path: Path, more: dict):
+    """Without NEW OBJECT, or with fusing off, each sweep is one; a limit of one makes it final."""
+    how = more.pop("how", "product")
+    it = Classifier(toy.load(tmp_path / "toy"), VirtualClock(), how, sure=0.85, most_sweeps=2)
+    assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNSURE] * 3
+    it = Classifier(it.bundle, VirtualClock(), how, sure=0.85, most_sweeps=1)
+    assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNDECIDED] * 3
+
+
+def test_sure_is_the_bundles_where_none_is_given(tmp_path: Path):
+    """0 stands for thresholds.unsure; without a limit nothing is ever undecided."""
+    it = Classifier(toy.load(tmp_path / "toy"), VirtualClock())
+    assert it.sure == toy.LIMITS.unsure
+    assert it(borderline()[0]).status is Status.OK
+    it = Classifier(it.bundle, VirtualClock(), sure=1.1)
+    assert {it(borderline(object=1)[0]).status for _ in range(20)} == {Status.UNSURE}
+
+
+def test_what_is_not_ok_need_not_count(tmp_path: Path):
+    """An early answer that would not be ok is none, and leaves the object as it was."""
+    it = Classifier(toy.load(tmp_path / "toy"), VirtualClock(), sure=0.85)
+    first = it(borderline(object=1)[0])
+    for object in (1, 2):
+        half = replace(toy.sweep(0, 0), object=object, share=0.5)
+        assert it.conclude_if_ok(half, np.array([0.6, 0.4, 0.0])) is None
+    assert it(borderline(object=1)[0]).fused == 2
+    v = it.conclude_if_ok(replace(toy.sweep(0, 0), object=1, share=0.5), np.array([0.9, 0.1, 0.0]))
+    assert v is not None
+    assert (v.status, v.label, v.fused, v.share) == (Status.OK, "a", 3, 0.5)
+    assert it(borderline(object=1)[0]).fused == 4
+    assert first.share == 1
+
+
+def test_early_logits(tmp_path: Path):
+    """One row a step."""
+    it = toy.load(tmp_path / "toy", early=Early((0.9,) * 3, 1), outputs=("logits", "early", "embedding"))
+    rows = Classifier(it, VirtualClock()).early(toy.window(1, 0))
+    assert rows.tolist() == pytest.approx(np.outer([1, 2, 3], [0, -6, -9]), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("more", "asked"),
+    [
+        ({"known": None, "outputs": ("logits", "embedding", "early")}, ["logits"]),
+        ({"outputs": ("logits", "embedding", "early")}, ["logits", "embedding"]),
+        ({"arrays": toy.means(sweeps=np.array([0, 0, 5])), "labels": 2}, ["embedding"]),
+    ],
+)
+def test_only_what_is_needed_is_asked_for(tmp_path: Path, more: dict, asked: list[str], monkeypatch):
+    """onnxruntime is asked for no output that nobody looks at."""
+    it = Classifier(toy.load(tmp_path / "toy", **more), VirtualClock())
+    seen = []
+
+    class Spy:
+        def run(self, outputs, given, inner=it._session):
+            seen.append(outputs)
+            return inner.run(outputs, given)
+
+    monkeypatch.setattr(it, "_session", Spy())
+    assert it(toy.sweep(1, 0)).label == "a"
+    assert seen == [asked]
+
+
+def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
+    """(means . z + bias) / temperature for every label; the nearest one wins, and its spread is wider by 1 + 1 / n."""
+    bias = np.float32([0, -18, -18 + 2 / 4])
+    arrays = toy.means(bias=bias, sweeps=np.array([0, 0, 2]))
+    it = Classifier(toy.load(tmp_path / "toy", arrays=arrays, labels=2), VirtualClock())
+    z = np.array([1.0, 2.0])
+    have = it.logits(toy.window(*z)).astype(float)
+    assert have - have[0] == pytest.approx((toy.MEANS @ z + bias - bias[0]) / 2, abs=1e-4)
+    assert it.self_test() < 1e-5
+    assert it(toy.sweep(0, 6)).label == "c"
+    # c lies 1.5 times as far as its sweeps say: 13.5 counts 9, as b's 9
+    assert it(toy.sweep(0, 6 + 3.6)).label == "c"
+    v = it(toy.sweep(0, 6 + 3.7))
+    assert (v.status, v.detail) == (Status.UNKNOWN, "squared distance 9.127 from c, limit 9")
+    wide = toy.load(tmp_path / "wide", arrays=arrays | {"spread": np.float32([1, 1, 4])}, labels=2)
+    it = Classifier(wide, VirtualClock())
+    assert it(toy.sweep(0, 6 + 7.3)).label == "c"
+    assert it(toy.sweep(0, 6 + 7.4)).status is Status.UNKNOWN
+    assert it(toy.sweep(9.1, 0)).status is Status.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        toy.means(means=toy.MEANS[[1, 0, 2]], bias=np.float32([-18, 0, -18])),
+        toy.means(bias=np.float32([0, -17, -18])),
+        toy.means(means=toy.MEANS * np.float32(1.2), bias=-(toy.MEANS**2).sum(1) * np.float32(0.72)),
+    ],
+)
+def test_means_of_another_training_are_found(tmp_path: Path, arrays: dict):
+    """Class means that do not give the model's own logits on its golden sweeps are refused."""
+    it = Classifier(bundle.load(spoiled(tmp_path, arrays)), VirtualClock())
+    with pytest.raises(BundleError, match=r"means\.npz and the model's own logits differ"):
+        it.self_test()

@@ -13,11 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import toy
 from conftest import numbered
 
 from appliance import bundle
 from appliance.__main__ import main
+from appliance.bundle import Early
+from appliance.classifier import softmax
 from appliance.sim import bench, demo, parts, score, script, skin, terminal
+from appliance.sweep import Frames, Status, Sweep, save
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
 
@@ -151,6 +155,58 @@ def test_replay_of_a_sweep_set(
     want = [default_bundle.manifest.labels[k] for k in default_bundle.golden_logits.argmax(1)]
     assert results[0][5].decode() == want[0]
     assert results[len(want)][5].decode() == want[-1]
+
+
+def test_the_sequential_test_is_configured(
+    tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
+):
+    """classifier.sure and classifier.most_sweeps reach the classifier, in `run` and in `replay`."""
+    samples = default_bundle.golden[:1].repeat(3, axis=0)
+    np.savez(
+        tmp_path / "set.npz", samples=samples, labels=np.zeros(3, int), materials=np.array(["a"]), rate_hz=750.0,
+        group_recording=np.zeros(3, int),
+    )  # fmt: skip
+    never = ["--set", "classifier.sure=1", "--set", "classifier.most_sweeps=2", "--set", "classifier.fuse=product"]
+    played = ["run", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
+    kept = ["--keep", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
+
+    def said() -> list[bytes]:
+        return [r.split(b",")[4] for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
+
+    p = softmax(default_bundle.golden_logits[0]).max()
+    assert p < 0.9999, "take a golden sweep that is less sure"
+    assert main([*played, *never, *kept]) == 0
+    assert said()[:2] == [b"unsure", b"undecided"]
+    assert main(["replay", str(tmp_path / "c"), *never]) == 0
+    assert said()[:2] == [b"unsure", b"undecided"]
+    assert main(["replay", str(next((tmp_path / "kept").glob("*.npy"))), *never]) == 0
+    assert said() == [b"unsure"]
+    assert main(played) == 0
+    assert said() == [b"ok"] * 3
+
+
+def test_early_needs_a_bundle_that_can(capsys: pytest.CaptureFixture[str]):
+    """classifier.early with a bundle without early heads ends before the first sweep; `check` names it."""
+    assert main(["run", "--sim", "skin", *VIRTUAL, "--set", "classifier.early=true"]) == 4
+    said = capsys.readouterr()
+    assert "has no early heads" in said.err
+    assert said.out == ""
+    assert main(["check", "--sim", "skin", "--virtual", "--set", "classifier.early=true"]) == 1
+    assert "FAIL  golden sweeps" in capsys.readouterr().out
+
+
+def test_a_sweep_that_was_answered_early_is_replayed_so(tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]):
+    """By a bundle that decides there; another one is named."""
+    frames = Frames(np.arange(10), np.arange(10), toy.window(1, 0)[:10])
+    save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.OK, frames, share=0.5), toy.FORMAT)
+    for least, code in ((0.5, 0), (2.0, 8)):
+        made = toy.files(early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early"))
+        folder = toy.put(tmp_path / f"b{least}", made)
+        assert main(["replay", str(tmp_path / "s.npy"), "--set", f"classifier.bundle={folder}"]) == code
+    said = capsysbinary.readouterr()
+    assert said.out.count(b",RES,1,") == 1
+    assert b",ok,a," in said.out
+    assert b"answered early, which this bundle does not do" in said.err
 
 
 def test_check_says_ok_part_by_part(capsys: pytest.CaptureFixture[str]):

@@ -265,7 +265,7 @@ def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str)
     pins, roles = _drawing(board)
     assert pins == HEADER
     wired = {f"in {name}": getattr(c.trigger, name) for name in ("start", "stop", "new_object")}
-    wired |= {f"out {name}": getattr(c.output, name) for name in ("ready", "busy", "result_valid", "fault")}
+    wired |= {f"out {name}": getattr(c.output, name) for name in ("ready", "busy", "result_valid", "fault", "decided")}
     wired |= {f"out class_bits {i}": name for i, name in enumerate(c.output.class_bits)}
     assert roles == wired | {"out serial TXD": "GPIO14", "in serial RXD": "GPIO15"}
     beside = re.findall(r"^\w+ = (.*GPIO.*)# pins? ([\d, ]+)", _page(board), re.MULTILINE)

@@ -300,15 +300,116 @@ def test_latest_is_whole_or_nothing():
     assert bench.recorder.latest(10) is None
 
 
-@given(st.lists(st.tuples(st.sampled_from(list(EdgeKind)), st.booleans(), st.integers(1, 3000)), max_size=30))
+def steps_of(bench: Bench, steps: int = 9) -> list[Sweep]:
+    """The open sweep at the steps that have come."""
+    return list(bench.recorder.so_far(steps, bench.now))
+
+
+@pytest.mark.parametrize("packet", [1, 6, 40, 1000])
+def test_an_open_sweep_so_far(packet: int):
+    """Nine steps of 150 frames, counted from `lead_ms` after the start edge, each once, however the frames come."""
+    bench = Bench(lead_ms=400)
+    bench.put(frames(0, 510))
+    assert steps_of(bench) == []
+    bench.edge(EdgeKind.START, 500)
+    seen = []
+    for first in range(510, 2600, packet):
+        bench.put(frames(first, packet))
+        for sweep in steps_of(bench):
+            assert sweep.complete_ns == bench.now
+            seen.append(sweep)
+    assert [(len(s.frames), s.share) for s in seen] == [(150 * d, d / 10) for d in range(1, 10)]
+    for s in seen:
+        assert (s.frames.seq[0], s.start_ns, s.stop_ns) == (800, t_ns(500), t_ns(800 + len(s.frames) - 1))
+        assert (s.frames.taxels == numbered(3000)[800 : 800 + len(s.frames)]).all()
+    bench.edge(EdgeKind.STOP, 2750)
+    bench.put(frames(2600, 400))
+    assert steps_of(bench) == []
+    assert one(bench) is Status.OK
+
+
+def test_steps_of_a_window_that_does_not_divide():
+    """Ten frames in three steps: 3, 5 and 8 of them, so that a head never lacks a frame that it may see."""
+    fmt = SweepFormat(4, 4, 750.0, 10, "uint8")
+    bench = Bench(fmt, lead_ms=0)
+    bench.edge(EdgeKind.START, 0)
+    bench.put(frames(0, 7, fmt=fmt))
+    assert [len(s.frames) for s in steps_of(bench, 3)] == [3, 5]
+    bench.put(frames(7, 1, fmt=fmt))
+    assert [len(s.frames) for s in steps_of(bench, 3)] == [8]
+
+
+def test_no_step_lies_beyond_a_gap():
+    """Three missing frames end the steps, also those that come later; two are filled, seen from both sides."""
+    bench = Bench(lead_ms=0)
+    bench.edge(EdgeKind.START, 0)
+    bench.put(frames(0, 1000, (148, 149, 400, 401, 402)))
+    seen = steps_of(bench)
+    assert [(len(s.frames), s.lost) for s in seen] == [(150, 2), (300, 2)]
+    assert abs(int(seen[0].frames.t_ns[-1]) - t_ns(149)) < 2
+    bench.put(frames(1000, 600))
+    assert steps_of(bench) == []
+
+
+def test_a_sweep_that_is_settled_has_had_its_answer():
+    """No further step, a silent stop edge, and nothing that goes wrong later brings an answer."""
+    bench = Bench(lead_ms=0)
+    bench.put(frames(0, 400))
+    bench.edge(EdgeKind.START, 0)
+    for _ in bench.recorder.so_far(9, bench.now):
+        bench.recorder.settle()
+    assert not bench.recorder.sweeping
+    bench.put(frames(400, 400))
+    assert steps_of(bench) == []
+    assert not bench.recorder.interrupt(Status.ABORTED, bench.now)
+    assert bench.done(60) == []
+    bench.edge(EdgeKind.STOP, 3000)
+    assert bench.done(1) == []
+
+
+def test_a_sweep_whose_answer_is_still_to_come_goes_first():
+    """The one before waits for frames behind a gap: no step of the open one before its answer."""
+    bench = Bench(lead_ms=0)
+    bench.put(frames(0, 1700))
+    bench.edge(EdgeKind.START, 0)
+    bench.edge(EdgeKind.STOP, 2000)
+    bench.edge(EdgeKind.START, 2010)
+    bench.put(frames(2000, 400))
+    assert steps_of(bench) == []
+    assert one(bench) is Status.GAP
+    assert [len(s.frames) for s in steps_of(bench)] == [150, 300]
+
+
+def test_steps_begin_with_a_new_enumeration():
+    """A skin that was plugged in again: its frames are not those of the sweep that was open before."""
+    bench = Bench(lead_ms=0)
+    bench.put(frames(0, 100))
+    bench.edge(EdgeKind.START, 0)
+    bench.put(frames(100, 500, epoch=1))
+    assert steps_of(bench) == []
+    assert one(bench) is Status.SENSOR_LOST
+    bench.edge(EdgeKind.START, 500)
+    bench.put(frames(600, 100, epoch=1))
+    assert [int(s.frames.seq[0]) - (1 << EPOCH_BITS) for s in steps_of(bench)] == [500]
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(list(EdgeKind)), st.booleans(), st.integers(1, 3000), st.integers(0, 8)), max_size=30
+    )
+)
 def test_every_start_gets_exactly_one_answer(script):
-    """Whatever edges come in whatever order: each number is answered once, every start edge has one."""
-    bench = Bench(longest_s=5)
+    """Whatever edges come in whatever order, some sweeps settled at a step: each number is answered once."""
+    bench = Bench(longest_s=5, lead_ms=0)
     frame = starts = 0
-    answers = []
-    for kind, ready, step in script:
+    answers: list[Sweep] = []
+    for kind, ready, step, settled in script:
         frame += step
-        bench.put(frames(frame - 1, 1))
+        bench.put(frames(frame - 1, 1) if settled == 0 else frames(frame - step, step))
+        for sweep in bench.recorder.so_far(4, bench.now):
+            if sweep.share * 5 > settled > 0:
+                bench.recorder.settle()
+                answers.append(sweep)
         bench.edge(kind, frame, ready)
         starts += kind is EdgeKind.START
         answers += bench.done()

@@ -70,7 +70,8 @@ class Demo:
                 self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""])
         if not self._raw and self.score.total:
             lost = f"  frames lost     {box.tally.lost_frames} of {box.tally.frames + box.tally.lost_frames}"
-            self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}")
+            touch = [f"  touch time      {self.score.touch(box.format.rate_hz)}"] if self.score.early else []
+            self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}", *touch)
 
     def _listen(self, said: int, wanted: int) -> None:
         """Read what has come to the robot's end; wait for answers that were said and are not here; stop at `wanted`."""
@@ -91,9 +92,9 @@ class Demo:
         mark = "right" if self.score.add(act, answer) else "wrong"
         if not self._raw:
             said = answer.label or answer.status
-            self._print(
-                f"{answer.sweep:>3}  {act.label:<15} -> {said:<15} {mark}  {bar(answer.probability)}", f"     {line}"
-            )
+            used = f"  after {answer.share:.0%} of the window" if answer.share < 1 else ""
+            shown = f"{answer.sweep:>3}  {act.label:<15} -> {said:<15} {mark}  {bar(answer.probability)}{used}"
+            self._print(shown, f"     {line}")
 
     def _draw(self, lines: list[str]) -> None:
         """Paint over the picture before, in one write, so that nothing flickers."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import os
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from itertools import count
 from types import SimpleNamespace
@@ -27,6 +27,7 @@ class SimGpio:
     """Stands where `import gpiod` would. chips: path (/dev/gpiochip0 and so on) -> its line names, '' for none.
 
     written: (t_ns, name, level) of everything that was driven, in order. requests: the lines that are held now.
+    watchers: output line -> what is called with the time when the box raises it.
     refuse: path -> errno with which a chip refuses from now on: 13 permission denied, 19 pulled out.
     """
 
@@ -39,6 +40,7 @@ class SimGpio:
         self.written: list[tuple[int, str, bool]] = []
         self.requests: list[SimRequest] = []
         self.refuse: dict[str, int] = {}
+        self.watchers: dict[str, Callable[[int], None]] = {}
         self._clock, self._chips = clock, chips
         self._driven: dict[str, bool] = {}
         self._plan, self._order = list[tuple[int, int, str, bool]](), count()
@@ -48,6 +50,11 @@ class SimGpio:
         if not any(name in names for names in self._chips.values()):
             raise ValueError(f"no simulated gpio line is named {name!r}; add it to chips")
         heapq.heappush(self._plan, (t_ns, next(self._order), name, bool(level)))
+
+    def forget(self, name: str, t_ns: int) -> None:
+        """Take back what `name` was to be set to at `t_ns` and later."""
+        self._plan = [item for item in self._plan if item[2] != name or item[0] < t_ns]
+        heapq.heapify(self._plan)
 
     def is_gpiochip_device(self, path: str) -> bool:
         """As gpiod's."""
@@ -134,6 +141,8 @@ class SimRequest:
         for offset, value in values.items():
             self._levels[offset] = (value is Value.ACTIVE) != self.settings[offset].active_low
             self._gpio.written.append((now_ns, self.names[offset], self._levels[offset]))
+            if self._levels[offset] and self.names[offset] in self._gpio.watchers:
+                self._gpio.watchers[self.names[offset]](now_ns)
 
     def release(self) -> None:
         """As gpiod's; an output becomes an input, and its pull-down takes it low."""

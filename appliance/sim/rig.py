@@ -7,8 +7,9 @@ In: Acts (frames of one sweep and where its edges lie). Out: packets of PROTOCOL
 from __future__ import annotations
 
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,8 @@ from ..sweep import SweepFormat
 
 PULSE_NS = 20_000_000
 """Length of the robot's pulses."""
+REACTION_NS = 20_000_000
+"""The finger slides on for so long after DECIDED has risen."""
 
 
 class VirtualClock:
@@ -70,14 +73,23 @@ class EdgeLines(Protocol):
         """Set the input line `name` to `level` at `t_ns`."""
         ...
 
+    def forget(self, name: str, t_ns: int) -> None:
+        """Take back what `name` was to be set to at `t_ns` and later."""
+        ...
+
 
 class Robot:
-    """Plays a script of acts: drives start, stop and NEW OBJECT at the right frames. `played` is what it did."""
+    """Plays a script of acts: drives start, stop and NEW OBJECT at the right frames. `played` is what it did.
+
+    skipped: numbers of the frames [from, to) that it did not slide, as it stopped early; the board leaves them out.
+    """
 
     def __init__(self, script: Iterator[Act], lines: EdgeLines, *, start: str, stop: str, new_object: str = "") -> None:
         self.played: list[Act] = []
         self.finished = False
+        self.skipped: tuple[int, int] | None = None
         self._script, self._lines = script, lines
+        self._playing: tuple[Act, int, Callable[[int], int]] | None = None  # as `next_act` got it, until it is stopped
         self._start, self._stop, self._new_object = start, stop, new_object
 
     def next_act(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
@@ -98,7 +110,27 @@ class Robot:
             self._pulse(self._stop, stop_ns, stop_ns + PULSE_NS)
         else:
             self._pulse(self._start, start_ns, stop_ns)
+        self._playing = act, first, frame_ns
         return act
+
+    def react(self, t_ns: int) -> None:
+        """DECIDED has risen at `t_ns`: end the slide REACTION_NS later, where it does not end before."""
+        if not self._playing:
+            return
+        act, first, frame_ns = self._playing
+        at = bisect_left(range(act.stop), t_ns + REACTION_NS, key=lambda i: frame_ns(first + i))
+        if at == act.stop:
+            return
+        self._playing = None
+        stop_ns = frame_ns(first + at)
+        self._lines.forget(self._stop or self._start, stop_ns)
+        if self._stop:
+            self._pulse(self._stop, stop_ns, stop_ns + PULSE_NS)
+        else:
+            self._lines.drive(self._start, False, stop_ns)
+        self.skipped = first + at, first + act.stop
+        if self.played:
+            self.played[-1] = replace(act, frames=np.delete(act.frames, slice(at, act.stop), axis=0), stop=at)
 
     def _pulse(self, name: str, up_ns: int, down_ns: int) -> None:
         self._lines.drive(name, True, up_ns)
@@ -171,6 +203,9 @@ class Board:
 
     def _block(self, first: int, n: int) -> NDArray[Any]:
         """Frames `first` to `first + n` of the script; after its end nothing touches the skin."""
+        if self._robot.skipped:
+            begin, end = (i - self._base for i in self._robot.skipped)
+            self._frames, self._robot.skipped = np.delete(self._frames, slice(begin, end), axis=0), None
         while first + n > self._base + len(self._frames):
             act = self._robot.next_act(self._base + len(self._frames), self.frame_ns)
             more = np.zeros((4096, *self._frames.shape[1:]), self._frames.dtype) if act is None else act.frames

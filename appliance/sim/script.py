@@ -22,8 +22,10 @@ PAUSE_S = 0.1, 0.14
 """The finger is off the tube so long before and after it; drawn anew each time, so that edges meet packets anywhere."""
 SLIDE_S, REST_S = 3.0, 0.1
 """The slide (paper, sec. II.B), and the finger at rest on the tube before and after it."""
+LEAD_S = 0.5
+"""From an edge to a recorded window, as `sweep.lead_ms` has it; the window's first and last frames are held so long."""
 MARGIN = 8
-"""Frames held before and after a recorded window, so that edges have room; its first and last frames are repeated."""
+"""Frames before and after the edges, so that these have room."""
 
 
 def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
@@ -74,7 +76,8 @@ def _play(held: SweepSet) -> Iterator[Act]:
     begins = np.ones(len(held), bool)
     recording = held.groups.get("recording", np.zeros(len(held), int))
     begins[1:] = recording[1:] != recording[:-1]
-    stop = held.format.window // 2 * 2 + 3 * MARGIN  # even, so that a frame lies in the middle
+    lead = round(LEAD_S * held.format.rate_hz)
+    stop = MARGIN + 2 * lead + held.format.window // 2 * 2  # even, so that a frame lies in the middle
     for window, label, new in zip(held.samples, held.labels, begins & ("recording" in held.groups), strict=True):
-        before, after = window[:1].repeat(2 * MARGIN, 0), window[-1:].repeat(2 * MARGIN, 0)
+        before, after = window[:1].repeat(MARGIN + lead, 0), window[-1:].repeat(MARGIN + lead, 0)
         yield Act(np.concatenate([before, window, after]), MARGIN, stop, held.materials[label], bool(new))

@@ -11,7 +11,7 @@ from ..config import Config
 from ..sweep import SweepFormat
 from . import gpio, rig, usb
 
-READY, BUSY, RESULT_VALID, FAULT = "READY", "BUSY", "RESULT-VALID", "FAULT"
+READY, BUSY, RESULT_VALID, FAULT, DECIDED = "READY", "BUSY", "RESULT-VALID", "FAULT", "DECIDED"
 START, STOP, NEW_OBJECT = "START", "STOP", "NEW-OBJECT"
 BITS = tuple(f"CLASS-{i}" for i in range(8))
 
@@ -32,8 +32,9 @@ class SimWorld(World):
             settings.trigger, mode="two-lines", start=START, stop=STOP, new_object=NEW_OBJECT, active_low=False
         )
         output = replace(
-            settings.output, ready=READY, busy=BUSY, result_valid=RESULT_VALID, fault=FAULT, class_bits=BITS
-        )
+            settings.output, ready=READY, busy=BUSY, result_valid=RESULT_VALID, fault=FAULT, decided=DECIDED,
+            class_bits=BITS,
+        )  # fmt: skip
         return replace(settings, sensor=sensor, trigger=trigger, output=output)
 
     def finished(self, answered: int) -> bool:
@@ -41,10 +42,15 @@ class SimWorld(World):
         return self.robot.finished and answered >= len(self.robot.played)
 
 
-def build(fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False) -> SimWorld:
-    """A world that plays `acts`: the same drivers above, nothing real below."""
-    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, READY, BUSY, RESULT_VALID, FAULT, *BITS]})
+def build(
+    fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False, stops: bool = True
+) -> SimWorld:
+    """A world that plays `acts`: the same drivers above, nothing real below. stops: the robot heeds DECIDED."""
+    outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
+    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]})
     robot = rig.Robot(iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT)
+    if stops:
+        lines.watchers[DECIDED] = robot.react
     board = rig.Board(fmt, robot, clock)
     backend = usb.RigBackend(board, clock, acm=acm)
     return SimWorld(clock=clock, gpio=lines, backend=backend, source=source, robot=robot)
