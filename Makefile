@@ -7,7 +7,7 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types bench bundle paper wheel lock clean
+.PHONY: help demo test check lint types bench bundle chart paper wheel lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -35,6 +35,9 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
 	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --row-shift 0.5 --seed 1 --out build/default.npz
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 1
+
+chart: $(DESKTOP) ## speed against accuracy: docs/chart/ (goes on where it was interrupted)
+	$(BIN)/palpate-train chart $(CHART)
 
 paper: $(DESKTOP) ## the paper's experiment, run again: docs/paper/ (goes on where it was interrupted)
 	$(BIN)/palpate-train paper $(PAPER)

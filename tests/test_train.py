@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +15,11 @@ from test_sets import easy
 from appliance.errors import FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import compact, fit, heads, loop, score, sets
+from train import fit, heads, ladder, score, sets
 from train.__main__ import main
-from train.compact import Compact, stages
+from train.compact import Compact
 from train.fit import Fit, Recipe
+from train.ladder import LADDER, USUAL
 
 QUICK = Recipe(steps=40)
 
@@ -30,33 +32,36 @@ def fitted() -> Fit:
 
 def test_stages_follow_the_window():
     """The kernels of the two windows that are known; every window gets a last stage, or a message."""
-    assert stages(1500) == ((16, 4), (5, 2), (5, 2))
-    assert stages(128) == ((4, 1), (5, 2), (5, 2))
-    for window in range(16, 3000):
-        steps = window
-        for kernel, stride in stages(window):
-            steps = (steps - kernel) // stride + 1
-        assert steps >= (compact.LEAST_STEPS if window >= 108 else 1)
-    with pytest.raises(FormatError, match="a window of 15 frames is too short"):
-        stages(15)
+    assert [(s.kernel, s.stride) for s in USUAL.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
+    assert [(s.kernel, s.stride) for s in USUAL.stages(128)] == [(4, 1), (5, 2), (5, 2)]
+    assert USUAL.stages(1500)[-1] == ladder.Stage(5, 2, 89, 32 + 4 * 4 + 4 * 8, 16)
+    for shape in LADDER.values():
+        for window in range(16, 3000):
+            last = shape.stages(window)[-1]
+            assert last.steps >= (ladder.LEAST_STEPS if window >= 108 else 1)
+            assert (last.steps - 1) * last.hop + last.reach <= window
+            assert shape.cut(1).stages(window) == shape.stages(window)[:1]
+        with pytest.raises(FormatError, match="a window of 15 frames is too short"):
+            shape.stages(15)
 
 
-def test_compact_is_as_small_as_it_says():
-    """19,110 weights for the skin of the paper with six classes."""
-    model = Compact(skin.FORMAT, 6, 1.0, norm=False)
-    assert sum(p.numel() for p in model.parameters()) == 19_110
+@pytest.mark.parametrize(("size", "weights"), [("1k", 1_223), ("20k", 18_558)])
+def test_compact_is_as_small_as_it_says(size: str, weights: int):
+    """For the skin of the paper with six classes; what a shape costs is what its network holds."""
+    model = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=LADDER[size])
+    assert sum(p.numel() for p in model.parameters()) == weights == LADDER[size].cost(skin.FORMAT, 6).weights
     assert model(torch.zeros(2, 1500, 4, 4)).shape == (2, 6)
 
 
 def test_compact_ignores_offsets():
-    """A constant on each taxel changes nothing: it is the offset, not the texture."""
+    """A constant on each taxel changes nothing: it is the offset, not the texture; by its kernels, not by `prepare`."""
     model = Compact(skin.FORMAT, 6, 0.1, norm=False)
     rng = np.random.default_rng(0)
-    digits = torch.from_numpy(rng.integers(0, 100, (2, 1500, 4, 4)).astype(np.float32))
-    offset = torch.from_numpy(rng.integers(0, 100, (2, 1, 4, 4)).astype(np.float32))
+    digits = torch.from_numpy(rng.integers(0, 100, (2, 16, 1500)).astype(np.float32))
+    offset = torch.from_numpy(rng.integers(0, 100, (2, 16, 1)).astype(np.float32))
     with torch.no_grad():
-        torch.testing.assert_close(model(digits + offset), model(digits), rtol=0, atol=1e-4)
-        assert (model(digits * 2) - model(digits)).abs().max() > 0.01
+        torch.testing.assert_close(model.judge(digits + offset), model.judge(digits), rtol=0, atol=1e-4)
+        assert (model.judge(digits * 2) - model.judge(digits)).abs().max() > 0.01
 
 
 def test_fused_norms_change_nothing():
@@ -69,45 +74,6 @@ def test_fused_norms_change_nothing():
     with torch.no_grad():
         model(digits)  # moves the running means
         torch.testing.assert_close(model.fused()(digits), model.eval()(digits))
-
-
-def test_row_shift_is_drawn_per_sweep():
-    """Some sweeps stay, some go up, some down by one row; the row that comes in is its neighbour's, no stronger."""
-    x = torch.arange(1, 9, dtype=torch.float32).reshape(1, 8, 1).expand(300, 8, 5)  # rows (1,2) (3,4) (5,6) (7,8)
-    still = Recipe(row_shift=0.5, noise=0, gain=0)
-    y = fit.vary(x, torch.Generator().manual_seed(0), 4, still)[:, :, 0]
-    stays = (y[:, 2:6] == torch.tensor([3, 4, 5, 6])).all(1)
-    up = (y[:, :6] == torch.tensor([3, 4, 5, 6, 7, 8])).all(1)
-    down = (y[:, 2:] == torch.tensor([1, 2, 3, 4, 5, 6])).all(1)
-    assert (stays.int() + up.int() + down.int() == 1).all()
-    assert 120 < stays.sum() < 180
-    assert 45 < up.sum() < 105
-    level = y[up, 6:] / torch.tensor([7, 8])
-    torch.testing.assert_close(level[:, 0], level[:, 1])
-    assert level.min() >= 0
-    assert level.max() <= 1
-    assert level.std() > 0.2
-
-
-def test_stretch_changes_speed_and_nothing_else():
-    """A tone comes back at 0.7 to 1.3 times its rate, with its strength."""
-    t = torch.arange(400) / 400
-    x = torch.sin(2 * np.pi * 40 * t).expand(64, 1, 400)
-    y = fit.vary(x, torch.Generator().manual_seed(0), 1, Recipe(stretch=0.3, noise=0, gain=0))
-    crossings = (y[:, 0, 1:] * y[:, 0, :-1] < 0).sum(1) / 2
-    assert crossings.min() >= 26
-    assert crossings.max() <= 54
-    assert crossings.max() - crossings.min() > 15
-    torch.testing.assert_close(y.std(2), x.std(2), rtol=0.1, atol=0)
-
-
-def test_gain_is_a_taxel_s_and_noise_a_frame_s():
-    """The stated deviations, gain constant in time, the same draw for the same seed."""
-    x = torch.ones(200, 4, 300)
-    y, again = (loop.unsettled(x, Recipe(), torch.Generator().manual_seed(3)) for _ in range(2))
-    assert torch.equal(y, again)
-    assert y.mean(2).std().item() == pytest.approx(0.15, rel=0.1)
-    assert y.std(2).mean().item() == pytest.approx(0.05, rel=0.05)
 
 
 def test_temperature_finds_how_sure_to_be():
@@ -178,9 +144,26 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
         np.testing.assert_array_equal(mine.group("recording"), theirs.group("recording"))
     for name, value in fitted.weights.items():
         np.testing.assert_array_equal(again.weights[name], value)
+    assert (again.shape, again.reach) == (fitted.shape, fitted.reach)
     easy(4).save(tmp_path / "set.npz")
     with pytest.raises(FormatError, match=r"^set.npz: not a fit"):
         Fit.load(tmp_path / "set.npz")
+
+
+def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
+    """Weights that are not of the shape that the file names, and a file from before there were shapes."""
+    replace(fitted, shape=LADDER["1k"]).save(tmp_path / "fit.npz")
+    with pytest.raises(
+        FormatError, match=r"^fit.npz: its weights are not those of its Shape\(channels=\(3, 6, 8\).*; fit again$"
+    ):
+        Fit.load(tmp_path / "fit.npz")
+    with np.load(tmp_path / "fit.npz") as z:
+        old = dict(z)
+    meta = json.loads(str(old["meta"]))
+    del meta["shape"]
+    np.savez(tmp_path / "old.npz", **old | {"meta": np.array(json.dumps(meta))})
+    with pytest.raises(FormatError, match=r"^old.npz: not a fit .*; fit again: 'shape'$"):
+        Fit.load(tmp_path / "old.npz")
 
 
 def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -9,12 +9,11 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from appliance import bundle
 from appliance.bundle import Manifest
 from appliance.errors import ApplianceError, FormatError
 from appliance.sim.bench import commit
 
-from . import calibrate, chart, evaluate, export, fit, methods, options, pack, paper, score, sets, stress, trial
+from . import calibrate, choose, evaluate, export, fit, frontier, methods, options, pack, score, sets, shows
 from .fold import whole
 
 Add = Callable[[str, Callable[[argparse.Namespace], None], str], argparse.ArgumentParser]
@@ -49,9 +48,10 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_looking(add)
     _add_evaluate(add)
-    _add_shows(add)
     _add_fit(add)
     _add_bundles(add)
+    for room in (shows, frontier, choose, calibrate):
+        room.register(add)
     return parser
 
 
@@ -73,35 +73,6 @@ def _add_evaluate(add: Add) -> None:
     one.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
     options.add_effort(one)
     options.add_where(one)
-
-
-def _add_shows(add: Add) -> None:
-    """The commands that write what people look at."""
-    one = add("paper", run_paper, "run the paper's experiment on the simulated skin and tell it as a page")
-    one.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
-    one.add_argument(
-        "--quick", action="store_true", help="small sets, hardly trained: everything is tried, nothing told"
-    )
-    one.add_argument("--kept", action="store_true", help="train nothing, tell what an earlier run has finished")
-    two = add("stress", run_stress, "put trained methods under what goes wrong, one thing at a time")
-    options.add_set(two)
-    two.add_argument("--test", required=True, metavar="SET", help="what is stressed; simulated, it is drawn anew")
-    two.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
-    two.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and stress: 1 to N (1)")
-    two.add_argument("--out", type=Path, required=True, metavar="DIR", help="for results.json, table.md and curves.svg")
-    two.add_argument("--strong", default="compact,minirocket", metavar="A,B", help="methods drawn with their bands")
-    for command in (one, two):
-        options.add_effort(command)
-        options.add_where(command)
-    three = add("calibrate", run_calibrate, "compare the simulator with the twenty accuracies that the paper prints")
-    three.add_argument("--seeds", default="201-208", metavar="FIRST-LAST", help="of the simulated worlds (201-208)")
-    three.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
-    three.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    three.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
-    four = add("chart", run_chart, "draw what evaluate wrote: methods by protocols")
-    four.add_argument("results", type=Path, nargs="+", metavar="FILE", help="of evaluate --json; several are joined")
-    four.add_argument("--out", type=Path, required=True, metavar="FILE.svg")
-    four.add_argument("--recordings", action="store_true", help="count recordings instead of windows")
 
 
 def _add_fit(add: Add) -> None:
@@ -171,58 +142,6 @@ def run_evaluate(args: argparse.Namespace) -> None:
             _write(args.json, done)
     if refused:
         raise FormatError("; ".join(f"{name} cannot be used here: {why}" for name, why in refused.items()))
-
-
-def run_paper(args: argparse.Namespace) -> None:
-    """All of it; the page is named at the end."""
-    print(paper.run(args.out, args.quick, options.where(args), options.Log(), options.effort(args)))
-
-
-def run_stress(args: argparse.Namespace) -> None:
-    """Curves as JSON and as a picture, and the table."""
-    train = options.load(args)
-    simulated = args.test.startswith("sim:")
-    test = trial.Trial.simulated(args.test) if simulated else trial.Trial.of(sets.load(args.test).select(args.only))
-    told = stress.run(
-        options.names(args),
-        train,
-        test,
-        options.where(args),
-        seeds=options.seeds(args),
-        effort=options.effort(args),
-        log=options.Log(),
-    )
-    told["box"] = stress.box_trouble(bundle.load(bundle.DEFAULT))
-    told |= {"train": train.source, "digest": sets.digest(train), "format": str(train.format)} | score.provenance()
-    table = stress.table(told)
-    whole(args.out / "results.json", (json.dumps(told) + "\n").encode())
-    whole(args.out / "table.md", table.encode())
-    whole(args.out / "curves.svg", chart.stress(told, args.strong.split(",")).encode())
-    print(table)
-
-
-def run_calibrate(args: argparse.Namespace) -> None:
-    """The table; the figures as JSON where asked for."""
-    first, _, last = args.seeds.partition("-")
-    if not first.isdigit() or not (last or first).isdigit() or int(last or first) < int(first):
-        raise FormatError(f"--seeds {args.seeds} cannot be read; write FIRST-LAST, e.g. 201-208")
-    seeds = range(int(first), int(last or first) + 1)
-    told = calibrate.measure(seeds, args.ablate, options.Log(), jobs=args.jobs) | score.provenance()
-    if args.json:
-        whole(args.json, (json.dumps(told, indent=1) + "\n").encode())
-    print(calibrate.table(told))
-
-
-def run_chart(args: argparse.Namespace) -> None:
-    """The picture's name."""
-    results: list[dict[str, Any]] = []
-    for path in args.results:
-        try:
-            results += json.loads(path.read_bytes())
-        except ValueError as e:
-            raise FormatError(f"{path.name}: not what evaluate wrote: {e}") from e
-    whole(args.out, chart.matrix(results, count="recording" if args.recordings else "window").encode())
-    print(args.out)
 
 
 def run_fit(args: argparse.Namespace) -> None:

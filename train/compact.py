@@ -1,76 +1,109 @@
-"""The room of the compact network, the box's own. In: the form of a sweep. Out: the network and its ONNX graph."""
+"""The room of the compact network, the box's own. In: a Shape and the form of a sweep. Out: the network in PyTorch.
+
+Its shapes stand in ladder.py; exact.py writes its graphs, for int8 too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from appliance.errors import FormatError
 from appliance.sweep import SweepFormat
 
-from .graphs import Graph, centred, with_head
+from . import exact
+from .graphs import with_head
+from .ladder import CAP, FLOOR, USUAL, Shape
+from .loop import in_order, tensors
 from .networks import Network
 
-CHANNELS = 32
-"""Of each stage: the fewest for which Arm's symmetric int8 kernel is used."""
-FLOOR = 0.02
-"""Added to a mean activation before its logarithm: a silent channel stays finite."""
-LEAST_STEPS = 24
-"""Time steps that the last stage should have: a mean over less is mostly noise."""
+Array = NDArray[Any]
+MAINS_HZ = 50.0
+"""Where 60 Hz hums, a kernel of some 20 ms hears little of it as well."""
+CALIBRATION_SWEEPS = 96
+PERCENTILE = 99.9
+"""Of the values that int8 must reach: with their full range one outlier sweep takes the resolution from all others."""
 
 
-def stages(window: int) -> tuple[tuple[int, int], ...]:
-    """(kernel, stride) of the three stages for a window of so many frames.
+class ZeroSum(nn.Conv1d):
+    """A convolution whose taps sum to zero for every filter and taxel: no offset can move it.
 
-    The first stride is the largest of 4, 2, 1 that leaves LEAST_STEPS after the last stage, and 1 where none does; its
-    kernel is four strides. 1500 frames: 16/4, then 5/2 twice. 128 frames: 4/1, then 5/2 twice.
-    Raises FormatError where the window is too short for any.
+    Gradient descent may hold any taps; what is not wanted of them is taken away. mains: how many of its periods pass
+    from one frame to the next; their hum is not wanted either.
     """
-    for stride in (4, 2, 1):
-        plan = ((4 * stride, stride), (5, 2), (5, 2))
-        steps = window
-        for kernel, by in plan:
-            steps = (steps - kernel) // by + 1
-        if steps >= LEAST_STEPS:
-            return plan
-    if steps < 1:
-        raise FormatError(f"a window of {window} frames is too short for the network; record at least 16")
-    return plan
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, mains: float = 0.0) -> None:
+        super().__init__(inputs, outputs, kernel, stride)
+        turn = 2 * np.pi * mains * np.arange(kernel)
+        unwanted = np.stack([np.ones(kernel), np.sin(turn), np.cos(turn)][: 3 if mains else 1], axis=1)
+        self.unwanted = torch.from_numpy(np.linalg.qr(unwanted)[0].astype(np.float32))
+
+    def wanted(self, weight: Tensor) -> Tensor:
+        """The taps themselves [filters, taxels, kernel]."""
+        return weight - weight @ self.unwanted @ self.unwanted.T
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, taxels, T] -> [B, filters, steps]."""
+        return self._conv_forward(x, self.wanted(self.weight), self.bias)
+
+
+def capped(x: Tensor) -> Tensor:
+    """Taxels [B, R * C, T], those that tremble far more than others turned down; see ladder.Cap."""
+    step, place = CAP.step(x.shape[2]), CAP.place(x.shape[1])
+    trembling = (x[:, :, 1::step] - x[:, :, :-1:step]).abs().mean(2, keepdim=True)
+    limit = CAP.times * trembling.topk(place + 1, dim=1).values[:, -1:]
+    return torch.where((trembling > limit) & (limit > 0), x * (limit / trembling), x)
 
 
 class Compact(Network):
-    """Three strided convolutions over time with the taxels as channels; the head sees each one's mean activation.
+    """Strided convolutions over time with the taxels as channels; the head sees the log of every mean response.
 
-    Each taxel's mean over the window is taken away first: what is left is texture, and int8 does not spend its range
-    on the offset. `scale` makes the rest about 1. Batch norms serve training only; `fused` folds them in.
-    keep_means: show the head the means as well, for comparison: where materials were recorded one after another they
-    tell the session rather than the material.
+    Where the window is long the first kernels sum to zero and do not hear the mains: what is left is texture, and int8
+    may take the digits as they are. `scale` makes the texture about 1. For inference the batch norms, which only serve
+    training, are folded in by `fused`.
+    keep_means: show the head each taxel's mean as well, for comparison: where materials were recorded one after another
+    they tell the session rather than the material.
     """
 
     def __init__(
-        self, form: SweepFormat, classes: int, scale: float, norm: bool = True, keep_means: bool = False
+        self,
+        form: SweepFormat,
+        classes: int,
+        scale: float,
+        norm: bool = True,
+        keep_means: bool = False,
+        shape: Shape = USUAL,
     ) -> None:
         super().__init__(form, scale)
-        self.keep_means = keep_means
-        plan = stages(form.window)
-        inputs = (form.rows * form.cols,) + (CHANNELS,) * (len(plan) - 1)
-        self.convs = nn.ModuleList(nn.Conv1d(n, CHANNELS, k, s) for n, (k, s) in zip(inputs, plan, strict=True))
-        self.norms = nn.ModuleList(nn.BatchNorm1d(CHANNELS) if norm else nn.Identity() for _ in plan)
-        self.head = nn.Linear(CHANNELS * len(plan) + keep_means * inputs[0], classes)
+        self.keep_means, self.shape = keep_means, shape
+        stages, inputs = shape.stages(form.window), (form.rows * form.cols, *shape.channels)
+        self.convs = nn.ModuleList(
+            nn.Conv1d(before, after, stage.kernel, stage.stride)
+            for before, after, stage in zip(inputs, shape.channels, stages, strict=False)
+        )
+        if shape.zero_sum(form.window):
+            first = stages[0]
+            periods = first.kernel * MAINS_HZ / form.rate_hz
+            mains = MAINS_HZ / form.rate_hz if norm and 1 <= periods <= first.kernel / 4 else 0.0
+            self.convs[0] = ZeroSum(inputs[0], inputs[1], first.kernel, first.stride, mains)
+        self.norms = nn.ModuleList(nn.BatchNorm1d(n) if norm else nn.Identity() for n in shape.channels)
+        self.head = nn.Linear(sum(shape.channels) + keep_means * inputs[0], classes)
+
+    def responses(self, prepared: Tensor) -> list[Tensor]:
+        """[B, R * C, T] -> of each stage its responses [B, channels, steps], none below 0."""
+        x, of_stages = capped(prepared), []
+        for conv, norm in zip(self.convs, self.norms, strict=True):
+            of_stages.append(x := torch.relu(norm(conv(x))))
+        return of_stages
 
     def features(self, prepared: Tensor) -> Tensor:
-        """[B, R * C, T] -> log mean activations [B, 3 * CHANNELS]."""
-        means, x = [], prepared
-        for conv, norm in zip(self.convs, self.norms, strict=True):
-            x = torch.relu(norm(conv(x)))
-            means.append(x.mean(2))
-        return torch.log(torch.cat(means, 1) + FLOOR)
+        """[B, R * C, T] -> log mean responses [B, sum of channels]."""
+        return torch.log(torch.cat([x.mean(2) for x in self.responses(prepared)], 1) + FLOOR)
 
     def seen(self, digits: Tensor) -> Tensor:
         """Digits [B, T, R, C] -> what the head sees of them [B, F]."""
@@ -80,34 +113,47 @@ class Compact(Network):
 
     def fused(self) -> Compact:
         """The same network for inference, its batch norms folded into the convolutions."""
-        plain = Compact(self.form, self.head.out_features, self.scale, norm=False)
+        plain = Compact(self.form, self.head.out_features, self.scale, norm=False, shape=self.shape)
         plain.head.load_state_dict(self.head.state_dict())
         for mine, conv, norm in zip(plain.convs, self.convs, self.norms, strict=True):
             mine.load_state_dict(fuse_conv_bn_eval(conv.eval(), norm.eval()).state_dict())
+        plain.convs[0].weight.data.copy_(self.first_taps(plain.convs[0].weight))
         return plain.eval()
+
+    def cut(self, depth: int) -> Compact:
+        """Its first stages, behind a head that is yet to be found; of a fused network."""
+        less = Compact(self.form, self.head.out_features, self.scale, False, self.keep_means, self.shape.cut(depth))
+        less.convs.load_state_dict(self.convs[:depth].state_dict())
+        return less.eval()
+
+    def first_taps(self, weight: Tensor) -> Tensor:
+        """What the first convolution makes of its weight."""
+        first = self.convs[0]
+        return first.wanted(weight) if isinstance(first, ZeroSum) else weight
+
+    @torch.no_grad()
+    def weights(self) -> dict[str, Array]:
+        """What `exact.trunk` asks for; of a fused network."""
+        weights = {k: v.numpy() for k, v in self.state_dict().items()}
+        return weights | {"convs.0.weight": self.first_taps(self.convs[0].weight).numpy()}
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; of a fused network."""
-        weights = {k: v.numpy() for k, v in self.state_dict().items()}
-        whole = trunk(self.form, self.scale, weights, self.keep_means)
-        return with_head(whole, weights["head.weight"], weights["head.bias"])
+        weights = self.weights()
+        trunk = exact.trunk(self.form, self.scale, weights, self.shape, keep_means=self.keep_means)
+        return with_head(trunk, weights["head.weight"], weights["head.bias"])
 
-
-def trunk(
-    form: SweepFormat, scale: float, weights: Mapping[str, NDArray[Any]], keep_means: bool = False
-) -> onnx.ModelProto:
-    """`Compact` up to its features: `sweep` -> `features` float32 [1, F]. weights: the state of a fused Compact.
-
-    The first convolution takes the scale along.
-    """
-    g = Graph()
-    x, sums = centred(g, form)
-    means = []
-    for i, (_, stride) in enumerate(stages(form.window)):
-        w, b = weights[f"convs.{i}.weight"], weights[f"convs.{i}.bias"]
-        x = g("Relu", g("Conv", x, g.constant(w if i else w * scale), g.constant(b), strides=[stride]))
-        means.append(g("ReduceMean", x, axes=[2], keepdims=0))
-    seen = g("Log", g("Add", g("Concat", *means, axis=1), g.constant(FLOOR)), output="" if keep_means else "features")
-    if keep_means:
-        g("Concat", seen, g("Mul", sums, g.constant(scale / form.window)), axis=1, output="features")
-    return g.model(form, "features", CHANNELS * len(means) + keep_means * form.rows * form.cols)
+    @torch.no_grad()
+    def reach(self, samples: Array) -> exact.Ranges:
+        """What int8 must reach, found on some of the training sweeps [N, T, R, C]; of a fused network."""
+        some = samples[np.linspace(0, len(samples) - 1, min(CALIBRATION_SWEEPS, len(samples))).astype(int)]
+        level = some[:, : exact.level_frames(self.form.window, self.shape)].mean(
+            axis=1, keepdims=True, dtype=np.float64
+        )
+        kept: list[list[Array]] = [[np.abs(some - level).ravel()], *([] for _ in self.convs)]
+        for digits in tensors(some, in_order(len(some), 32)):
+            for stage, x in zip(kept[1:], self.responses(self.prepare(digits)), strict=True):
+                stage.append(x.numpy().ravel())
+        # a silent set has ranges, too
+        digits, *responses = (max(float(np.percentile(np.concatenate(x), PERCENTILE)), 1e-6) for x in kept)
+        return exact.Ranges(digits, tuple(responses))

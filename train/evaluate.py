@@ -145,10 +145,10 @@ def evaluate(
         same = [method.name for method in known if method.input == kind]
         tasks = {
             (name, *split, i): Task(name, plan.effort, split[1], *fold)
-            for name in same for split, folds in splits.items() for i, fold in enumerate(folds)
+            for name in same for split, parts in splits.items() for i, fold in enumerate(parts)
         }  # fmt: skip
         done: dict[Any, Fold] = {}
-        for (name, protocol, seed, i), fold in _folds(tasks, sweeps, origin["digest"], kind, where):
+        for (name, protocol, seed, i), fold in folds(tasks, sweeps, origin["digest"], kind, where):
             done[name, protocol, seed, i] = fold
             progress(f"{name}, {protocol}, seed {seed}, fold {i + 1}")
             whole = [done.get((name, protocol, seed, k)) for k in range(len(splits[protocol, seed]))]
@@ -156,7 +156,7 @@ def evaluate(
                 yield Result(name, protocol, plan.means_removed, seed, sweeps, whole, origin)  # type: ignore[arg-type]
 
 
-def _folds(tasks: dict[Any, Task], sweeps: SweepSet, data: str, kind: str, where: Where) -> Iterator[tuple[Any, Fold]]:
+def folds(tasks: dict[Any, Task], sweeps: SweepSet, data: str, kind: str, where: Where) -> Iterator[tuple[Any, Fold]]:
     """Every task's Fold: those in the cache first, then the others as they finish.
 
     data: digest of `sweeps`. kind: what the tasks' methods are given of them.

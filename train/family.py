@@ -1,48 +1,95 @@
-"""The room of the box's own method. In: an Effort. Out: the METHOD compact, trained as `palpate-train fit` does."""
+"""The room of the box's own methods. In: an Effort. Out: the METHODS compact-1k to compact-100k, and compact.
+
+Trained as `palpate-train fit` does. The method is what the box runs, the int8 graph; its form "float" is the network it
+was made of.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+import onnx
 from numpy.typing import NDArray
 
-from .fit import Recipe, fit_on
-from .loop import Log, silent
-from .methods import USUAL, Effort, Method
+from .fit import Fit, Recipe, fit_on
+from .graphs import run, with_head
+from .heads import ABSENT
+from .ladder import LADDER, USUAL, Shape
+from .loop import Cost, Log, silent
+from .methods import USUAL as WHOLE
+from .methods import Effort, Method, Model
 from .nets import Trained, parts, ran, shortened
 from .sets import SweepSet
 
 Array = NDArray[Any]
 RECIPE = Recipe()
-GRID_SHIFT = 0.5
-"""Share of the training sweeps that `compact` moves by one row of taxels, where the taxels form a grid (as the bundle
-of the box does); in a line of taxels there is no row to be off by."""
 
 
-def train_compact(sweeps: SweepSet, given: Array, seed: int, *, steps: int, log: Log) -> Trained:
-    """Train the compact network and its closed-form head, as `palpate-train fit` does.
+@dataclass(frozen=True)
+class Int8:
+    """A trained member of the family as the box runs it. forms: "float", the same before quantization.
+
+    made: the fit it comes from, with the sweeps that were trained on and held out. weight [K, F], bias [K]: its head.
+    """
+
+    made: Fit
+    weight: Array
+    bias: Array
+    ran: str
+    cost: Cost = field(default_factory=list)
+    forms: Mapping[str, Model] = field(default_factory=dict)
+
+    def features(self, given: Array, tenths: bool = False, bands: bool = False) -> Array:
+        """Digits [n, T, R, C] -> what the head sees of them, float32 [n, F]; of each tenth [n, 10, F]; see exact.trunk."""
+        return run(self.made.trunk(tenths=tenths, bands=bands), given)
+
+    def logits(self, given: Array) -> Array:
+        """Digits [n, T, R, C] -> float32 [n, K]."""
+        return run(self.graph(), given)
+
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
+        return with_head(self.made.trunk(), self.weight, self.bias)
+
+
+def train_compact(sweeps: SweepSet, given: Array, seed: int, *, shape: Shape, recipe: Recipe, log: Log) -> Int8:
+    """Train a network of this shape and its closed-form heads, as `palpate-train fit` does.
 
     Raises FormatError where only one material occurs, each only once, or a window is too short.
     """
     known = replace(sweeps, samples=given).select(())
-    line = 1 in (known.format.rows, known.format.cols)
-    recipe = replace(RECIPE, steps=steps, row_shift=0.0 if line else GRID_SHIFT)
-    made = fit_on(*parts(known, seed), seed, recipe, log)
-    network = made.network()
-    network.spread(np.unique(sweeps.labels), len(sweeps.materials), 1.0)
-    return Trained(network, ran(recipe, "cpu", False, False), made.cost)
+    made = fit_on(*parts(known, seed), seed, recipe, log, shape)
+    network, present, told = made.network(), np.unique(sweeps.labels), ran(recipe, "cpu", False, False)
+    network.spread(present, len(sweeps.materials), 1.0)
+    head = spread(*made.int8_head(), present, len(sweeps.materials))
+    return Int8(made, *head, told, made.cost, {"float": Trained(network, told, made.cost)})
 
 
-def methods(effort: Effort = USUAL, log: Log = silent) -> tuple[Method, ...]:
+def spread(weight: Array, bias: Array, present: Array, classes: int) -> tuple[Array, Array]:
+    """A head for all `classes`, of which `present` were learnt; as Network.spread."""
+    all_weight, all_bias = np.zeros((classes, weight.shape[1]), np.float32), np.full(classes, ABSENT, np.float32)
+    all_weight[present], all_bias[present] = weight - weight.mean(axis=0), bias - bias.mean()
+    return all_weight, all_bias
+
+
+def methods(effort: Effort = WHOLE, log: Log = silent) -> tuple[Method, ...]:
     """The family, trained with this effort. log: is told of every iteration."""
-    compact = partial(train_compact, steps=shortened(RECIPE, effort).steps, log=log)
+    recipe = shortened(RECIPE, effort)
+
+    def rung(name: str, about: str, shape: Shape) -> Method:
+        train = partial(train_compact, shape=shape, recipe=recipe, log=log)
+        return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations")
+
+    about = "strided convolutions and a closed-form head in int8, about {},000 weights"
+    ladder = (rung(f"compact-{size}", about.format(size[:-1]), shape) for size, shape in LADDER.items())
     return (
-        Method("compact", "the box's own small network with a closed-form head", "raw", compact,
-               effort=f"{compact.keywords['steps']} iterations"),
-    )  # fmt: skip
+        *ladder,
+        rung("compact", "the box's own: the rung of the ladder that is used unless another is asked for", USUAL),
+    )
 
 
 METHODS = methods()

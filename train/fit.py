@@ -8,53 +8,74 @@ changed.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import InitVar, asdict, dataclass, field, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
+from appliance.classifier import LEAST_PROBABILITY, softmax
 from appliance.errors import FormatError
 from appliance.sim.sets import read
 
-from . import loop
+from . import exact, loop
+from .augment import Scene, vary
 from .compact import Compact
+from .graphs import run
 from .heads import closed_form_head, hold_out
-from .loop import Cost, Log, in_order, learn, one_thread, silent, tensors
+from .ladder import USUAL, Shape
+from .loop import Cost, Log, Vary, in_order, learn, one_thread, silent, tensors
 from .networks import Network, texture_scale
 from .score import figure
 from .sets import SweepSet
 
 Array = NDArray[Any]
+Seen = tuple[tuple[Array, Array], ...]
+COPIES = 2
+"""Of the training sweeps, changed as in training, that the closed-form head sees beside them."""
 
 
 @dataclass(frozen=True)
 class Recipe(loop.Recipe):
     """How the compact network is trained.
 
-    row_shift: share of sweeps moved by one row of taxels. stretch: largest change of speed. Both are drawn per sweep.
+    scene: what varies, and so do the training sweeps; gain and noise are its matter.
     keep_means: see Compact; the convolutions never see them, the closed-form head does.
     """
 
-    row_shift: float = 0.0
-    stretch: float = 0.0
+    steps: int = 600
+    noise: float = 0.0
+    gain: float = 0.0
+    scene: Scene = field(default_factory=Scene)
     keep_means: bool = False
+    row_shift: InitVar[float | None] = None  # until the command gives a scene
+    stretch: InitVar[float | None] = None
+
+    def __post_init__(self, row_shift: float | None, stretch: float | None) -> None:
+        given = {k: v for k, v in (("moved", row_shift), ("stretch", stretch)) if v is not None}
+        object.__setattr__(self, "scene", replace(self.scene, **given))
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A trained network. weights: the state of a fused Compact with its LDA head, the temperature folded in.
+    """A trained network. weights: the state of a fused Compact with its LDA head, the temperature folded in; and another
+    head, `int8.weight` [K, F] and `int8.bias` [K], fitted on what the int8 trunk gives.
 
-    train, held: what was trained on and what was held out. about: JSON of how it was made and how it did.
-    cost: (step, cross entropy) of the training; the file does not keep it.
+    shape: its rung. reach: what its int8 form reaches. train, held: what was trained on and what was held out.
+    about: JSON of how it was made and how it did. cost: (step, cross entropy) of the training; the file does not keep it.
     """
 
     weights: dict[str, Array]
     scale: float
+    shape: Shape
+    reach: exact.Ranges
     train: SweepSet
     held: SweepSet
     about: dict[str, Any]
@@ -68,9 +89,20 @@ class Fit:
     def network(self) -> Compact:
         """The network in PyTorch, ready to run."""
         with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and written over
-            model = Compact(self.train.format, len(self.train.materials), self.scale, False, self.keep_means)
-        model.load_state_dict({k: torch.from_numpy(v) for k, v in self.weights.items()})
+            form, classes = self.train.format, len(self.train.materials)
+            model = Compact(form, classes, self.scale, False, self.keep_means, self.shape)
+        state = {k: torch.from_numpy(v) for k, v in self.weights.items() if not k.startswith("int8.")}
+        model.load_state_dict(state)
         return model.eval()
+
+    def trunk(self, int8: bool = True, tenths: bool = False, bands: bool = False) -> onnx.ModelProto:
+        """`sweep` -> `features` float32 [1, F], or `tenths` float32 [1, 10, F]; see exact.trunk."""
+        reach, form = self.reach if int8 else None, self.train.format
+        return exact.trunk(form, self.scale, self.weights, self.shape, reach, tenths, self.keep_means, bands)
+
+    def int8_head(self) -> tuple[Array, Array]:
+        """Weight [K, F] and bias [K] of the int8 trunk's head, the temperature folded in."""
+        return self.weights["int8.weight"], self.weights["int8.bias"]
 
     def save(self, path: Path) -> None:
         """Write the fit as one .npz without pickle; training and held-out sweeps are one set with a mark."""
@@ -80,7 +112,7 @@ class Fit:
         arrays = {f"weight_{k}": v for k, v in self.weights.items()} | both
         for name in self.train.groups:
             arrays[f"group_{name}"] = np.concatenate([self.train.groups[name], self.held.groups[name]])
-        meta = {"scale": self.scale, "materials": self.train.materials, "rate_hz": self.train.rate_hz,
+        meta = {"scale": self.scale, "shape": asdict(self.shape), "reach": asdict(self.reach), "materials": self.train.materials, "rate_hz": self.train.rate_hz,
                 "source": self.train.source, "trained_on": len(self.train), "about": self.about}  # fmt: skip
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as f:
@@ -99,55 +131,96 @@ class Fit:
             samples, labels, materials = held["set_samples"], held["set_labels"], tuple(meta["materials"])
             whole = SweepSet(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
             first = np.arange(len(whole)) < meta["trained_on"]
-            return cls(weights, meta["scale"], whole.take(first), whole.take(~first), meta["about"])
+            shape = Shape(**meta["shape"] | {"channels": tuple(meta["shape"]["channels"])})
+            reach = exact.Ranges(meta["reach"]["digits"], tuple(meta["reach"]["responses"]))
+            made = cls(weights, meta["scale"], shape, reach, whole.take(first), whole.take(~first), meta["about"])
         except (KeyError, ValueError, TypeError) as e:
-            raise FormatError(f"{path.name}: not {what}: {e}") from e
+            raise FormatError(f"{path.name}: not {what}, or of another version; fit again: {e}") from e
+        try:
+            made.network()
+        except RuntimeError as e:
+            raise FormatError(f"{path.name}: its weights are not those of its {shape}; fit again") from e
+        return made
 
 
-def fit(sweeps: SweepSet, seed: int, recipe: Recipe, log: Log = silent) -> Fit:
+def fit(sweeps: SweepSet, seed: int, recipe: Recipe, log: Log = silent, shape: Shape = USUAL) -> Fit:
     """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it, and for windows too short."""
-    return fit_on(*hold_out(sweeps, seed), seed, recipe, log)
+    return fit_on(*hold_out(sweeps, seed), seed, recipe, log, shape)
 
 
-def fit_on(train: SweepSet, held: SweepSet, by: str, seed: int, recipe: Recipe, log: Log = silent) -> Fit:
+def fit_on(
+    train: SweepSet, held: SweepSet, by: str, seed: int, recipe: Recipe, log: Log = silent, shape: Shape = USUAL
+) -> Fit:
     """Train on `train`; `held` gives temperature and validation. by: how they were parted, for the story."""
-    scale = texture_scale(train.samples)
-    with one_thread(), torch.random.fork_rng(devices=[]):
+    scale, change = texture_scale(train.samples), partial(varied, rows=train.format.rows, scene=recipe.scene)
+    with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
-        model, cost = learn(
-            Compact(train.format, len(train.materials), scale),
-            train,
-            recipe,
-            seed,
-            log,
-            vary=partial(vary, rows=train.format.rows, recipe=recipe),
-        )
+        model = Compact(train.format, len(train.materials), scale, shape=shape)
+        with torch.enable_grad():
+            model, cost = learn(model, train, recipe, seed, log, vary=change)
         model.keep_means = recipe.keep_means
-        seen, unseen = features(model, train), features(model, held)
-    weight, bias = closed_form_head(seen, train.labels, unseen, held.labels)
-    weights = {k: v.numpy() for k, v in model.state_dict().items()} | {"head.weight": weight, "head.bias": bias}
-    right = int(np.sum((unseen @ weight.T + bias).argmax(1) == held.labels))
+        reach = model.reach(train.samples)
+        seen = _seen(model, reach, train, held, copies(model, train, change, seed))
+        model, weights = _judged(model, seen, np.tile(train.labels, COPIES + 1), held.labels)
+        right = int(np.sum(model(torch.from_numpy(held.samples.astype(np.float32))).argmax(1).numpy() == held.labels))
     about = {"seed": seed, "recipe": asdict(recipe), "held_out_by": by, "validation": figure(right, len(held))}
-    return Fit(weights, scale, train, held, about, cost)
+    reach = replace(reach, responses=reach.responses[: len(model.convs)])
+    return Fit(weights, scale, model.shape, reach, train, held, about, cost)
 
 
-def vary(x: Tensor, rng: Generator, rows: int, recipe: Recipe) -> Tensor:
-    """Sweeps [B, R * C, T] as another attachment and speed would have given them."""
-    if recipe.row_shift:
-        grid = x.unflatten(1, (rows, -1))
-        moved = torch.rand(len(x), 1, generator=rng) < recipe.row_shift
-        source = torch.arange(rows) + moved * (2 * torch.randint(0, 2, (len(x), 1), generator=rng) - 1)
-        # nobody knows what lies under the row that comes in: as much as its neighbour feels, nothing, or between
-        level = torch.where((source < 0) | (source >= rows), torch.rand(len(x), 1, generator=rng), 1.0)
-        x = (grid[torch.arange(len(x))[:, None], source.clamp(0, rows - 1)] * level[..., None, None]).flatten(1, 2)
-    if recipe.stretch:
-        last = x.shape[2] - 1
-        speed = 1 + recipe.stretch * (2 * torch.rand(len(x), 1, generator=rng) - 1)
-        at = last - (last - torch.arange(last + 1) * speed).abs()  # past its end a sweep runs back
-        left = at.floor().clamp(0, last - 1)
-        take = left.long()[:, None].expand_as(x)
-        x = torch.lerp(x.gather(2, take), x.gather(2, take + 1), (at - left)[:, None])
-    return x
+def _seen(model: Compact, reach: exact.Ranges, train: SweepSet, held: SweepSet, more: Iterable[SweepSet]) -> Seen:
+    """What the heads see of the training sweeps with their copies, and of those held out: (float, int8)."""
+    trunk = exact.trunk(model.form, model.scale, model.weights(), model.shape, reach, keep_means=model.keep_means)
+    asked = (partial(features, model), lambda sweeps: run(trunk, sweeps.samples))
+    rows = [[ask(sweeps) for ask in asked] for sweeps in chain([train], more)]
+    return tuple(
+        (np.concatenate(of_all), ask(held)) for of_all, ask in zip(zip(*rows, strict=True), asked, strict=True)
+    )
+
+
+def _judged(model: Compact, seen: Seen, labels: Array, held_labels: Array) -> tuple[Compact, dict[str, Array]]:
+    """The network behind the heads, and all weights of a Fit.
+
+    The heads see the first stages, as many as name the held-out sweeps with the least surprise; what comes after them
+    is cut off. Later stages know the training sweeps too well, and a head that was found on these trusts them too much.
+    """
+    size = sum(model.shape.channels)
+    surprise = []
+    for depth in range(1, len(model.convs) + 1):
+        columns = np.r_[: sum(model.shape.channels[:depth]), size : seen[1][0].shape[1]]
+        heads = [closed_form_head(x[:, columns], labels, y[:, columns], held_labels) for x, y in seen]
+        weight, bias = heads[1]
+        p = softmax(seen[1][1][:, columns] @ weight.T + bias)[np.arange(len(held_labels)), held_labels]
+        surprise.append((-np.log(np.maximum(p, LEAST_PROBABILITY)).mean(), depth, heads))
+    _, depth, heads = min(surprise, key=lambda one: one[:2])
+    model = model.cut(depth)
+    named = {
+        f"{name}.{k}": v
+        for name, head in zip(("head", "int8"), heads, strict=True)
+        for k, v in zip(("weight", "bias"), head, strict=True)
+    }
+    model.head.weight.data, model.head.bias.data = (torch.from_numpy(named[f"head.{k}"]) for k in ("weight", "bias"))
+    return model, {k: v.numpy() for k, v in model.state_dict().items()} | named
+
+
+def varied(x: Tensor, rng: Generator, rows: int, scene: Scene) -> Tensor:
+    """augment.vary, as the loop calls it."""
+    return vary(x, rows, scene, rng)
+
+
+def copies(model: Compact, sweeps: SweepSet, change: Vary, seed: int) -> Iterator[SweepSet]:
+    """The sweeps again COPIES times as the scene might have given them: the head must know how materials vary, too."""
+    rng, kind = torch.Generator().manual_seed(seed), sweeps.samples.dtype
+    for _ in range(COPIES):
+        changed = np.empty_like(sweeps.samples)
+        picks = in_order(len(sweeps))
+        for pick, digits in zip(picks, tensors(sweeps.samples, picks), strict=True):
+            x = change(model.prepare(digits), rng) / model.scale
+            x = x.transpose(1, 2).unflatten(2, digits.shape[2:]) + digits.mean(1, keepdim=True)
+            if kind.kind != "f":
+                x = x.round().clamp(np.iinfo(kind).min, np.iinfo(kind).max)
+            changed[pick.numpy()] = x.numpy()
+        yield replace(sweeps, samples=changed)
 
 
 @torch.no_grad()

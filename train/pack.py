@@ -34,8 +34,11 @@ from .score import figure
 from .sets import SweepSet
 
 Array = NDArray[Any]
-MOST_REFUSED = 0.05
-"""Share of held-out sweeps that the box may refuse (stuck taxels, say); more means that its thresholds do not fit."""
+MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
+"""Shares of held-out sweeps that the box may refuse (stuck taxels, say), and call unknown, of which its limit makes some
+.05; more means that thresholds or limit do not fit."""
+REFUSED, UNKNOWN = -1, -2
+"""What `score` gives instead of a label."""
 
 
 class ExportRefused(BundleError):
@@ -44,10 +47,11 @@ class ExportRefused(BundleError):
 
 @dataclass(frozen=True)
 class Content:
-    """What goes into a bundle. model: `sweep` or `features` -> `logits`. input: as in the manifest.
+    """What goes into a bundle. model: `sweep` or `features` -> `logits`, and what `early` and `known` need. input: as in
+    the manifest.
 
     train, held: what it was trained on and what it was not, parted by `held_by`. about: how it was made, figures: how
-    it did, for the manifest.
+    it did, for the manifest. early, known: for the manifest, with the file means.npz where there is `known`.
     """
 
     model: onnx.ModelProto
@@ -57,6 +61,9 @@ class Content:
     held_by: str
     about: dict[str, Any]
     figures: dict[str, Any] = field(default_factory=dict)
+    early: bundle.Early | None = None
+    known: bundle.Known | None = None
+    means: bytes = b""
 
 
 def pack(
@@ -70,9 +77,10 @@ def pack(
     train, held = content.train, content.held
     golden = golden_sweeps(train, run(content.model, given(content.input, train)))
     files = {bundle.MODEL: content.model.SerializeToString(), bundle.GOLDEN: golden}
+    files |= {bundle.MEANS: content.means} if content.known else {}
     manifest = bundle.Manifest(
         name=name, version=version, format=train.format, input=content.input, labels=train.materials,
-        thresholds=thresholds(train, full_scale), files={k: bundle.file_entry(v) for k, v in files.items()},
+        thresholds=thresholds(train, full_scale), early=content.early, known=content.known, files={k: bundle.file_entry(v) for k, v in files.items()},
         made={"commit": commit, "set": train.source, "machine": platform.machine(), "cpus": os.cpu_count(),
               "torch": torch.__version__, "onnxruntime": onnxruntime.__version__} | content.about,
     )  # fmt: skip
@@ -124,24 +132,26 @@ def thresholds(sweeps: SweepSet, full_scale: float | None) -> bundle.Thresholds:
 
 
 def score(classifier: Classifier, sweeps: SweepSet, *, fused: bool = False) -> Array:
-    """Labels that the box gives, int64 [N] into the bundle's, -1 where it refuses the sweep.
+    """Labels that the box gives, int64 [N] into the bundle's, or REFUSED or UNKNOWN.
 
     fused: each sweep gets what the box says after all of its recording.
     """
     form, labels = sweeps.format, classifier.bundle.manifest.labels
     t_ns, seq = (np.arange(form.window) * form.period_ns).astype(np.int64), np.arange(form.window)
     recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
-    given = np.full(len(sweeps), -1)
+    given = np.full(len(sweeps), REFUSED)
     for i in np.argsort(recording, kind="stable"):
         frames = Frames(t_ns, seq, sweeps.samples[i])
         verdict = classifier(Sweep(int(i), 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1)))
         if verdict.label:
             given[recording == recording[i] if fused else i] = labels.index(verdict.label)
+        elif verdict.status is Status.UNKNOWN and not fused:
+            given[i] = UNKNOWN
     return given
 
 
 def figures(classifier: Classifier, sweeps: SweepSet, protocol: str) -> dict[str, Any]:
-    """Accuracy by sweep, and by recording where one holds several; what the box refuses counts as wrong."""
+    """Accuracy by sweep, and by recording where one holds several; what the box refuses or does not know is wrong."""
     right = score(classifier, sweeps) == sweeps.labels
     told = {protocol: figure(int(right.sum()), len(sweeps))}
     first = np.unique(sweeps.group("recording"), return_index=True)[1]
@@ -159,13 +169,18 @@ def judge(folder: Path, held: SweepSet, logits: Array, protocol: str) -> dict[st
     box = Classifier(bundle.load(folder), SystemClock())
     box.self_test()
     given = score(box, held)
-    refused = given < 0
-    if other := int(np.sum((given != logits.argmax(1)) & ~refused)):
+    refused, unknown = given == REFUSED, given == UNKNOWN
+    if other := int(np.sum((given != logits.argmax(1)) & (given >= 0))):
         raise ExportRefused(f"the box labels {other} of {len(held)} held-out sweeps otherwise than export did")
     if refused.mean() > MOST_REFUSED:
         raise ExportRefused(
             f"the box would refuse {refused.sum()} of {len(held)} held-out sweeps (limit {MOST_REFUSED:.0%}); "
             f"see their thresholds {box.bundle.manifest.thresholds}, and drop sweeps with stuck taxels from the set"
+        )
+    if unknown.mean() > MOST_UNKNOWN:
+        raise ExportRefused(
+            f"the box would call {unknown.sum()} of {len(held)} held-out sweeps unknown (limit {MOST_UNKNOWN:.0%}, "
+            f"squared distance {box.bundle.manifest.known}); record more positions, so that it learns how sweeps vary"
         )
     return figures(box, held, protocol)
 

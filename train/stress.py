@@ -92,7 +92,8 @@ def run(
              for method in methods.find(names, effort) for seed in seeds}  # fmt: skip
     paths = {task: where.cache / f"{key}.json" for task, key in tasks.items() if where.cache}
     done = {task: json.loads(path.read_text()) for task, path in paths.items() if path.exists()}
-    left, progress = [task for task in tasks if task not in done], pool.Progress(len(tasks) - len(done), log)
+    left = [task for task in tasks if task not in done and not where.kept]
+    progress = pool.Progress(len(left), log)
     for task, told in pool.results(_one, left, (train, trial, effort), where.jobs, where.scheduler):
         done[task] = told
         if where.cache:

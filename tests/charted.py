@@ -1,0 +1,30 @@
+"""A small chart for tests: dots as chart.json lists them, with a front that is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def dot(method: str, precision: str, ms: float, hard: float, lopo: float | None = None, **more: Any) -> dict[str, Any]:
+    """One dot with an interval of two points each way; bigger where it is slower."""
+    accuracy = {key: {"mean": mean, "low": round(mean - 0.02, 4), "high": round(mean + 0.02, 4), "n": 100, "seeds": [1]}
+                for key, mean in (("hard", hard), ("lopo", lopo)) if mean is not None}  # fmt: skip
+    return {
+        "method": method, "precision": precision, "runtime": "onnx", "weights": round(1e5 * ms), "macs": round(5e7 * ms),
+        "file_kb": 1000 * ms, "bundle_kb": 1000 * ms + 25, "rss_mb": 60 - ms, "ms_p50": ms, "ms_p99": 2 * ms,
+        "touch_s": 2.0, "runs_on_box": True, "family": "Palpate", "accuracy": accuracy, "seeds": [1], "set": "sim:T-REAL:1",
+        "commit": "abc", "machine": "x86_64, 2 cores",
+    } | more  # fmt: skip
+
+
+DOTS = [
+    dot("compact-1k", "int8", 0.02, 0.90, 0.91),
+    dot("compact-1k", "float", 0.05, 0.91, 0.92),
+    dot("compact-20k", "int8", 0.04, 0.95, 0.93),
+    dot("H-svm", "float", 0.5, 0.93, 0.96, family="L and H"),
+    dot("L-gauss", "float", 0.1, 0.6, 0.6, family="L and H"),
+    dot("minirocket", "float", 50.0, 0.96, family="MiniRocket"),
+    dot("minirocket", "float", 9.0, 0.96, runtime="aeon", runs_on_box=False, family="MiniRocket"),
+]
+FRONT = {"hard": [0, 2, 6], "lopo": [0, 2, 3]}
+"""Numbers of the dots on the front over ms_p50, cheapest first."""

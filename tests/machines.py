@@ -1,0 +1,171 @@
+"""The room of other processors. In: folders with bundles and sweeps. Out: what the box's classifier says of them there.
+
+`python tests/machines.py` gets what an arm64 userland needs, once, into ~/.cache/palpate/machines: Debian's packages
+unpacked, the wheels of appliance/requirements.lock beside them. qemu's user mode runs it, and x86 processors older than
+this one; nothing needs root, and nothing outside that folder is changed. `python tests/machines.py FROM TO` is what
+then runs on each machine, this one too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+LOCK = ROOT / "appliance" / "requirements.lock"
+HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palpate" / "machines"
+MACHINES = {
+    "x86, AVX2 without VNNI": ("x86_64", "Haswell"),
+    "x86, SSE4 without AVX": ("x86_64", "Nehalem"),
+    "Raspberry Pi 4": ("aarch64", "cortex-a72"),
+    "Raspberry Pi 5": ("aarch64", "cortex-a76"),
+    "Arm with all that qemu knows": ("aarch64", "max"),
+}
+"""Name: (architecture, processor as qemu calls it). The Pi 5 has dot products of eight bits, the Pi 4 has not."""
+PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
+PACKAGES = (f"{PYTHON}-minimal", f"lib{PYTHON}-stdlib", "libstdc++6")
+PLATFORMS = [f"manylinux{tag}_aarch64" for tag in ("_2_28", "_2_27", "_2_17", "2014")]
+CPUINFO = (
+    "processor\t: 0\nFeatures\t: fp asimd\nCPU implementer\t: 0x41\n"
+    "CPU architecture: 8\nCPU variant\t: 0x0\nCPU part\t: 0xd08\nCPU revision\t: 3\n"
+)
+"""onnxruntime counts cores there and crashes on an x86's; what the processor can do it asks the kernel, here qemu."""
+
+
+class Missing(Exception):
+    """What another machine needs is not to be had here."""
+
+
+def folder() -> Path:
+    """Where the arm64 userland lies, or will: another one for another lock or Python."""
+    name = hashlib.sha256(LOCK.read_bytes() + PYTHON.encode()).hexdigest()[:16]
+    return HOME / name
+
+
+def qemu(kind: str) -> str:
+    """The emulator of an architecture: this machine's, else the one that `set_up` got. Raises Missing."""
+    for name in (f"qemu-{kind}-static", f"qemu-{kind}"):
+        if found := shutil.which(name, path=f"{os.environ['PATH']}:{folder() / 'qemu' / 'usr' / 'bin'}"):
+            return found
+    raise Missing(f"no qemu-{kind} here; apt-get install qemu-user-static, or run python tests/machines.py")
+
+
+def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
+    """Arguments and environment that run this file on one of MACHINES. Raises Missing."""
+    kind, processor = MACHINES[name]
+    if platform.machine() != "x86_64":
+        raise Missing("other processors are compared with an x86")
+    run = [qemu(kind), "-cpu", processor]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    if kind == platform.machine():
+        return [*run, sys.executable, __file__, *map(str, args)], env
+    usr = folder() / "root" / "usr"
+    if not usr.exists():
+        raise Missing("no arm64 userland here; run python tests/machines.py (30 s, 300 MB in ~/.cache/palpate)")
+    env |= {"PYTHONPATH": f"{folder() / 'site'}:{ROOT}", "PYTHONHOME": str(usr)}
+    return [*run, "-L", str(usr.parent), str(usr / "bin" / PYTHON), __file__, *map(str, args)], env
+
+
+def set_up() -> Path:
+    """The folder of the arm64 userland, made where it is not there. Raises Missing where apt or pip cannot."""
+    target = folder()
+    if target.exists():
+        return target
+    part = target.with_suffix(f".{os.getpid()}.part")
+    for made in ("lists/partial", "archives/partial", "root/proc", "root/sys/devices/system/cpu", "qemu"):
+        (part / made).mkdir(parents=True)
+    try:
+        _unpack(part)
+        _install(part / "site")
+        (part / "root/proc/cpuinfo").write_text(CPUINFO)
+        for file in ("possible", "present"):
+            (part / "root/sys/devices/system/cpu" / file).write_text("0\n")
+        for rest in ("lists", "archives"):
+            shutil.rmtree(part / rest)
+        for other in (part / "qemu/usr/bin").glob("*"):  # 20 MB each
+            if "x86_64" not in other.name and "aarch64" not in other.name:
+                other.unlink()
+        with suppress(OSError):  # somebody else was quicker
+            part.rename(target)
+    except subprocess.CalledProcessError as e:
+        raise Missing(f"{' '.join(map(str, e.cmd[:3]))} failed: {(e.stderr or e.stdout).strip()[-300:]}") from e
+    except FileNotFoundError as e:
+        raise Missing(f"no {e.filename} here: this needs Debian's apt and dpkg") from e
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return target
+
+
+def _unpack(part: Path) -> None:
+    """Debian's Python for arm64, and qemu where this machine has none, with all they need; apt checks signatures."""
+    mine = _run("dpkg", "--print-architecture").strip()
+    wanted = {"root": [f"{name}:arm64" for name in PACKAGES]}
+    try:
+        qemu("aarch64"), qemu("x86_64")
+    except Missing:
+        wanted["qemu"] = [f"qemu-user-static:{mine}"]
+    known = '"arm64"; ' + f'"{mine}"; ' * ("qemu" in wanted)
+    (part / "status").write_bytes(b"")
+    (part / "apt.conf").write_text(
+        f'APT::Architecture "arm64"; APT::Architectures {{ {known}}}; APT::Sandbox::User ""; Acquire::Languages "none";\n'
+        f'Dir::State::Lists "{part}/lists"; Dir::State::Status "{part}/status"; Dir::Cache "{part}";\n'
+    )
+    apt = ("env", f"APT_CONFIG={part / 'apt.conf'}", "apt-get", "-qq")
+    _run(*apt, "update")
+    for where, names in wanted.items():
+        _run(*apt, "install", "-y", "--download-only", "--no-install-recommends", *names)
+        for package in (part / "archives").glob("*.deb"):
+            _run("dpkg-deb", "-x", package, part / where)
+            package.unlink()
+
+
+def _install(site: Path) -> None:
+    """The locked wheels for arm64."""
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q", "install", "--no-deps")
+    wheels = ("--only-binary", ":all:", "--implementation", "cp", *(f"--platform={tag}" for tag in PLATFORMS))
+    _run(*pip, *wheels, "--require-hashes", "-r", LOCK, "--target", site)
+
+
+def _run(*args: str | Path) -> str:
+    """A command's output; its errors go into the exception."""
+    return subprocess.run(args, check=True, capture_output=True, text=True).stdout
+
+
+def work(given: Path, told: Path) -> None:
+    """Run what lies in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy, into one .npz.
+
+    A bundle: NAME/golden and NAME/sweeps are its logits. A shown.onnx: NAME/shown [n, ...] is all that it gives for the
+    sweeps, one after another.
+    """
+    import numpy as np
+
+    from appliance import bundle, classifier, clock
+
+    said = {}
+    for path in sorted(given.iterdir()):
+        sweeps = np.load(path / "sweeps.npy")
+        if (path / bundle.MANIFEST).exists():
+            box = classifier.Classifier(bundle.load(path), clock.SystemClock())
+            said[f"{path.name}/golden"] = np.stack([box.logits(sweep) for sweep in box.bundle.golden])
+            said[f"{path.name}/sweeps"] = np.stack([box.logits(sweep) for sweep in sweeps])
+        if (path / "shown.onnx").exists():
+            run = classifier.session((path / "shown.onnx").read_bytes())
+            each = [run.run(None, {run.get_inputs()[0].name: sweep[None]}) for sweep in sweeps]
+            said[f"{path.name}/shown"] = np.stack([np.concatenate([x.ravel() for x in one]) for one in each])
+    np.savez(told, **said)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 3:
+        work(Path(sys.argv[1]), Path(sys.argv[2]))
+    else:
+        try:
+            print(set_up())
+        except Missing as e:
+            sys.exit(str(e))

@@ -1,0 +1,311 @@
+"""The family: what a rung costs, what int8 keeps exactly, what a tenth knows, that a method is its int8 graph."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from onnx import numpy_helper
+from test_sets import easy
+
+from appliance.sim import skin
+from appliance.sweep import SweepFormat
+from train import compact, exact, family, fit, graphs
+from train.augment import Scene
+from train.compact import Compact
+from train.fit import Fit, Recipe
+from train.ladder import LADDER, Shape
+from train.methods import Effort
+
+SMALL = Shape((6, 8, 8), 8, 2)
+LIMITS = {"compact-10k": (1e6, 24), "compact-100k": (12e6, 96)}
+"""Multiply-accumulates and kilobytes that the issue allows."""
+
+
+def drawn(form: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
+    """Digits of n sweeps: every taxel with an offset of its own, a tone and noise; none trembles far more than others."""
+    rng, t = np.random.default_rng(seed), np.arange(form.window)[:, None, None]
+    taxels = (n, 1, form.rows, form.cols)
+    x = rng.uniform(80, 120, taxels) + rng.uniform(8, 14, taxels) * np.sin(t * rng.uniform(0.6, 1.2, taxels))
+    return (x + rng.standard_normal((n, form.window, form.rows, form.cols))).astype(form.dtype)
+
+
+def trunks(form: SweepFormat, shape: Shape = SMALL, **asked: bool) -> tuple[Compact, onnx.ModelProto, onnx.ModelProto]:
+    """A network with random weights, its float and its int8 trunk."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = Compact(form, 3, 0.1, shape=shape)
+        model.train()(torch.from_numpy(drawn(form).astype(np.float32)))
+    model = model.fused()
+    weights, reach = {k: v.numpy() for k, v in model.state_dict().items()}, model.reach(drawn(form))
+    return model, *(exact.trunk(form, 0.1, weights, shape, r, **asked) for r in (None, reach))
+
+
+def seen(model: Compact, digits: np.ndarray) -> np.ndarray:
+    """What PyTorch's head sees of the digits."""
+    with torch.no_grad():
+        return model.seen(torch.from_numpy(digits.astype(np.float32))).numpy()
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    """A fit on the easy set."""
+    return fit.fit(easy(), 1, Recipe(steps=40), shape=SMALL)
+
+
+@pytest.mark.parametrize(("rows", "cols", "window", "dtype"),
+                         [(4, 4, 1500, "uint8"), (3, 3, 150, "int16"), (1, 1, 20, "uint16"), (16, 1, 128, "float32")])  # fmt: skip
+def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str):
+    """Any digits and window: float to rounding, int8 near it; a silent sweep gives the same as one at another level."""
+    form = SweepFormat(rows, cols, 100.0, window, dtype)
+    model, plain, int8 = trunks(form)
+    digits = drawn(form, seed=1)
+    want = seen(model, digits)
+    np.testing.assert_allclose(graphs.run(plain, digits), want, atol=1e-3)
+    have = graphs.run(int8, digits)
+    assert have.shape == want.shape
+    assert np.abs(have - want).mean() < 0.1
+    silent = np.stack([np.full(digits.shape[1:], level, dtype) for level in (0, 90)])
+    quiet = graphs.run(int8, silent)
+    np.testing.assert_array_equal(quiet[0], quiet[1])
+    assert np.isfinite(quiet).all()
+
+
+def test_no_offset_moves_a_bit_of_bytes():
+    """Every kernel's integer taps sum to zero and need no more than seven bits: offsets change nothing at all."""
+    form = skin.FORMAT
+    _, _, int8 = trunks(form)
+    values = {c.name: numpy_helper.to_array(c) for c in int8.graph.initializer}
+    first = next(v for v in values.values() if v.dtype == np.int8 and v.ndim == 3)
+    np.testing.assert_array_equal(first.sum(axis=2, dtype=int), 0)
+    assert np.abs(first).max() == exact.SEVEN_BITS
+    digits = drawn(form, 2)
+    offset = np.random.default_rng(1).integers(0, 60, (2, 1, 4, 4)).astype(np.uint8)
+    np.testing.assert_array_equal(graphs.run(int8, digits + offset), graphs.run(int8, digits))
+
+
+def test_rounding_to_zero_sums_moves_as_little_as_it_can():
+    """Against all ways to round up or down that sum to zero: none is nearer; whole taps stay as they are."""
+    rng = np.random.default_rng(0)
+    taps = rng.uniform(-60, 60, (40, 3, 6))
+    taps -= taps.mean(axis=2, keepdims=True)
+    have = exact.zero_sum_taps(taps)
+    np.testing.assert_array_equal(have.sum(axis=2), 0)
+    ways = np.stack(np.meshgrid(*[(0, 1)] * 6, indexing="ij"), -1).reshape(-1, 6)
+    rounded = np.floor(taps)[:, :, None] + ways
+    cost = np.where(rounded.sum(3) == 0, np.abs(rounded - taps[:, :, None]).sum(3), np.inf).min(2)
+    np.testing.assert_allclose(np.abs(have - taps).sum(2), cost, atol=1e-9)
+    whole = np.array([[[64.0, -64, 3, -3]]])
+    np.testing.assert_array_equal(exact.zero_sum_taps(whole), whole)
+
+
+@pytest.mark.parametrize("int8", [False, True])
+@pytest.mark.parametrize(("window", "dtype"), [(1500, "uint8"), (128, "int16"), (25, "float32")])
+def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: str):
+    """Row d stays to the bit whatever comes after (d + 1) / 10 of the window, and hears what came just before."""
+    form = SweepFormat(2, 2, 100.0, window, dtype)
+    trunk, whole = trunks(form, tenths=True)[1 + int8], trunks(form)[1 + int8]
+    digits, other = drawn(form, 3), drawn(form, 3, seed=7)
+    want = graphs.run(trunk, digits)
+    assert want.shape == (3, 10, 22)
+    np.testing.assert_allclose(want[:, -1], graphs.run(whole, digits), atol=2e-5)
+    for d in range(9):
+        end = window * (d + 1) // 10
+        have = graphs.run(trunk, np.concatenate([digits[:, :end], other[:, end:]], axis=1))
+        np.testing.assert_array_equal(have[:, : d + 1], want[:, : d + 1])
+        held = graphs.run(
+            trunk, np.concatenate([digits[:, :end], np.repeat(digits[:, end - 1 : end], window - end, 1)], 1)
+        )
+        np.testing.assert_array_equal(held[:, d], want[:, d])
+    if window == 1500:
+        assert not np.array_equal(have[:, 9], want[:, 9])
+        early = digits.copy()
+        early[:, 1200:1300] = other[:, 1200:1300]
+        assert (graphs.run(trunk, early)[:, 8:] != want[:, 8:]).any(axis=2).all()
+
+
+def test_the_first_kernels_do_not_hear_the_mains():
+    """50 Hz of any phase gives nothing, 100 Hz does, in training and after; a kernel shorter than a period hears both."""
+    at = torch.arange(750) / 750
+    hum, tone = (torch.sin(2 * np.pi * hz * at + torch.rand(16, 1)) for hz in (50, 100))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        deaf, short = (Compact(skin.FORMAT, 3, 1.0, shape=Shape((6, 8), kernel, 4)) for kernel in (16, 8))
+    with torch.no_grad():
+        for model in (deaf, deaf.fused()):
+            first = model.convs[0]
+            assert (first(hum) - first.bias[:, None]).abs().max() < 1e-4
+            assert (first(tone) - first.bias[:, None]).abs().max() > 0.1
+        assert (short.convs[0](hum) - short.convs[0].bias[:, None]).abs().max() > 0.1
+
+
+def test_a_trembling_taxel_is_turned_down():
+    """To three times the fifth of sixteen; the others stay to the bit, and all do where only a few are touched."""
+    x = torch.randn(2, 16, 1500, generator=torch.Generator().manual_seed(0))
+    loud = x.clone()
+    loud[0, 3] *= 40
+    have = compact.capped(loud)
+    trembling = (have[:, :, 1::10] - have[:, :, :-1:10]).abs().mean(2)
+    assert trembling[0, 3] == pytest.approx(3 * trembling[0].sort(descending=True).values[4].item(), rel=1e-5)
+    others = torch.arange(16) != 3
+    assert torch.equal(have[:, others], x[:, others])
+    assert torch.equal(have[1], x[1])
+    loud[:, 4:] = 0
+    assert torch.equal(compact.capped(loud), loud)
+    assert torch.equal(compact.capped(loud[:, 3:4]), loud[:, 3:4])
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16"])
+def test_int8_turns_down_as_the_network_does(dtype: str):
+    """A noisy taxel changes the graphs' features as PyTorch's, and by much less than without the cap."""
+    form = SweepFormat(4, 4, 750.0, 600, dtype)
+    model, plain, int8 = trunks(form)
+    digits = drawn(form, 4)
+    digits[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, digits.shape[:2])
+    want = seen(model, digits)
+    np.testing.assert_allclose(graphs.run(plain, digits), want, atol=1e-3)
+    assert np.abs(graphs.run(int8, digits) - want).mean() < 0.1
+
+
+def test_tenths_are_means_of_what_was_known():
+    """In float: the first half's features are those of a window of half the length, as both see the same responses."""
+    form = SweepFormat(2, 2, 100.0, 800, "uint8")
+    model, trunk, _ = trunks(form, tenths=True)
+    digits = drawn(form, 3)
+    half = graphs.run(trunk, digits)[:, 4]
+    np.testing.assert_allclose(half, seen(model, digits[:, :400]), atol=1e-3)
+
+
+@pytest.mark.parametrize("name", LADDER)
+def test_a_rung_costs_what_it_says(name: str):
+    """Weights of the float graph, multiply-accumulates of its convolutions and head; within what the issue allows."""
+    cost = LADDER[name].cost(skin.FORMAT, 6)
+    assert cost.weights == pytest.approx(1000 * int(name[:-1]), rel=0.35)
+    plain = Compact(skin.FORMAT, 6, 0.1, norm=False, shape=LADDER[name]).eval().graph()
+    assert graphs.weight_count(plain) == cost.weights
+    inferred = onnx.shape_inference.infer_shapes(plain, strict_mode=True, data_prop=True).graph
+    steps = {v.name: v.type.tensor_type.shape.dim[-1].dim_value for v in inferred.value_info}
+    sizes = {c.name: c.dims for c in plain.graph.initializer}
+    macs = sum(np.prod(sizes[n.input[1]]) * steps[n.output[0]] for n in plain.graph.node if n.op_type == "Conv")
+    assert cost.macs == macs + np.prod(sizes["head.weight"])
+    macs, kilobytes = LIMITS.get(f"compact-{name}", (12e6, 96))
+    assert cost.macs <= macs
+    _, _, int8 = trunks(skin.FORMAT, shape=LADDER[name])
+    features = sum(LADDER[name].channels)
+    whole = graphs.with_head(int8, np.zeros((6, features)), np.zeros(6))
+    assert len(whole.SerializeToString()) <= kilobytes * 1024
+
+
+def test_every_operator_of_int8_is_fused(tmp_path: Path):
+    """onnxruntime runs whole-number convolutions on bytes in the order they come, integer sums, and turns nothing."""
+    _, _, int8 = trunks(skin.FORMAT, shape=LADDER["20k"])
+    options = onnxruntime.SessionOptions()
+    options.optimized_model_filepath = str(tmp_path / "optimized.onnx")
+    options.log_severity_level = 3
+    onnxruntime.InferenceSession(int8.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    done = Counter(n.op_type for n in onnx.load(tmp_path / "optimized.onnx").graph.node)
+    assert (done["QLinearConv"], done["QLinearMul"], done["MatMulInteger"]) == (3, 1, 3)
+    assert not {"Conv", "DequantizeLinear", "Range", "Less", "MatMul"} & set(done)
+    assert done["Transpose"] == 0
+
+
+def test_the_method_is_its_int8_graph():
+    """Logits are the graph's to the bit; the float form is the fit's network; the same fit gives the same head."""
+    s = easy(12)
+    model = family.methods(Effort(share=0.02))[0].train(s, s.samples, 1)
+    np.testing.assert_array_equal(model.logits(s.samples), graphs.run(model.graph(), s.samples))
+    assert any(n.op_type == "MatMulInteger" for n in model.graph().graph.node)
+    plain = model.forms["float"]
+    np.testing.assert_allclose(plain.logits(s.samples), graphs.run(plain.graph(), s.samples), atol=1e-3)
+    assert not any(n.op_type == "QuantizeLinear" for n in plain.graph().graph.node)
+    weight, bias = model.made.int8_head()
+    z = model.features(s.samples) @ weight.T + bias
+    np.testing.assert_allclose(model.logits(s.samples), z - z.mean(1, keepdims=True), atol=1e-3)
+    assert model.features(s.samples[:2], tenths=True).shape == (2, 10, sum(model.made.shape.channels))
+
+
+def test_the_family_is_one_recipe_in_several_shapes():
+    """Names in order of size; `compact` is one of the ladder; effort reaches all."""
+    made = {m.name: m for m in family.methods(Effort(share=0.01))}
+    assert list(made) == [*(f"compact-{size}" for size in LADDER), "compact"]
+    assert made["compact"].train.keywords["shape"] in LADDER.values()
+    assert {m.effort for m in made.values()} == {"6 iterations"}
+
+
+def test_stages_that_only_know_their_training_are_cut():
+    """The head sees the stages that help where they never were; a cut network gives what its first stages gave."""
+    rng, labels, held = np.random.default_rng(0), np.arange(90) % 3, np.arange(60) % 3
+    model, _, _ = trunks(SweepFormat(2, 2, 100.0, 64, "uint8"))
+    first, second = np.arange(22) < 6, (np.arange(22) >= 6) & (np.arange(22) < 14)
+    for useful, depth in ((first, 1), (second, 2), (~(first | second), 3)):
+        known = 6 * rng.standard_normal((3, 22))
+        x, y = known[labels] + rng.standard_normal((90, 22)), rng.standard_normal((60, 22))
+        y[:, useful] += known[held][:, useful]
+        y[:, ~useful] += 6 * rng.standard_normal((60, (~useful).sum()))
+        less, weights = fit._judged(model, ((x, y), (x, y)), labels, held)
+        assert len(less.convs) == depth
+        assert weights["int8.weight"].shape == weights["head.weight"].shape == (3, sum(SMALL.channels[:depth]))
+    assert less.shape == SMALL.cut(3)
+    digits = drawn(model.form)
+    np.testing.assert_array_equal(seen(model.cut(2), digits), seen(model, digits)[:, :14])
+    assert model.cut(1).shape.stages(64) == SMALL.stages(64)[:1]
+
+
+@pytest.mark.parametrize(("window", "dtype"), [(1500, "uint8"), (128, "int16"), (21, "float32")])
+def test_bands_are_the_power_of_the_taxels_sum(window: int, dtype: str):
+    """Against NumPy's transform, behind the features, in every row of tenths; finite where all is silent."""
+    form = SweepFormat(2, 2, 100.0, window, dtype)
+    digits, edges = drawn(form, 3), exact.band_edges(window)
+    plain, banded, tenths = (
+        trunks(form, shape=SMALL, **asked)[2] for asked in ({}, {"bands": True}, {"bands": True, "tenths": True})
+    )
+    wave = digits.reshape(3, window, 4).mean(axis=2, dtype=np.float64) * 0.1
+    power = (
+        np.abs(np.fft.rfft(wave - wave.mean(axis=1, keepdims=True), 2 ** int(np.ceil(np.log2(window))))) ** 2 / window
+    )
+    want = np.log([[p[a:b].mean() + exact.QUIET for a, b in pairwise(edges)] for p in power])
+    have = graphs.run(banded, digits)
+    np.testing.assert_allclose(have[:, 22:], want, atol=0.02)
+    np.testing.assert_array_equal(have[:, :22], graphs.run(plain, digits))
+    assert (edges[0], edges[-1]) == (round(2 * 2 ** np.ceil(np.log2(window)) / window), len(power[0]))
+    rows = graphs.run(tenths, digits)
+    np.testing.assert_array_equal(rows[:, :, 22:], np.repeat(have[:, None, 22:], 10, axis=1))
+    assert np.isfinite(graphs.run(banded, np.full_like(digits, 9))).all()
+
+
+def test_copies_are_digits_of_the_scene():
+    """Nothing varies: the very sweeps, twice. The default scene: others, of the same type, the same of the same seed."""
+    for s in (easy(4), replace(easy(4), samples=easy(4).samples.astype(np.float32) / 7)):
+        model = Compact(s.format, 3, 0.1, shape=SMALL)
+        still = Scene(shift=0, gain=0, gains=0, silent=0, damped=0, colour=0, noise=0)
+        both = [
+            [c.samples for c in fit.copies(model, s, partial(fit.varied, rows=2, scene=scene), 5)]
+            for scene in (still, Scene(), Scene())
+        ]
+        assert len(both[0]) == fit.COPIES
+        for same, other, again in zip(*both, strict=True):
+            np.testing.assert_allclose(same, s.samples, atol=0 if same.dtype == np.uint8 else 1e-3)
+            assert other.dtype == s.samples.dtype
+            assert (other != s.samples).any(axis=(1, 2, 3)).all()
+            np.testing.assert_array_equal(other, again)
+        assert not np.array_equal(*both[1])
+
+
+def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
+    """With keep_means the head sees each taxel's mean beside the rest, in int8 too, and of each tenth."""
+    s = easy(6)
+    made = fit.fit(s, 1, Recipe(steps=2, keep_means=True), shape=SMALL)
+    level = s.samples.mean(axis=(1,)).reshape(len(s), -1) * made.scale
+    for int8 in (False, True):
+        np.testing.assert_allclose(graphs.run(made.trunk(int8), s.samples)[:, -4:], level, rtol=1e-5)
+        of_tenths = graphs.run(made.trunk(int8, tenths=True), s.samples)
+        np.testing.assert_allclose(of_tenths[:, -1, -4:], level, rtol=1e-5)
+    assert graphs.run(fitted.trunk(), s.samples).shape[1] == sum(fitted.shape.channels)

@@ -1,0 +1,184 @@
+"""Knowing what is known, on Gaussians whose truth is known: the embedding is LDA, the limit keeps what it promises."""
+
+import itertools
+
+import numpy as np
+import onnx
+import pytest
+from scipy.stats import norm
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+from appliance.errors import FormatError
+from appliance.sweep import SweepFormat
+from train import known, spectrum
+from train.graphs import TENSOR, Graph, run
+
+FORM = SweepFormat(2, 2, 100.0, 163, "int16")
+
+
+def gaussians(n: int, means, seed: int = 0, mix=None):
+    """n sweeps of each of `means` [K, F] with covariance mix mix' -> features, labels."""
+    rng, means = np.random.default_rng(seed), np.asarray(means, float)
+    labels = np.repeat(np.arange(len(means)), n)
+    noise = rng.standard_normal((len(labels), means.shape[1]))
+    return means[labels] + (noise if mix is None else noise @ mix), labels
+
+
+def trunk(form: SweepFormat, tenths: bool = False) -> onnx.ModelProto:
+    """`sweep` -> the taxels' means over the window, `features` [1, F], or over its first tenths, `tenths` [1, 10, F]."""
+    g, taxels, length = Graph(), form.rows * form.cols, form.window // 10
+    x = g("Cast", g("Reshape", "sweep", g.constant([form.window, taxels], "int64")), to=1)
+    x = g("Slice", x, g.constant([0], "int64"), g.constant([10 * length], "int64"))
+    x = g("ReduceMean", g("Reshape", x, g.constant([10, length, taxels], "int64")), axes=[1], keepdims=0)
+    x = g("MatMul", g.constant(np.tri(10) / np.arange(1, 11)[:, None]), x)
+    name, shape = ("tenths", [1, 10, taxels]) if tenths else ("features", [1, taxels])
+    x = x if tenths else g("Slice", x, g.constant([9], "int64"), g.constant([10], "int64"))
+    g("Reshape", x, g.constant(shape, "int64"), output=name)
+    given = onnx.helper.make_tensor_value_info("sweep", TENSOR[form.dtype], [1, form.window, form.rows, form.cols])
+    out = onnx.helper.make_tensor_value_info(name, 1, shape)
+    graph = onnx.helper.make_graph(g.nodes, "toy", [given], [out], g.constants)
+    return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+
+
+@pytest.mark.parametrize("whole", [0, 3])
+def test_the_embedding_is_lda(whole: int):
+    """Logits from distances are those of shrinkage LDA with equal priors but for a common term; the covariance is 1."""
+    mix = np.random.default_rng(1).standard_normal((7, 7))
+    x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 7)) @ mix, mix=mix)
+    one = known.embed(x, y, whole)
+    assert one.means.shape == (4, 3 + whole)
+    lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", store_covariance=True).fit(x, y)
+    want = x @ lda.coef_.T + lda.intercept_
+    have = one.logits(x)
+    assert np.allclose(have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=1e-3)
+    half = -one.distances(one(x)) / 2
+    assert np.allclose(half - half.mean(1, keepdims=True), have - have.mean(1, keepdims=True), atol=1e-3)
+    assert np.allclose(one.projection.T @ lda.covariance_ @ one.projection, np.eye(3 + whole), atol=1e-4)
+
+
+def test_features_that_nobody_trained_are_kept_whole():
+    """With `whole` all of the last features' directions are seen: the distance is the whole Mahalanobis distance there."""
+    x, y = gaussians(300, [[0, 0, 0], [6, 0, 0]])
+    stranger = np.array([[0.0, 0.0, 20.0]])
+    assert known.embed(x, y, 0).strangeness(stranger)[0] < 10
+    assert known.embed(x, y, 1).strangeness(stranger)[0] > 300
+
+
+def test_two_sweeps_of_a_material_and_silent_channels_are_finite():
+    """K = 2, one class of two sweeps, a feature that never changes: no NaN."""
+    x, y = gaussians(2, [[0, 0, 0], [5, 0, 0]])
+    x[:, 2] = 1.0
+    more, labels = gaussians(30, [[5, 0, 1]], seed=3)
+    more[:, 2] = 1.0
+    one = known.embed(np.vstack([x, more]), np.concatenate([y, labels + 1]), 2)
+    assert np.isfinite(one.strangeness(x)).all()
+    silent = known.embed(np.zeros((8, 3)), np.repeat([0, 1], 4), 3)
+    assert np.isfinite(silent.strangeness(np.ones((1, 3)))).all()
+
+
+@pytest.mark.parametrize(
+    ("labels", "why"),
+    [([0, 0, 0], "one material"), ([0, 2, 2, 0], "label 1"), ([0, 1], "record more")],
+)
+def test_what_cannot_be_embedded_is_refused(labels, why: str):
+    """One material, a label without sweeps, one sweep each."""
+    with pytest.raises(FormatError, match=why):
+        known.embed(np.random.default_rng(0).standard_normal((len(labels), 2)), np.array(labels))
+
+
+def test_the_limit_keeps_what_it_promises():
+    """Over many draws a limit of 99 sweeps keeps 95 % of new ones; with few sweeps it is the largest."""
+    rng = np.random.default_rng(0)
+    kept = [np.mean(rng.chisquare(5, 500) <= known.limit(rng.chisquare(5, 99))) for _ in range(200)]
+    assert abs(np.mean(kept) - 0.95) < 0.006
+    assert known.limit(np.array([1.0, 7.0, 3.0])) == 7.0
+    with pytest.raises(FormatError, match="several positions"):
+        known.limit(np.empty(0))
+
+
+def test_the_limit_knows_positions_that_were_not_seen():
+    """Places that shift all sweeps: judged across groups the limit keeps 95 % at new places, within them it does not."""
+
+    def world(places, seed):
+        x, y = gaussians(5 * places, [[0, 0], [30, 0]], seed)
+        at = np.tile(np.repeat(np.arange(places), 5), 2)
+        return x + 3 * np.random.default_rng(seed + 1).standard_normal((places, 2))[at], y, at
+
+    (x, y, at), (new, _, _) = world(300, 0), world(400, 5)
+    one, every = known.embed(x, y, 2), np.ones(len(y), bool)
+    across = known.limit(known.crossed(x, y, at, every, 2))
+    assert 0.93 < np.mean(one.strangeness(new) <= across) < 0.97
+    seven = at < 7  # with few places the covariance is too small, and what fits itself is far too narrow
+    narrow, mine, them = known.embed(x[seven], y[seven], 2), (x[seven], y[seven], at[seven]), every[seven]
+    itself, others = known.limit(narrow.strangeness(x[seven])), known.limit(known.crossed(*mine, them, 2))
+    kept = [np.mean(narrow.strangeness(new) <= at_most) for at_most in (itself, others)]
+    assert kept[0] < 0.9 < kept[1]
+    few = np.isin(at, (0, 1))
+    assert len(known.crossed(x, y, at, few)) == few.sum()
+    with pytest.raises(FormatError, match="one group"):
+        known.crossed(x, y, 0 * at, every)
+
+
+def test_each_judge_judges_once_and_never_its_own_group():
+    """parts: every judged sweep is in one part, and no group is on both sides."""
+    groups = np.random.default_rng(0).integers(0, 25, 200)
+    judged = groups % 3 > 0
+    seen = []
+    for fit, numbers in known.parts(groups, judged):
+        assert not set(groups[fit]) & set(groups[numbers])
+        seen += numbers.tolist()
+    assert sorted(seen) == np.flatnonzero(judged).tolist()
+
+
+def test_auroc_of_a_known_separation():
+    """Two normals two deviations apart: Phi(2 / sqrt 2); ties count half."""
+    rng = np.random.default_rng(0)
+    have = known.auroc(rng.standard_normal(20000), 2 + rng.standard_normal(20000))
+    assert abs(have - norm.cdf(2 / np.sqrt(2))) < 0.003
+    assert known.auroc(np.zeros(3), np.zeros(5)) == 0.5
+    with pytest.raises(FormatError, match="both kinds"):
+        known.auroc(np.zeros(3), np.empty(0))
+
+
+@pytest.mark.parametrize(
+    "form", [FORM, SweepFormat(4, 4, 750.0, 1500, "uint8"), SweepFormat(16, 1, 35.6, 128, "float32")]
+)
+def test_the_spectrum_is_that_of_its_definition(form: SweepFormat):
+    """Band powers of each segment as complex waves in float64 give them, behind the trunk's features."""
+    rng = np.random.default_rng(0)
+    sweep = rng.integers(60, 90, (2, form.window, form.rows, form.cols)).astype(form.dtype)
+    size, length = spectrum.bands(form), form.window // 10
+    have = run(spectrum.with_spectrum(trunk(form, True), form, 0.1), sweep)
+    assert have.shape == (2, 10, form.rows * form.cols + size)
+    assert np.allclose(have[:, :, :-size], run(trunk(form, True), sweep))
+    x = 0.1 * sweep.reshape(2, form.window, -1).mean(2)[:, : 10 * length].reshape(2, 10, length)
+    window = np.hanning(length + 2)[1:-1]
+    base = np.exp(-1j * np.pi * np.outer(np.arange(length), np.arange(length + 1)) / length) * window[:, None]
+    power = np.abs(x @ (base - base.mean(0))) ** 2 / (window**2).sum()
+    ends = spectrum.edges(length)
+    bands = np.stack([power[:, :, a:b].mean(2) for a, b in itertools.pairwise(ends)], 2)
+    want = np.log(bands.cumsum(1) / np.arange(1, 11)[:, None] + spectrum.FLOOR)
+    assert np.allclose(have[:, :, -size:], want, atol=2e-3)
+    whole = run(spectrum.with_spectrum(trunk(form), form, 0.1), sweep)
+    assert np.allclose(whole, have[:, -1], atol=1e-4)
+
+
+def test_later_frames_and_offsets_do_not_matter_to_the_spectrum():
+    """Row d is of the first d + 1 tenths alone; a skin that is loaded more has the same spectrum; silence is finite."""
+    rng = np.random.default_rng(1)
+    sweep = rng.integers(0, 50, (1, FORM.window, 2, 2)).astype(np.int16)
+    held, moved = sweep.copy(), sweep + np.int16(300)
+    held[:, 64:] = held[:, 63:64]
+    model, size = spectrum.with_spectrum(trunk(FORM, True), FORM, 0.05), spectrum.bands(FORM)
+    a, b, c = (run(model, s)[:, :, -size:] for s in (sweep, held, moved))
+    assert np.array_equal(a[:, :4], b[:, :4])
+    assert not np.allclose(a[:, 4:], b[:, 4:], atol=1e-3)
+    assert np.allclose(a, c, atol=5e-3)
+    assert np.isfinite(run(model, 0 * sweep)).all()
+
+
+def test_a_window_too_short_for_a_spectrum_stays_as_it_is():
+    """Less than four frames a tenth: nothing is added."""
+    short = SweepFormat(2, 2, 100.0, 30, "int16")
+    assert spectrum.bands(short) == 0
+    assert spectrum.with_spectrum(trunk(short), short, 1.0) == trunk(short)
