@@ -7,7 +7,7 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types bench bundle chart paper wheel lock clean
+.PHONY: help demo test check machines lint types bench bundle chart paper wheel lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -24,6 +24,9 @@ lint: $(DESKTOP) ## ruff
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+machines: $(DESKTOP) ## the same bundles on older x86 and on arm64 (emulated; gets what that needs)
+	PALPATE_MACHINES=1 $(BIN)/python -m pytest -q -rP tests/test_machines.py
+
 types: $(DESKTOP) ## mypy --strict on the appliance
 	$(BIN)/mypy
 
@@ -33,7 +36,7 @@ bench: $(DESKTOP) ## measure this machine; the figures go to build/bench.json
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
-	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --row-shift 0.5 --seed 1 --out build/default.npz
+	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --seed 1 --out build/default.npz
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 1
 
 chart: $(DESKTOP) ## speed against accuracy: docs/chart/ (goes on where it was interrupted)

@@ -36,9 +36,10 @@ def case(left_out: int = NOBODY, apart: float = 6.0, fold: int = 0, places: int 
     keep = y != left_out
     y = y - (y > left_out) * (left_out != NOBODY)
     new, labels, there = world(places, 24, 2 + fold, apart, first=100 + 10 * fold)
-    return Case(
-        left_out, fold, 2, x[keep], y[keep], at[keep], at[keep] % 2 == 0, np.zeros(keep.sum(), bool), new, labels, there
-    )
+    x, y, at = x[keep], y[keep], at[keep]
+    seen = at % 2 == 1
+    copied = x[seen, -1] + np.random.default_rng(9).normal(0, 0.1, (seen.sum(), 4))
+    return Case(left_out, fold, 2, x, y, at, ~seen, copied, y[seen], at[seen], new, labels, there)
 
 
 @pytest.fixture(scope="module")
@@ -130,8 +131,9 @@ def test_two_materials_leave_nobody_out():
     """Of two materials none can be left out: calibration, sweeps and early are told, and the page says no more."""
     one = case()
     two, test = one.seen_labels < 2, one.labels < 2
-    one = Case(NOBODY, 0, 2, one.seen[two], one.seen_labels[two], one.seen_groups[two], one.judged[two], one.changed[two], one.new[test],
-               one.labels[test], one.places[test])  # fmt: skip
+    also = one.copied_labels < 2
+    one = Case(NOBODY, 0, 2, one.seen[two], one.seen_labels[two], one.seen_groups[two], one.judged[two], one.copied[also],
+               one.copied_labels[also], one.copied_groups[also], one.new[test], one.labels[test], one.places[test])  # fmt: skip
     figures = doubt.figures([one], NAMES[:2], 1)
     assert set(figures) == {"calibration", "sequence", "early"}
     html, pictures = certainty_page.tell(figures | dict.fromkeys(ABOUT, "x"))

@@ -578,12 +578,11 @@ def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
     "arrays",
     [
         toy.means(means=toy.MEANS[[1, 0, 2]], bias=np.float32([-18, 0, -18])),
-        toy.means(bias=np.float32([0, -17, -18])),
-        toy.means(means=toy.MEANS * np.float32(1.2), bias=-(toy.MEANS**2).sum(1) * np.float32(0.72)),
+        toy.means(bias=np.float32([0, 30, -18])),
     ],
 )
 def test_means_of_another_training_are_found(tmp_path: Path, arrays: dict):
-    """Class means that do not give the model's own logits on its golden sweeps are refused."""
+    """Class means that name a golden sweep otherwise than the model's own logits are refused."""
     it = Classifier(bundle.load(spoiled(tmp_path, arrays)), VirtualClock())
-    with pytest.raises(BundleError, match=r"means\.npz and the model's own logits differ"):
+    with pytest.raises(BundleError, match=r"means\.npz and the model's own logits call a golden sweep"):
         it.self_test()

@@ -11,7 +11,7 @@ from appliance import early as box_early
 from appliance.bundle import Classes, Early, Manifest, Thresholds
 from appliance.clock import SystemClock
 from appliance.known import Means
-from train import doubt, early, finish, spectrum
+from train import doubt, early, finish
 from train.graphs import run
 
 
@@ -110,6 +110,18 @@ def test_temperatures_make_each_step_honest():
     assert np.abs(p.max(2).mean(0) - right).max() < 0.04
 
 
+def test_each_step_has_its_own_temperature():
+    """The last temperature is the whole sweep's, each other one its own step's."""
+    x, y, at = tenths(10, seed=3)
+    done, every = finish.finish(x, y, at, np.ones(len(y), bool)), np.ones(len(y), bool)
+    logits, numbers = early.crossed(x, y, at, every)
+    cooler = early.temperatures(logits, y[numbers])
+    assert len(set(cooler)) > 2
+    assert done.temperature == cooler[-1]
+    raw = early.heads(done.embedding(x), y, 3)
+    assert np.allclose(done.steps.weight * cooler[:-1, None, None], raw.weight, rtol=1e-5)
+
+
 def test_a_material_of_one_place_and_two_materials():
     """A material that only one place has is still learned; of two materials, too: nothing is NaN."""
     x, y, at = tenths(20)
@@ -123,14 +135,14 @@ def test_a_material_of_one_place_and_two_materials():
 
 @pytest.fixture(scope="module")
 def made():
-    """A bundle's parts on the toy trunk with its spectrum: Finish, model, digits, labels, whole Bundle."""
+    """A bundle's parts on the toy trunk, one of whose features nobody trained: Finish, model, digits, labels, whole Bundle."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(3), 4), 6)
     level = np.array([[[20, 60], [40, 40]], [[60, 20], [40, 40]], [[40, 40], [60, 20]]])
     digits = level[labels][:, None] + rng.normal(0, [4, 9, 6], (FORM.window, 2, 2, 3))[None, ..., 0].repeat(72, 0)
     digits = np.rint(digits + rng.normal(0, 5, digits.shape)).astype(np.int16)
-    trunks = spectrum.with_spectrum(trunk(FORM, True), FORM, 0.1)
-    x, size = run(trunks, digits), spectrum.bands(FORM)
+    trunks = trunk(FORM, True)
+    x, size = run(trunks, digits), 1
     done = finish.finish(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
     done = replace(done, rule=early.Rule(Early((0.9,) * 9, 2)))
     model = done.graph(trunks)
@@ -157,10 +169,11 @@ def test_the_graph_gives_what_training_computed(made):
 def test_a_graph_without_tenths_has_no_early_heads(made):
     """From a trunk of the whole window: logits and embedding alone; without a rule none either."""
     done, x, digits, _, _ = made
-    for model in (done.graph(spectrum.with_spectrum(trunk(FORM), FORM, 0.1)),
-                  replace(done, rule=early.Rule(None, "why")).graph(spectrum.with_spectrum(trunk(FORM, True), FORM, 0.1))):  # fmt: skip
+    for model in (done.graph(trunk(FORM)), replace(done, rule=early.Rule(None, "why")).graph(trunk(FORM, True))):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
-        assert np.allclose(run(model, digits[:2]), done.logits(x[:2, -1]), atol=1e-3)
+        assert np.allclose(
+            classifier.softmax(run(model, digits[:2])), classifier.softmax(done.logits(x[:2, -1])), atol=1e-3
+        )
 
 
 def test_enrolment_is_judged_as_the_box_enrols(made):
@@ -170,6 +183,6 @@ def test_enrolment_is_judged_as_the_box_enrols(made):
     new = enrol.enrol(whole, "new", digits[drawn]).bundle
     z = done.embedding(x[:, -1])
     means = Means(new.classes, new.manifest.known, new.manifest.labels)
-    want = means.logits(means.distances(z)) * done.temperature
+    want = means.logits(means.distances(z)) * done.warmth
     have = doubt.enrolled_logits(done.embedding, z, z[drawn])
     assert np.allclose(have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=0.02)

@@ -29,7 +29,7 @@ from train.__main__ import main
 from train.compact import Compact
 from train.fit import Fit, Recipe
 from train.heads import closed_form_head, hold_out
-from train.ladder import USUAL
+from train.ladder import LADDER, USUAL
 from train.layers import Layer
 from train.pack import ExportRefused
 
@@ -37,13 +37,13 @@ from train.pack import ExportRefused
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on the easy set, two sweeps to a recording."""
-    return fit.fit(easy(pieces=2), 1, Recipe(steps=40))
+    return fit.fit(easy(pieces=2), 1, Recipe(steps=40), shape=LADDER["20k"])
 
 
 @pytest.fixture(scope="module")
 def tight() -> Fit:
     """A fit on a set that takes all int8 has."""
-    return fit.fit(close(), 1, Recipe(steps=60))
+    return fit.fit(close(), 1, Recipe(steps=60), shape=LADDER["20k"])
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_the_float_graph_is_the_network(dtype: str):
 
 
 def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: Path):
-    """Weights of seven bits, one scale a channel; every convolution between quantizers; 1 x K out."""
+    """Weights of seven bits, one scale a channel; every convolution between quantizers; 1 x K out, and where it lies."""
     model = onnx.load(packed / bundle.MODEL)
     maker = {name: n for n in model.graph.node for name in n.output}
     values = {c.name: numpy_helper.to_array(c) for c in model.graph.initializer}
@@ -105,7 +105,9 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: P
         assert [n.op_type for n in model.graph.node if conv.output[0] in n.input] == ["QuantizeLinear"]
     run = session(model.SerializeToString())
     assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [("sweep", [1, 64, 2, 2], "tensor(uint8)")]
-    assert [(o.name, o.shape, o.type) for o in run.get_outputs()] == [("logits", [1, 3], "tensor(float)")]
+    assert [(o.name, o.shape, o.type) for o in run.get_outputs()] == [
+        (name, [1, size], "tensor(float)") for name, size in (("logits", 3), ("embedding", 2))
+    ]
 
 
 def test_quantizing_leaves_its_model_alone(fitted: Fit):
@@ -144,7 +146,7 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
 def test_the_same_fit_gives_the_same_bytes(fitted: Fit, packed: Path, tmp_path: Path):
     """Every file, the zip of golden sweeps included."""
     export.export(fitted, tmp_path / "again", "easy", "1", "0123abcd")
-    for file in (bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN):
+    for file in (bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
         assert (tmp_path / "again" / file).read_bytes() == (packed / file).read_bytes(), file
     assert [f.name for f in tmp_path.iterdir()] == ["again"]
 
@@ -155,12 +157,12 @@ def test_scores_are_fused_by_recording(packed: Path):
     s.samples[3] = 0
     s.samples[9] = s.samples[29]
     alone, fused = pack.score(it, s), pack.score(it, s, fused=True)
-    assert np.flatnonzero(alone < 0).tolist() == [3]
+    assert np.flatnonzero(alone == pack.REFUSED).tolist() == [3]
     assert alone[9] != fused[9]
     p = softmax(np.stack([it.logits(x) for x in s.samples]))
     for recording in np.unique(s.groups["recording"]):
         member = s.groups["recording"] == recording
-        assert set(fused[member]) == {np.log(p[member & (alone >= 0)]).sum(0).argmax()}
+        assert set(fused[member]) == {np.log(p[member & (alone != pack.REFUSED)]).sum(0).argmax()}
 
 
 def test_a_head_that_says_otherwise_is_refused(fitted: Fit, tmp_path: Path):
@@ -206,10 +208,10 @@ def test_a_range_for_one_outlier_is_refused(tight: Fit):
 
 
 def test_a_layer_that_saturates_is_refused(tight: Fit):
-    """A stage that reaches a twentieth of what it should: no head can cope; how much is cut off is told."""
-    *before, last = tight.reach.responses
+    """The first stage reaches a twentieth of what it should: no head can cope; how much is cut off is told."""
+    first, *others = tight.reach.responses
     with pytest.raises(ExportRefused, match=r"\(limit .*suffers most \(\d+ dB, [3-6]\d\.\d% beyond"):
-        judged(ranged(tight, (*before, 0.05 * last)))
+        judged(ranged(tight, (0.05 * first, *others)))
 
 
 def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
@@ -276,7 +278,8 @@ def test_the_box_must_say_what_export_saw(fitted: Fit, packed: Path):
 def test_a_material_never_recognised_is_refused(fitted: Fit):
     """There is no golden sweep of it."""
     with pytest.raises(ExportRefused, match="no training sweep of 'high' is recognised"):
-        pack.golden_sweeps(fitted.train, np.tile(np.float32([1, 0, 0]), (len(fitted.train), 1)))
+        logits = np.tile(np.float32([1, 0, 0]), (len(fitted.train), 1))
+        pack.golden_sweeps(fitted.train, logits, logits)
 
 
 def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):
@@ -290,7 +293,9 @@ def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp
     assert (target / bundle.MANIFEST).read_bytes() == before
     export.export(fitted, target, "new", "2", "")
     assert bundle.load(target).manifest.name == "new"
-    assert sorted(f.name for f in target.iterdir()) == sorted([bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN])
+    assert sorted(f.name for f in target.iterdir()) == sorted(
+        [bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS]
+    )
     (tmp_path / "letters").mkdir()
     with pytest.raises(ExportRefused, match="is no bundle and will not be replaced"):
         export.export(fitted, tmp_path / "letters", "new", "2", "")
@@ -354,6 +359,27 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
     assert "golden.npz: not a fit" in capsys.readouterr().err
 
 
+def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
+    """Nothing in it is int8: both forms are one, the box's labels are its network's, no tensor is told; what another
+    head says is refused here as well."""
+    made = fit.fit(easy(), 1, Recipe(), shape=LADDER["bands"])
+    export.export(made, tmp_path / "b", "easy", "1", "0123abcd")
+    it = box(tmp_path / "b")
+    assert it.self_test() < 1e-6
+    assert "QuantizeLinear" not in {n.op_type for n in onnx.load(tmp_path / "b" / bundle.MODEL).graph.node}
+    with torch.no_grad():
+        said = made.network()(torch.from_numpy(made.held.samples.astype(np.float32))).numpy()
+    assert [it.logits(x).argmax() for x in made.held.samples] == said.argmax(1).tolist()
+    told = it.bundle.manifest.figures["parity"]
+    assert (told["agreement"], told["lost"]) == (1, 0)
+    assert told["probability_difference"] < 1e-3
+    (method,) = methods.find(["compact-bands"], methods.Effort(0.02))
+    content = pack.trained(method, easy(), 1)
+    assert export.checked(content, content.reference).figures["parity"]["agreement"] == 1
+    with pytest.raises(ExportRefused, match=r"int8 loses \d+\.\d\d points .*record more"):
+        export.export(negated(made), tmp_path / "other", "easy", "1", "")
+
+
 def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch):
     """An int8 method's figures come into its content; beyond a limit it is refused; one without float form passes."""
     (method,) = methods.find(["compact-1k"], methods.Effort(0.02))
@@ -401,9 +427,8 @@ def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
     level = whole.samples.mean(axis=1, keepdims=True) - np.array([60, 100, 140])[labels][:, None, None, None]
     offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
     try:
-        manifest = export.export(
-            fit.fit(offset, 1, Recipe(steps=20, keep_means=keep)), tmp_path / "b", "offset", "1", "0123abcd"
-        )
+        made = fit.fit(offset, 1, Recipe(steps=20, keep_means=keep), shape=LADDER["20k"])
+        manifest = export.export(made, tmp_path / "b", "offset", "1", "0123abcd")
     except ExportRefused:  # what was never learnt may not survive int8 either
         assert not keep
         return

@@ -21,9 +21,10 @@ from appliance.clock import SystemClock
 from appliance.errors import FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import alone, cost, dots, explorer, front, frontier, methods, minirocket, scatter
+from train import alone, cost, dots, exact, explorer, front, frontier, methods, minirocket, scatter
 from train.evaluate import Where
 from train.graphs import Graph, Graphed, run
+from train.ladder import LADDER
 from train.methods import Method
 from train.quantize import quantize
 from train.sets import SweepSet
@@ -112,14 +113,20 @@ def test_weights_and_multiply_accumulates_are_counted():
 
 
 def test_the_family_counts_its_costs_as_the_chart_does():
-    """What ladder.py says of a shape is what cost.py counts in its graphs, but for the means of the responses."""
+    """What ladder.py says of a shape is what cost.py counts in its graphs, but for the means of the responses, and for
+    the spectrum: its part of the head, and the few numbers that it is made of."""
     (method,) = methods.find(["compact-10k"], methods.Effort(share=0.0))
     known = sweeps()
     model = method.train(known, known.samples, 1)
-    told = model.made.shape.cost(known.format, 2)
+    told, bands = model.made.shape.cost(known.format, 2), model.made.bands
+    alone = exact.trunk(known.format, model.made.scale, {}, LADDER["bands"])
+    more = [count(alone) + 2 * bands if bands else 0 for count in (cost.weights, cost.macs)]
     for one in (model, model.forms["float"]):
-        assert cost.weights(one.graph()) == told.weights
-        assert cost.macs(one.graph()) == pytest.approx(told.macs, rel=0.15)  # a window so short has long means
+        assert cost.weights(one.graph()) == told.weights + more[0]
+        assert cost.macs(one.graph()) == pytest.approx(
+            told.macs + more[1], rel=0.15
+        )  # a window so short has long means
+    assert cost.weights(alone) <= 7 * 4 + bands  # window, what is not heard (twice), shares of the bands
 
 
 def test_a_gru_a_kernel_and_neighbours_are_counted():

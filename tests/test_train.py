@@ -15,7 +15,7 @@ from test_sets import easy
 from appliance.errors import FormatError
 from appliance.sim import skin
 from appliance.sweep import SweepFormat
-from train import fit, heads, ladder, score, sets
+from train import fit, heads, ladder, score, sets, spectrum
 from train.__main__ import main
 from train.compact import Compact
 from train.fit import Fit, Recipe
@@ -35,22 +35,26 @@ def test_stages_follow_the_window():
     assert [(s.kernel, s.stride) for s in USUAL.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
     assert [(s.kernel, s.stride) for s in USUAL.stages(128)] == [(4, 1), (5, 2), (5, 2)]
     assert USUAL.stages(1500)[-1] == ladder.Stage(5, 2, 89, 32 + 4 * 4 + 4 * 8, 16)
-    for shape in LADDER.values():
+    for shape in (shape for shape in LADDER.values() if shape.channels):
         for window in range(16, 3000):
             last = shape.stages(window)[-1]
             assert last.steps >= (ladder.LEAST_STEPS if window >= 108 else 1)
             assert (last.steps - 1) * last.hop + last.reach <= window
             assert shape.cut(1).stages(window) == shape.stages(window)[:1]
+            assert shape.cut(0, spectrum=True).stages(window) == ()
         with pytest.raises(FormatError, match="a window of 15 frames is too short"):
             shape.stages(15)
+    assert LADDER["bands"].stages(1500) == ()
 
 
-@pytest.mark.parametrize(("size", "weights"), [("1k", 1_223), ("20k", 18_558)])
+@pytest.mark.parametrize(("size", "weights"), [("1k", 1_442), ("20k", 18_558)])
 def test_compact_is_as_small_as_it_says(size: str, weights: int):
     """For the skin of the paper with six classes; what a shape costs is what its network holds."""
     model = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=LADDER[size])
     assert sum(p.numel() for p in model.parameters()) == weights == LADDER[size].cost(skin.FORMAT, 6).weights
     assert model(torch.zeros(2, 1500, 4, 4)).shape == (2, 6)
+    more = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=replace(LADDER[size], spectrum=True))
+    assert sum(p.numel() for p in more.parameters()) == weights + 6 * spectrum.count(skin.FORMAT)
 
 
 def test_compact_ignores_offsets():
@@ -150,11 +154,24 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
         Fit.load(tmp_path / "set.npz")
 
 
+def test_the_rung_without_convolutions_learns_its_head_alone(tmp_path: Path):
+    """No iteration, no cost; it tells what is easy apart, and comes back from its file."""
+    made = fit.fit(easy(), 1, QUICK, shape=LADDER["bands"])
+    assert (made.shape, made.bands, made.cost) == (LADDER["bands"], 5, [])
+    assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]
+    assert made.about["validation"]["accuracy"] > 0.9
+    made.save(tmp_path / "fit.npz")
+    again = Fit.load(tmp_path / "fit.npz")
+    assert (again.shape, again.reach) == (made.shape, made.reach)
+    np.testing.assert_array_equal(fit.features(again.network(), made.held), fit.features(made.network(), made.held))
+    assert again.trunk() == made.trunk()
+
+
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     """Weights that are not of the shape that the file names, and a file from before there were shapes."""
     replace(fitted, shape=LADDER["1k"]).save(tmp_path / "fit.npz")
     with pytest.raises(
-        FormatError, match=r"^fit.npz: its weights are not those of its Shape\(channels=\(3, 6, 8\).*; fit again$"
+        FormatError, match=r"^fit.npz: its weights are not those of its Shape\(channels=\(2, 6, 8\).*; fit again$"
     ):
         Fit.load(tmp_path / "fit.npz")
     with np.load(tmp_path / "fit.npz") as z:

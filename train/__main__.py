@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,23 @@ from appliance.bundle import Manifest
 from appliance.errors import ApplianceError, FormatError
 from appliance.sim.bench import commit
 
-from . import calibrate, choose, evaluate, export, fit, frontier, methods, options, pack, score, sets, shows
+from . import (
+    calibrate,
+    certainty,
+    choose,
+    evaluate,
+    export,
+    fit,
+    frontier,
+    methods,
+    options,
+    pack,
+    score,
+    sets,
+    shows,
+)
 from .fold import whole
+from .ladder import LADDER, USUAL
 
 Add = Callable[[str, Callable[[argparse.Namespace], None], str], argparse.ArgumentParser]
 
@@ -50,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_evaluate(add)
     _add_fit(add)
     _add_bundles(add)
-    for room in (shows, frontier, choose, calibrate):
+    for room in (export, shows, frontier, choose, certainty, calibrate):
         room.register(add)
     return parser
 
@@ -84,10 +100,13 @@ def _add_fit(add: Add) -> None:
     one.add_argument("--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7")
     one.add_argument("--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set")
     one.add_argument("--steps", type=int, default=recipe.steps, help=f"of training (default {recipe.steps})")
-    one.add_argument("--row-shift", type=float, default=recipe.row_shift, metavar="SHARE",
-                     help="share of training sweeps moved by a row of taxels (default 0)")  # fmt: skip
-    one.add_argument("--stretch", type=float, default=recipe.stretch, metavar="SHARE",
+    one.add_argument("--row-shift", type=float, metavar="SHARE", dest="moved",
+                     help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
+    one.add_argument("--stretch", type=float, metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
+    one.add_argument(
+        "--size", choices=[*LADDER, "usual"], default="usual", help="rung of the ladder (default: as compact)"
+    )
     one.add_argument("--keep-means", action="store_true", help="show the head each taxel's mean too, for comparison")
 
 
@@ -95,7 +114,7 @@ def _add_bundles(add: Add) -> None:
     """The commands that make what the box runs."""
     one = add("export", run_export, "quantize a fit and pack its bundle")
     one.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
-    two = add("pack", run_pack, "train any method and pack its bundle, in floating point")
+    two = add("pack", run_pack, "train any method and pack its bundle")
     options.add_set(two)
     two.add_argument("--method", required=True, metavar="NAME", help="see palpate-train methods")
     two.add_argument("--seed", type=int, required=True, help="of the training, and of simulated sets that name none")
@@ -156,8 +175,11 @@ def run_fit(args: argparse.Namespace) -> None:
             args.rest.parent.mkdir(parents=True, exist_ok=True)
             rest.save(args.rest)
             print(f"rest: {len(rest)} sweeps in {args.rest}")
-    recipe = fit.Recipe(steps=args.steps, row_shift=args.row_shift, stretch=args.stretch, keep_means=args.keep_means)
-    made = fit.fit(sweeps, args.seed, recipe, options.Log())
+    shape = LADDER.get(args.size, USUAL)
+    asked = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
+    scene = replace(fit.usual(sweeps.format, shape), **asked)
+    recipe = fit.Recipe(steps=args.steps, scene=scene, keep_means=args.keep_means)
+    made = fit.fit(sweeps, args.seed, recipe, options.Log(), shape)
     made.save(args.out)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; held-out {made.about['held_out_by']}: "
           f"{_spoken(made.about['validation'])}; {args.out}")  # fmt: skip
@@ -171,7 +193,8 @@ def run_export(args: argparse.Namespace) -> None:
 def run_pack(args: argparse.Namespace) -> None:
     """Train, pack the bundle and say how it does."""
     (method,) = methods.find([args.method], options.effort(args))
-    _told(pack.pack(pack.trained(method, options.load(args, args.seed), args.seed), *_packing(args)), args.out)
+    content = pack.trained(method, options.load(args, args.seed), args.seed)
+    _told(pack.pack(export.checked(content, content.reference), *_packing(args)), args.out)
 
 
 def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None]:

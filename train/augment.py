@@ -62,6 +62,11 @@ class Scene:
     """Share of the taxels that are cut off above, anywhere within two of their own deviations of their mean."""
 
 
+SLOW = Scene(gain=0.4, noise=0.1, silent=0.0, damped=0.0, colour=0.0)
+"""For sensors that are too slow for vibrations: what fingers and tape do to those does not concern them, and what lies
+below says more of force and friction."""
+
+
 def vary(x: Tensor, rows: int, scene: Scene, rng: Generator) -> Tensor:
     """Sweeps float32 [B, R * C, T] as `scene` may give them, R being `rows`; the same of the same `rng`.
 

@@ -11,9 +11,8 @@ import io
 import json
 import time
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +22,16 @@ from numpy.typing import NDArray
 from appliance.errors import FormatError
 
 from . import certainty_page, doubt, methods, options, pool, sets
-from .augment import Scene
+from .complete import seen
 from .evaluate import Where
-from .fit import Fit, copies, varied
+from .finish import Copies, Finish, finish
+from .fit import Fit
 from .fold import fingerprint, whole
 from .graphs import run as through
 from .methods import Effort
 from .protocols import Protocol
 from .score import provenance
 from .sets import SweepSet, digest, join
-from .spectrum import bands, with_spectrum
 
 Array = NDArray[Any]
 Log = Callable[[str], None]
@@ -57,9 +56,10 @@ class Task:
 class Case:
     """What one training gave. left_out: the material that it did not see. fixed: so many features nobody trained, last.
 
-    seen: features [N, 10, F] of the tenths of the training sweeps, and of the same changed as the scene might, whose materials are numbered `seen_labels` [N] from
+    seen: features [N, 10, F] of the tenths of the training sweeps, whose materials are numbered `seen_labels` [N] from
     0 on without the one left out; seen_groups [N]: positions or recordings; judged: bool [N], those that the trunk did
-    not see and nobody changed, which may judge; changed: bool [N]. new, labels, places: features of test sweeps, the set's labels, and where the skin sat.
+    not see, which may judge. copied: features [M, F] of changed copies of the others, of copied_labels and copied_groups [M].
+    new, labels, places: features of test sweeps, the set's labels, and where the skin sat.
     """
 
     left_out: int
@@ -69,7 +69,9 @@ class Case:
     seen_labels: Array
     seen_groups: Array
     judged: Array
-    changed: Array
+    copied: Array
+    copied_labels: Array
+    copied_groups: Array
     new: Array
     labels: Array
     places: Array
@@ -77,6 +79,11 @@ class Case:
     def known(self) -> Array:
         """bool [n], the test sweeps of materials that were trained."""
         return self.labels != self.left_out
+
+    def finish(self) -> Finish:
+        """What is put on the trunk of this training."""
+        copies = Copies(self.copied, self.copied_labels, self.copied_groups)
+        return finish(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies)
 
     def numbered(self) -> Array:
         """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out mean nothing."""
@@ -95,28 +102,16 @@ def learn(task: Task, sweeps: SweepSet) -> Case:
         raise FormatError(f"method {task.method!r} gives no features of tenths; use compact or one of its family")
     kept = task.train[sweeps.labels[task.train] != task.left_out]
     part = sweeps.take(kept)
-    part = replace(part, groups=part.groups | {"recording": part.group("recording"), "index": np.arange(len(part))})
     if task.left_out != NOBODY:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).made  # type: ignore[attr-defined]
-    by = made.about["held_out_by"]
-    trunk = with_spectrum(made.trunk(tenths=True), part.format, made.scale)
-    seen = [through(trunk, one.samples) for one in (part, *changed(made, part, task.seed))]
-    judged = np.isin(np.arange(len(part) * len(seen)), made.held.group("index"))  # of what was recorded, not changed
-    groups = part.group(by if by in part.groups else "recording")
+    *looked, fixed, copies = seen(made)
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
-        task.left_out, task.fold, bands(part.format), np.concatenate(seen), np.tile(part.labels, len(seen)),
-        np.tile(groups, len(seen)), judged, np.arange(len(judged)) >= len(part), through(trunk, sweeps.samples[task.test]),
-        sweeps.labels[task.test], places[task.test],
+        task.left_out, task.fold, fixed, *looked, copies.features, copies.labels, copies.groups,
+        through(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
     )  # fmt: skip
-
-
-def changed(made: Fit, sweeps: SweepSet, seed: int) -> Iterator[SweepSet]:
-    """`sweeps` again as the scene that `made` was trained for might have given them."""
-    scene = Scene(**made.about["recipe"]["scene"])
-    return copies(made.network(), sweeps, partial(varied, rows=sweeps.format.rows, scene=scene), seed)
 
 
 def tasks(sweeps: SweepSet, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int) -> list[Task]:
@@ -129,7 +124,7 @@ def cases(wanted: Sequence[Task], sweeps: SweepSet, where: Where, log: Log) -> l
     """The Case of each task in their order: kept ones from the cache, the others trained. log: is told how far it is."""
     data, held = digest(sweeps), {}
     keys = [fingerprint([data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
-                        methods.home(t.method), "spectrum") for t in wanted]  # fmt: skip
+                        methods.home(t.method), "complete") for t in wanted]  # fmt: skip
     for i, key in enumerate(keys):
         if where.cache and (case := _load(where.cache / f"{key}.case.npz")):
             held[i] = replace(case, fold=wanted[i].fold)

@@ -16,15 +16,13 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from appliance.sweep import SweepFormat
 
-from . import exact
+from . import exact, spectrum
 from .graphs import with_head
-from .ladder import CAP, FLOOR, USUAL, Shape
+from .ladder import CAP, FLOOR, MAINS_HZ, USUAL, Shape
 from .loop import in_order, tensors
 from .networks import Network
 
 Array = NDArray[Any]
-MAINS_HZ = 50.0
-"""Where 60 Hz hums, a kernel of some 20 ms hears little of it as well."""
 CALIBRATION_SWEEPS = 96
 PERCENTILE = 99.9
 """Of the values that int8 must reach: with their full range one outlier sweep takes the resolution from all others."""
@@ -86,13 +84,14 @@ class Compact(Network):
             nn.Conv1d(before, after, stage.kernel, stage.stride)
             for before, after, stage in zip(inputs, shape.channels, stages, strict=False)
         )
-        if shape.zero_sum(form.window):
+        if shape.channels and shape.zero_sum(form.window):
             first = stages[0]
             periods = first.kernel * MAINS_HZ / form.rate_hz
             mains = MAINS_HZ / form.rate_hz if norm and 1 <= periods <= first.kernel / 4 else 0.0
             self.convs[0] = ZeroSum(inputs[0], inputs[1], first.kernel, first.stride, mains)
         self.norms = nn.ModuleList(nn.BatchNorm1d(n) if norm else nn.Identity() for n in shape.channels)
-        self.head = nn.Linear(sum(shape.channels) + keep_means * inputs[0], classes)
+        bands = shape.spectrum * spectrum.count(form)
+        self.head = nn.Linear(sum(shape.channels) + keep_means * inputs[0] + bands, classes)
 
     def responses(self, prepared: Tensor) -> list[Tensor]:
         """[B, R * C, T] -> of each stage its responses [B, channels, steps], none below 0."""
@@ -103,13 +102,18 @@ class Compact(Network):
 
     def features(self, prepared: Tensor) -> Tensor:
         """[B, R * C, T] -> log mean responses [B, sum of channels]."""
-        return torch.log(torch.cat([x.mean(2) for x in self.responses(prepared)], 1) + FLOOR)
+        means = [x.mean(2) for x in self.responses(prepared)]
+        return torch.log(torch.cat(means, 1) + FLOOR) if means else prepared.new_zeros(len(prepared), 0)
 
     def seen(self, digits: Tensor) -> Tensor:
         """Digits [B, T, R, C] -> what the head sees of them [B, F]."""
-        features = self.features(self.prepare(digits))
-        means = digits.flatten(2).float().mean(1) * self.scale
-        return torch.cat([features, means], 1) if self.keep_means else features
+        prepared = self.prepare(digits)
+        seen = [self.features(prepared)]
+        if self.keep_means:
+            seen.append(digits.flatten(2).float().mean(1) * self.scale)
+        if self.shape.spectrum:
+            seen.append(spectrum.bands(capped(prepared), self.form))
+        return torch.cat(seen, 1)
 
     def fused(self) -> Compact:
         """The same network for inference, its batch norms folded into the convolutions."""
@@ -117,12 +121,14 @@ class Compact(Network):
         plain.head.load_state_dict(self.head.state_dict())
         for mine, conv, norm in zip(plain.convs, self.convs, self.norms, strict=True):
             mine.load_state_dict(fuse_conv_bn_eval(conv.eval(), norm.eval()).state_dict())
-        plain.convs[0].weight.data.copy_(self.first_taps(plain.convs[0].weight))
+        if self.convs:
+            plain.convs[0].weight.data.copy_(self.first_taps(plain.convs[0].weight))
         return plain.eval()
 
-    def cut(self, depth: int) -> Compact:
-        """Its first stages, behind a head that is yet to be found; of a fused network."""
-        less = Compact(self.form, self.head.out_features, self.scale, False, self.keep_means, self.shape.cut(depth))
+    def cut(self, depth: int, spectrum: bool) -> Compact:
+        """Its first stages, and the spectrum or not, behind a head that is yet to be found; of a fused network."""
+        shape = self.shape.cut(depth, spectrum)
+        less = Compact(self.form, self.head.out_features, self.scale, False, self.keep_means, shape)
         less.convs.load_state_dict(self.convs[:depth].state_dict())
         return less.eval()
 
@@ -135,7 +141,7 @@ class Compact(Network):
     def weights(self) -> dict[str, Array]:
         """What `exact.trunk` asks for; of a fused network."""
         weights = {k: v.numpy() for k, v in self.state_dict().items()}
-        return weights | {"convs.0.weight": self.first_taps(self.convs[0].weight).numpy()}
+        return weights | ({"convs.0.weight": self.first_taps(self.convs[0].weight).numpy()} if self.convs else {})
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; of a fused network."""

@@ -18,7 +18,7 @@ from appliance.classifier import LEAST_PROBABILITY, softmax
 from appliance.errors import FormatError
 
 from .early import LEVELS, decide
-from .finish import Finish, finish
+from .finish import Finish
 from .known import Embedding, auroc, embed
 from .score import interval
 
@@ -39,10 +39,7 @@ DRAWS, ORDERS = 500, 20
 
 def figures(cases: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
     """All of it; what needs a material left out is missing where there are but two."""
-    done = [
-        (case, finish(case.seen, case.seen_labels, case.seen_groups, case.judged, case.fixed, case.changed))
-        for case in cases
-    ]
+    done = [(case, case.finish()) for case in cases]
     full = [one for one in done if one[0].left_out < 0]
     told = {"calibration": calibration(full), "sequence": sequence(full, seed), "early": early(full)}
     partial = [one for one in done if one[0].left_out >= 0]
@@ -172,17 +169,15 @@ def unknown(partial: Sequence[tuple[Case, Finish]], materials: Sequence[str]) ->
 
 def _of_trunk(case: Case, done: Finish) -> Array:
     """Squared distance in the trained features alone: all of them."""
-    size, plain = case.seen.shape[2] - case.fixed, ~case.changed
-    return embed(case.seen[plain, -1, :size], case.seen_labels[plain], size).strangeness(case.new[:, -1, :size])
+    size = case.seen.shape[2] - case.fixed
+    return embed(case.seen[:, -1, :size], case.seen_labels, size).strangeness(case.new[:, -1, :size])
 
 
 SCORES: dict[str, Callable[[Case, Finish], Array]] = {
     "distance": lambda case, done: done.embedding.strangeness(case.new[:, -1]) / done.limit,
     "distance, trained features only": _of_trunk,
-    "distance, sweeps changed as the scene might among those trained": lambda case, done: embed(
-        case.seen[:, -1], case.seen_labels, case.fixed).strangeness(case.new[:, -1]),
     "distance, where trained materials differ": lambda case, done: embed(
-        case.seen[~case.changed, -1], case.seen_labels[~case.changed]).strangeness(case.new[:, -1]),
+        case.seen[:, -1], case.seen_labels).strangeness(case.new[:, -1]),
     "highest probability": lambda case, done: -softmax(done.logits(case.new[:, -1])).max(1),
 }  # fmt: skip
 """Each grows with how little a sweep is like what was trained. Limits of several folds differ: the first is in units of

@@ -68,31 +68,34 @@ def heads(z: Array, labels: Array, classes: int) -> Heads:
 
     A label of which there is no sweep among `labels` gets logits far below all others.
     """
+    each = [lda(z[:, d], labels, classes) for d in range(z.shape[1] - 1)]
+    return Heads(np.stack([weight for weight, _ in each]), np.stack([bias for _, bias in each]))
+
+
+def lda(x: Array, labels: Array, classes: int) -> tuple[Array, Array]:
+    """Weight [F, K] and bias [K], float32, of shrinkage LDA with equal priors on x [N, F]; see `heads` for labels that
+    are not there."""
     there = np.unique(labels)
-    weight, bias = np.zeros((z.shape[1] - 1, z.shape[2], classes)), np.full((z.shape[1] - 1, classes), ABSENT)
-    for d in range(len(weight)):
-        prior = np.full(len(there), 1 / len(there))
-        lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=prior).fit(z[:, d], labels)
-        coefficients, intercepts = lda.coef_, lda.intercept_
-        if len(there) == 2:  # of two it gives only the difference
-            coefficients, intercepts = np.vstack([0 * coefficients, coefficients]), np.append(0, intercepts)
-        weight[d][:, there], bias[d, there] = coefficients.T, intercepts
-    return Heads(weight.astype(np.float32), bias.astype(np.float32))
+    weight, bias = np.zeros((x.shape[1], classes), np.float32), np.full(classes, ABSENT, np.float32)
+    prior = np.full(len(there), 1 / len(there))
+    found = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=prior).fit(x, labels)
+    coefficients, intercepts = found.coef_, found.intercept_
+    if len(there) == 2:  # of two it gives only the difference
+        coefficients, intercepts = np.vstack([0 * coefficients, coefficients]), np.append(0, intercepts)
+    weight[:, there], bias[there] = coefficients.T, intercepts
+    return weight, bias
 
 
-def crossed(
-    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, changed: Array | None = None
-) -> tuple[Array, Array]:
+def crossed(tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0) -> tuple[Array, Array]:
     """Logits [n, D + 1, K], not cooled, of each step and the whole, and the numbers [n] of the sweeps they are of.
 
     tenths: features [N, D + 1, F]. Each sweep of `judged` (bool [N]) is judged by an embedding and heads that did not
-    see its group (int [N]); sweeps of a material that is in no other part are left out. changed: as in finish.finish.
+    see its group (int [N]); sweeps of a material that is in no other part are left out.
     Raises FormatError as `parts`.
     """
     classes, told, numbers = int(labels.max()) + 1, [], []
-    plain = np.ones(len(labels), bool) if changed is None else ~changed
     for fit, judges in parts(groups, judged):
-        one, there = embed_some(tenths[fit & plain, -1], labels[fit & plain], fixed)
+        one, there = embed_some(tenths[fit, -1], labels[fit], fixed)
         judges = judges[np.isin(labels[judges], there)]
         steps = heads(one(tenths[fit]), labels[fit], classes).logits(one(tenths[judges]))
         end = np.full((len(judges), 1, classes), ABSENT)

@@ -14,9 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.classifier import softmax
-
-from . import methods, pool
+from . import methods, parity, pool
 from .fold import Fold, Task, key, run
 from .protocols import Protocol
 from .score import Tally, fused, interval, provenance
@@ -88,11 +86,15 @@ class Result:
         return told
 
     def _form(self, name: str) -> dict[str, Any]:
-        """The same models in another precision: counts, share of equal labels, how far a probability differs."""
+        """The same models in another precision: counts, how far the answers are apart (parity.Apart), and what accuracy
+        int8 loses against float, whichever of the two this form is (parity.Lost)."""
         logits = np.concatenate([fold.forms[name] for fold in self.folds])
-        equal = float(np.mean(logits.argmax(1) == self.logits.argmax(1)))
-        apart = np.abs(softmax(logits) - softmax(self.logits)).max()
-        return self._counts(logits) | {"agreement": round(equal, 4), "probability_difference": round(float(apart), 4)}
+        precise, int8 = (logits, self.logits) if name == "float" else (self.logits, logits)
+        labels, clusters = self.sweeps.labels[self.test], Protocol(self.protocol).clusters(self.sweeps)
+        right = [x.argmax(1) == labels for x in (precise, int8)]
+        lost = parity.loss(*right, None if clusters is None else clusters[self.test])
+        told = asdict(parity.compare(precise, int8)) | asdict(lost)
+        return self._counts(logits) | {key: round(value, 4) for key, value in told.items()}
 
 
 HEADER = f"{'method':<16} {'protocol':<22} means  {'windows':<30} {'recordings':<30} {'fit s':>7} {'ms':>7}"

@@ -18,18 +18,17 @@ from onnx import TensorProto, helper
 
 from appliance.sweep import SweepFormat
 
+from . import spectrum
 from .graphs import IR, OPSET, TENSOR, Graph
 from .ladder import CAP, FLOOR, Shape, Stage
 
 Array = NDArray[Any]
 FLOAT = TensorProto.FLOAT
-TENTHS = 10
+TENTHS = spectrum.SEGMENTS
 """Into how many parts a window is cut for early decisions."""
 SEVEN_BITS = 64
 """Largest integer tap: two products of eight bits overflow the 16-bit sums of an x86 without VNNI, and then the answer
 there is another than on Arm."""
-BANDS, QUIET = 20, 1e-6
-"""Bands of the power spectrum, and the power that is added to each before its logarithm."""
 MIDDLE = 128
 """The byte that stands for 0 where digits are no bytes themselves."""
 
@@ -59,33 +58,30 @@ def trunk(
     reach: Ranges | None = None,
     tenths: bool = False,
     keep_means: bool = False,
-    bands: bool = False,
 ) -> onnx.ModelProto:
     """A fused Compact up to its features: `sweep` -> `features` float32 [1, F]; in int8 where `reach` is given.
 
     tenths: `tenths` float32 [1, TENTHS, F] instead, features of the first tenth, two tenths ... of the window. Row d
     depends on no frame after (d + 1) / TENTHS of it, as long as later frames repeat the newest one (what has not come
     yet does not tremble) or none is capped. A stage that has seen too little by then counts as silent.
-    bands: the log power of the taxels' sum in `band_edges` behind the features, F + bands in all, in float; of the whole
-    window in every row. They were not learnt, and so tell a material that nobody taught.
+    The bands of the spectrum are the last features, in float.
     """
-    g, rows = Graph(), TENTHS if tenths else 1
+    g, seen, sizes = Graph(), [], []
     raw = g("Reshape", "sweep", g.constant([1, form.window, form.rows * form.cols], "int64"))
     turned = _capping(g, raw, form)
-    seen = [
-        _log_means(g, form, shape, weights, *_front(g, form, scale, shape, raw, turned, reach, tenths), reach, tenths)
-    ]
-    sizes = [sum(shape.channels)]
+    if shape.channels:
+        front = _front(g, form, scale, shape, raw, turned, reach, tenths)
+        seen.append(_log_means(g, form, shape, weights, *front, reach, tenths))
+        sizes.append(sum(shape.channels))
     if keep_means:
         counts = _counts(_frames(form.window), form.window, tenths)
         seen.append(g("Mul", _levels(g, g("Cast", raw, to=FLOAT), form, counts), g.constant(scale)))
         sizes.append(form.rows * form.cols)
-    if bands:
-        edges = band_edges(form.window)
-        seen.append(_bands(g, raw, turned, form, scale, edges, rows))
-        sizes.append(len(edges) - 1)
+    if shape.spectrum:
+        seen.append(spectrum.nodes(g, raw, turned, form, scale, tenths))
+        sizes.append(spectrum.count(form))
     all_of_them = g("Concat", *seen, axis=2) if len(seen) > 1 else seen[0]
-    out = [1, rows, sum(sizes)] if tenths else [1, sum(sizes)]
+    out = [1, TENTHS, sum(sizes)] if tenths else [1, sum(sizes)]
     return _model(g, form, all_of_them, "tenths" if tenths else "features", out)
 
 
@@ -114,31 +110,6 @@ def _log_means(
     total = g("Cast", total, to=FLOAT) if reach else total
     log = g("Log", g("Add", g("Mul", total, g("Concat", *factors, axis=2)), g.constant(FLOOR)))
     return g("Reshape", log, g.constant([1, TENTHS, sum(shape.channels)], "int64")) if apart else log
-
-
-def band_edges(window: int) -> Array:
-    """Whole numbers of waves in a window, padded to a power of two, between which BANDS bands lie: as wide on a
-    logarithmic scale, from two waves a window to half the sampling rate; fewer where the window is short."""
-    padded = 1 << (window - 1).bit_length()
-    return np.unique(np.rint(np.geomspace(2 * padded / window, padded / 2 + 1, BANDS + 1)).astype(int))
-
-
-def _bands(g: Graph, raw: str, turned: str, form: SweepFormat, scale: float, edges: Array, rows: int) -> str:
-    """Digits [1, T, R * C] and what their taxels are multiplied with -> log power by band [1, rows, bands]."""
-    taxels, padded = form.rows * form.cols, 1 << (form.window - 1).bit_length()
-    share = g("Mul", g("Reshape", turned, g.constant([taxels, 1], "int64")), g.constant(scale / taxels))
-    wave = g("MatMul", g("Cast", raw, to=FLOAT), share)
-    wave = g("Sub", wave, g("ReduceMean", wave, axes=[1]))
-    spectrum = g("DFT", wave, g.constant(padded, "int64"), axis=1, onesided=1)
-    power = g("ReduceSum", g("Mul", spectrum, spectrum), g.constant([2], "int64"))
-    below = _sums(g, power, padded // 2 + 1, edges.tolist())
-    lower, upper = (
-        g("Slice", below, *(g.constant([n], "int64") for n in (at, len(edges) - 1 + at, 1))) for at in (0, 1)
-    )
-    each = g("Mul", g("Sub", upper, lower), g.constant(1 / (np.diff(edges) * form.window)[None, :, None]))
-    log = g("Log", g("Add", g("Relu", each), g.constant(QUIET)))
-    return g("Expand", g("Reshape", log, g.constant([1, 1, len(edges) - 1], "int64")),
-             g.constant([1, rows, len(edges) - 1], "int64"))  # fmt: skip
 
 
 def _front(

@@ -67,7 +67,7 @@ def export(
             f"fit again, and look at train/exact.py if it stays"
         )
     about = fit.about | {"torch_difference": apart}
-    content = Content(model, "raw", fit.train, fit.held, fit.about["held_out_by"], about)
+    content = Content(model, "raw", fit.train, fit.held, fit.about["held_out_by"], about, made=fit)
     return pack(checked(content, reference), target, name, version, commit, full_scale)
 
 
@@ -97,11 +97,11 @@ def check(found: Parity) -> None:
     apart, lost = found.apart, found.lost
     if apart is None or lost is None:
         raise ExportRefused("there is no float form that int8 could be compared with; export a fit")
-    worst = min(found.layers, key=lambda layer: (layer.saturated < SATURATED, layer.sqnr_db))
-    hint = (
-        f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond what int8 reaches; see "
-        "palpate-train parity): drop training sweeps that are unlike all others, record more, or take a larger network"
-    )
+    hint = "drop training sweeps that are unlike all others, record more, or take a larger network"
+    if found.layers:
+        worst = min(found.layers, key=lambda layer: (layer.saturated < SATURATED, layer.sqnr_db))
+        hint = (f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond what int8 reaches; "
+                f"see palpate-train parity): {hint}")  # fmt: skip
     if lost.lost > MOST_LOST and lost.chance < CHANCE:
         raise ExportRefused(
             f"int8 is right on {lost.int8_right} of {lost.total} held-out sweeps, float on {lost.float_right}: "
@@ -149,7 +149,7 @@ def compared(source: Path, sweeps: SweepSet, file: Path | None = None) -> str:
     return parity.table(found)
 
 
-def add_parity(add: Callable[..., argparse.ArgumentParser]) -> None:
+def register(add: Callable[..., argparse.ArgumentParser]) -> None:
     """The command `parity`. add: as in __main__, (name, what runs, what it does) -> its parser."""
     one = add(
         "parity",

@@ -27,6 +27,7 @@ from .sets import SweepSet
 
 Array = NDArray[Any]
 RECIPE = Recipe()
+SPECTRUM = "the spectrum that all taxels share, and a closed-form head: nothing else is learnt"
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,9 @@ class Int8:
     cost: Cost = field(default_factory=list)
     forms: Mapping[str, Model] = field(default_factory=dict)
 
-    def features(self, given: Array, tenths: bool = False, bands: bool = False) -> Array:
-        """Digits [n, T, R, C] -> what the head sees of them, float32 [n, F]; of each tenth [n, 10, F]; see exact.trunk."""
-        return run(self.made.trunk(tenths=tenths, bands=bands), given)
+    def features(self, given: Array, tenths: bool = False) -> Array:
+        """Digits [n, T, R, C] -> what the head sees, float32 [n, F]; of each tenth [n, 10, F]; see exact.trunk."""
+        return run(self.made.trunk(tenths=tenths), given)
 
     def logits(self, given: Array) -> Array:
         """Digits [n, T, R, C] -> float32 [n, K]."""
@@ -84,12 +85,12 @@ def methods(effort: Effort = WHOLE, log: Log = silent) -> tuple[Method, ...]:
         train = partial(train_compact, shape=shape, recipe=recipe, log=log)
         return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations")
 
-    about = "strided convolutions and a closed-form head in int8, about {},000 weights"
-    ladder = (rung(f"compact-{size}", about.format(size[:-1]), shape) for size, shape in LADDER.items())
-    return (
-        *ladder,
-        rung("compact", "the box's own: the rung of the ladder that is used unless another is asked for", USUAL),
+    about = "strided convolutions, a spectrum and a closed-form head in int8, {},000 weights at most"
+    ladder = (
+        rung(f"compact-{size}", about.format(size[:-1]) if shape.channels else SPECTRUM, shape)
+        for size, shape in LADDER.items()
     )
+    return (*ladder, rung("compact", "the box's own: as compact-20k, or less where held-out sweeps need less", USUAL))
 
 
 METHODS = methods()

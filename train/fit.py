@@ -1,17 +1,17 @@
 """The room of training. In: a SweepSet and a seed. Out: a Fit, which holds the network and the sweeps it saw.
 
-The convolutions are trained by gradient; then the head is replaced by shrinkage LDA in closed form, and one
-temperature, found on groups that were held out, makes its probabilities honest. No random state outside is read or
-changed.
+The convolutions are trained by gradient on sweeps that vary as the scene does; then shrinkage LDA in closed form
+replaces the head, one for the network and one for its int8 trunk. Groups that were held out tell how many stages the
+heads should see, and give one temperature that makes probabilities honest. No random state outside is read or changed.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import InitVar, asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,10 @@ from torch import Generator, Tensor
 from appliance.classifier import LEAST_PROBABILITY, softmax
 from appliance.errors import FormatError
 from appliance.sim.sets import read
+from appliance.sweep import SweepFormat
 
-from . import exact, loop
-from .augment import Scene, vary
+from . import exact, loop, spectrum
+from .augment import SLOW, Scene, vary
 from .compact import Compact
 from .graphs import run
 from .heads import closed_form_head, hold_out
@@ -46,30 +47,25 @@ COPIES = 2
 class Recipe(loop.Recipe):
     """How the compact network is trained.
 
-    scene: what varies, and so do the training sweeps; gain and noise are its matter.
+    scene: what varies, and so do the training sweeps; gain and noise are its matter. None: `usual`.
     keep_means: see Compact; the convolutions never see them, the closed-form head does.
     """
 
     steps: int = 600
     noise: float = 0.0
     gain: float = 0.0
-    scene: Scene = field(default_factory=Scene)
+    scene: Scene | None = None
     keep_means: bool = False
-    row_shift: InitVar[float | None] = None  # until the command gives a scene
-    stretch: InitVar[float | None] = None
-
-    def __post_init__(self, row_shift: float | None, stretch: float | None) -> None:
-        given = {k: v for k, v in (("moved", row_shift), ("stretch", stretch)) if v is not None}
-        object.__setattr__(self, "scene", replace(self.scene, **given))
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A trained network. weights: the state of a fused Compact with its LDA head, the temperature folded in; and another
-    head, `int8.weight` [K, F] and `int8.bias` [K], fitted on what the int8 trunk gives.
+    """A trained network. weights: the state of a fused Compact with its LDA head, the temperature folded in; and one
+    more, `int8.weight` [K, F] and `int8.bias` [K], fitted on what the int8 trunk gives.
 
-    shape: its rung. reach: what its int8 form reaches. train, held: what was trained on and what was held out.
-    about: JSON of how it was made and how it did. cost: (step, cross entropy) of the training; the file does not keep it.
+    shape: its rung, cut to what the heads see. reach: what its int8 form reaches. train, held: what was trained on and
+    what was held out. about: JSON of how it was made and how it did. cost: (step, cross entropy) of the training; the
+    file does not keep it.
     """
 
     weights: dict[str, Array]
@@ -86,6 +82,11 @@ class Fit:
         """Whether the head sees the means of the taxels."""
         return bool(self.about["recipe"]["keep_means"])
 
+    @property
+    def bands(self) -> int:
+        """How many of the features, the last ones, are of the spectrum and were not learnt."""
+        return self.shape.spectrum * spectrum.count(self.train.format)
+
     def network(self) -> Compact:
         """The network in PyTorch, ready to run."""
         with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and written over
@@ -95,10 +96,10 @@ class Fit:
         model.load_state_dict(state)
         return model.eval()
 
-    def trunk(self, int8: bool = True, tenths: bool = False, bands: bool = False) -> onnx.ModelProto:
+    def trunk(self, int8: bool = True, tenths: bool = False) -> onnx.ModelProto:
         """`sweep` -> `features` float32 [1, F], or `tenths` float32 [1, 10, F]; see exact.trunk."""
         reach, form = self.reach if int8 else None, self.train.format
-        return exact.trunk(form, self.scale, self.weights, self.shape, reach, tenths, self.keep_means, bands)
+        return exact.trunk(form, self.scale, self.weights, self.shape, reach, tenths, self.keep_means)
 
     def int8_head(self) -> tuple[Array, Array]:
         """Weight [K, F] and bias [K] of the int8 trunk's head, the temperature folded in."""
@@ -112,7 +113,8 @@ class Fit:
         arrays = {f"weight_{k}": v for k, v in self.weights.items()} | both
         for name in self.train.groups:
             arrays[f"group_{name}"] = np.concatenate([self.train.groups[name], self.held.groups[name]])
-        meta = {"scale": self.scale, "shape": asdict(self.shape), "reach": asdict(self.reach), "materials": self.train.materials, "rate_hz": self.train.rate_hz,
+        meta = {"scale": self.scale, "shape": asdict(self.shape), "reach": asdict(self.reach),
+                "materials": self.train.materials, "rate_hz": self.train.rate_hz,
                 "source": self.train.source, "trained_on": len(self.train), "about": self.about}  # fmt: skip
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as f:
@@ -152,17 +154,21 @@ def fit_on(
     train: SweepSet, held: SweepSet, by: str, seed: int, recipe: Recipe, log: Log = silent, shape: Shape = USUAL
 ) -> Fit:
     """Train on `train`; `held` gives temperature and validation. by: how they were parted, for the story."""
-    scale, change = texture_scale(train.samples), partial(varied, rows=train.format.rows, scene=recipe.scene)
+    if not (shape.channels or spectrum.count(train.format)):
+        raise FormatError(f"a window of {train.format.window} frames is too short for a spectrum; take another rung")
+    recipe = replace(recipe, scene=(scene := recipe.scene or usual(train.format, shape)))
+    scale, change = texture_scale(train.samples), partial(varied, rows=train.format.rows, scene=scene)
     with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
         model = Compact(train.format, len(train.materials), scale, shape=shape)
         with torch.enable_grad():
-            model, cost = learn(model, train, recipe, seed, log, vary=change)
-        model.keep_means = recipe.keep_means
+            model, cost = learn(model, train, recipe, seed, log, vary=change) if shape.channels else (model.fused(), [])
+        model.keep_means, model.shape = recipe.keep_means, replace(shape, spectrum=spectrum.count(train.format) > 0)
         reach = model.reach(train.samples)
         seen = _seen(model, reach, train, held, copies(model, train, change, seed))
         model, weights = _judged(model, seen, np.tile(train.labels, COPIES + 1), held.labels)
-        right = int(np.sum(model(torch.from_numpy(held.samples.astype(np.float32))).argmax(1).numpy() == held.labels))
+        logits = features(model, held) @ weights["head.weight"].T + weights["head.bias"]
+    right = int(np.sum(logits.argmax(1) == held.labels))
     about = {"seed": seed, "recipe": asdict(recipe), "held_out_by": by, "validation": figure(right, len(held))}
     reach = replace(reach, responses=reach.responses[: len(model.convs)])
     return Fit(weights, scale, model.shape, reach, train, held, about, cost)
@@ -181,26 +187,36 @@ def _seen(model: Compact, reach: exact.Ranges, train: SweepSet, held: SweepSet, 
 def _judged(model: Compact, seen: Seen, labels: Array, held_labels: Array) -> tuple[Compact, dict[str, Array]]:
     """The network behind the heads, and all weights of a Fit.
 
-    The heads see the first stages, as many as name the held-out sweeps with the least surprise; what comes after them
-    is cut off. Later stages know the training sweeps too well, and a head that was found on these trusts them too much.
+    The heads see the first stages, with the spectrum or without, whichever names the held-out sweeps with the least
+    surprise; of equal ones the least. What comes after is cut off. Later stages know the training sweeps too well, and
+    a head that was found on these trusts them too much.
     """
-    size = sum(model.shape.channels)
+    size, whole = sum(model.shape.channels), seen[1][0].shape[1]
+    bands = model.shape.spectrum * spectrum.count(model.form)
     surprise = []
-    for depth in range(1, len(model.convs) + 1):
-        columns = np.r_[: sum(model.shape.channels[:depth]), size : seen[1][0].shape[1]]
+    depths = range(min(model.shape.fewest, len(model.convs)), len(model.convs) + 1)
+    for depth, with_bands in product(depths, (True, False) if bands else (False,)):
+        if not depth and not with_bands:
+            continue
+        columns = np.r_[: sum(model.shape.channels[:depth]), size : whole - bands * (not with_bands)]
         heads = [closed_form_head(x[:, columns], labels, y[:, columns], held_labels) for x, y in seen]
         weight, bias = heads[1]
         p = softmax(seen[1][1][:, columns] @ weight.T + bias)[np.arange(len(held_labels)), held_labels]
-        surprise.append((-np.log(np.maximum(p, LEAST_PROBABILITY)).mean(), depth, heads))
-    _, depth, heads = min(surprise, key=lambda one: one[:2])
-    model = model.cut(depth)
-    named = {
-        f"{name}.{k}": v
+        surprise.append((-np.log(np.maximum(p, LEAST_PROBABILITY)).mean(), depth, with_bands, heads))
+    _, depth, with_bands, heads = min(surprise, key=lambda one: one[0])
+    model = model.cut(depth, with_bands)
+    named = {  # what all materials have in common changes no probability, and takes digits from float32
+        f"{name}.{k}": v - v.mean(axis=0)
         for name, head in zip(("head", "int8"), heads, strict=True)
         for k, v in zip(("weight", "bias"), head, strict=True)
     }
     model.head.weight.data, model.head.bias.data = (torch.from_numpy(named[f"head.{k}"]) for k in ("weight", "bias"))
     return model, {k: v.numpy() for k, v in model.state_dict().items()} | named
+
+
+def usual(form: SweepFormat, shape: Shape) -> Scene:
+    """What varies where nobody says it: another scene for a sensor that is too slow for kernels that sum to zero."""
+    return Scene() if shape.zero_sum(form.window) else SLOW
 
 
 def varied(x: Tensor, rng: Generator, rows: int, scene: Scene) -> Tensor:

@@ -18,8 +18,8 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from appliance.errors import FormatError
 
 Array = NDArray[Any]
-KEPT = 0.95
-"""Share of known sweeps that the limit keeps."""
+KEPT = 0.99
+"""Share of known sweeps that the limit keeps: what it refuses is lost to the robot, whatever the network knew."""
 PARTS = 10
 """Into how many parts groups are dealt at most, where each part is judged by what the others gave."""
 FLAT = 1e-9

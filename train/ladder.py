@@ -19,6 +19,8 @@ LATER = (5, 2)
 """Kernel and stride of the stages after the first."""
 SHORT = 4
 """The first kernel of a window that does not allow any stride."""
+MAINS_HZ = 50.0
+"""What is not heard. Of 60 Hz three quarters still pass 32 frames at 750 Hz."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +49,21 @@ class Cost:
 class Shape:
     """A rung of the ladder. channels: of each stage; kernel and stride: of the first stage for long windows.
 
-    planned: how many stages there were before some were cut off, 0 for no more than there are.
+    planned: how many stages there were before some were cut off, 0 for no more than there are; all may be. spectrum:
+    whether the head sees the bands of spectrum.py behind the stages' responses. fewest: stages that are not cut off.
     """
 
     channels: tuple[int, ...]
     kernel: int = 32
     stride: int = 4
     planned: int = 0
+    spectrum: bool = False
+    fewest: int = 1
 
-    def cut(self, depth: int) -> Shape:
-        """The first `depth` stages, each as it was."""
-        return replace(self, channels=self.channels[:depth], planned=max(self.planned, len(self.channels)))
+    def cut(self, depth: int, spectrum: bool = False) -> Shape:
+        """The first `depth` stages, each as it was, and the spectrum or not."""
+        planned = max(self.planned, len(self.channels))
+        return replace(self, channels=self.channels[:depth], planned=planned, spectrum=spectrum)
 
     def stages(self, window: int) -> tuple[Stage, ...]:
         """The stages for a window of so many frames.
@@ -65,13 +71,16 @@ class Shape:
         Kernel and stride of the first are halved as long as the last stage has less than LEAST_STEPS; where that leaves
         no stride, the kernel is SHORT. Raises FormatError where the window is too short for any.
         """
+        return self._stages(window)[: len(self.channels)]
+
+    def _stages(self, window: int) -> tuple[Stage, ...]:
         kernel, stride = self.kernel, self.stride
         while (plan := self._plan(window, kernel, stride))[-1].steps < LEAST_STEPS and stride > 1:
             stride //= 2
             kernel = kernel // 2 if stride > 1 else SHORT
         if plan[-1].steps < 1:
             raise FormatError(f"a window of {window} frames is too short for the network; record at least 16")
-        return plan[: len(self.channels)]
+        return plan
 
     def _plan(self, window: int, kernel: int, stride: int) -> tuple[Stage, ...]:
         plan, steps, reach, hop = [], window, 1, 1
@@ -86,7 +95,7 @@ class Shape:
         So they do where the window is long enough for a stride. A slow sensor's texture lies in just these low
         frequencies; there each taxel's mean over the window is taken away instead.
         """
-        return self.stages(window)[0].stride > 1
+        return self._stages(window)[0].stride > 1
 
     def cost(self, form: SweepFormat, classes: int) -> Cost:
         """Of convolutions and head, as they stand in the graph."""
@@ -99,7 +108,8 @@ class Shape:
 
 
 LADDER = {
-    "1k": Shape((3, 6, 8), 16, 8),
+    "bands": Shape((), spectrum=True, fewest=0),
+    "1k": Shape((2, 6, 8), 32, 8),
     "4k": Shape((5, 12, 16), 32, 8),
     "10k": Shape((8, 20, 36), 32, 8),
     "20k": Shape((24, 24, 24)),
@@ -107,8 +117,9 @@ LADDER = {
     "100k": Shape((32, 72, 104)),
 }
 """By about how many weights they have at most, for 1500 x 4 x 4 digits and six materials; the last is as large as its
-bundle may be."""
-USUAL = LADDER["20k"]
+bundle may be, the first has nothing but the spectrum and a head."""
+USUAL = replace(LADDER["20k"], fewest=0)
+"""Of the box's own method: no stage at all where the spectrum alone does as well."""
 
 
 @dataclass(frozen=True)

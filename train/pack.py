@@ -24,9 +24,11 @@ from numpy.typing import NDArray
 from appliance import bundle
 from appliance.classifier import Classifier, softmax
 from appliance.clock import SystemClock
-from appliance.errors import BundleError
+from appliance.errors import BundleError, FormatError
 from appliance.sweep import Frames, Status, Sweep
 
+from .complete import complete
+from .fit import Fit
 from .graphs import run
 from .heads import hold_out
 from .methods import Method, given
@@ -52,6 +54,7 @@ class Content:
 
     train, held: what it was trained on and what it was not, parted by `held_by`. about: how it was made, figures: how
     it did, for the manifest. early, known: for the manifest, with the file means.npz where there is `known`.
+    reference: the float form of a model in int8. made: the fit of one of our own networks, which `pack` completes.
     """
 
     model: onnx.ModelProto
@@ -64,6 +67,8 @@ class Content:
     early: bundle.Early | None = None
     known: bundle.Known | None = None
     means: bytes = b""
+    reference: onnx.ModelProto | None = None
+    made: Fit | None = None
 
 
 def pack(
@@ -74,8 +79,10 @@ def pack(
     commit: of the code, for the manifest. full_scale: the sensor's highest digit where it is not its type's.
     Raises ExportRefused where a check fails, and BundleError where a label or the target cannot be used.
     """
+    content = completed(content)
     train, held = content.train, content.held
-    golden = golden_sweeps(train, run(content.model, given(content.input, train)))
+    logits = run(content.model, given(content.input, train))
+    golden = golden_sweeps(train, logits, named_by_means(content, train) if content.known else logits)
     files = {bundle.MODEL: content.model.SerializeToString(), bundle.GOLDEN: golden}
     files |= {bundle.MEANS: content.means} if content.known else {}
     manifest = bundle.Manifest(
@@ -100,18 +107,51 @@ def trained(method: Method, sweeps: SweepSet, seed: int) -> Content:
     train, held, by = hold_out(sweeps, seed)
     model = method.train(train, given(method.input, train), seed)
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
-    return Content(model.graph(), method.input, train, held, by, about)
+    forms = getattr(model, "forms", {})
+    reference = forms["float"].graph() if "float" in forms else None
+    made = getattr(model, "made", None)
+    return Content(model.graph(), method.input, train, held, by, about, reference=reference, made=made)
 
 
-def golden_sweeps(sweeps: SweepSet, logits: Array) -> bytes:
+def completed(content: Content) -> Content:
+    """`content` with all that stands on the trunk of what was `made`: early answers where its sweeps support them, and
+    what is known. As it is where nothing was held out, or not all its materials were trained."""
+    made = content.made
+    if made is None or made.train.materials != content.train.materials:
+        return content
+    try:
+        done = complete(made)
+    except FormatError:  # too few groups: nothing could judge
+        return content
+    rule = done.rule
+    told = {"early": {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why}
+    return replace(
+        content, model=done.graph(made.trunk(tenths=bool(rule.early))), early=rule.early, known=done.known(),
+        means=done.means(), about=content.about | told,
+    )  # fmt: skip
+
+
+def named_by_means(content: Content, sweeps: SweepSet) -> Array:
+    """Logits [N, K] as the box computes them from class means where a label is enrolled, not cooled."""
+    embedding = onnx.ModelProto()
+    embedding.CopyFrom(content.model)
+    kept = [output for output in embedding.graph.output if output.name == "embedding"]
+    del embedding.graph.output[:]
+    embedding.graph.output.extend(kept)
+    with np.load(io.BytesIO(content.means)) as means:
+        named: Array = run(embedding, sweeps.samples) @ means["means"].T + means["bias"]
+    return named
+
+
+def golden_sweeps(sweeps: SweepSet, logits: Array, also: Array) -> bytes:
     """An .npz of one training sweep of the first and the last material, and their logits.
 
-    Of those that are recognised it is the one whose probability is the median: neither so sure that a small fault does
+    Of those that are recognised, by the logits `also` too, it is the one whose probability is the median: neither so sure that a small fault does
     not show, nor so unsure that rounding turns it. Raises ExportRefused where none is recognised.
     """
     index = []
     for label in (0, len(sweeps.materials) - 1):
-        known = np.flatnonzero((sweeps.labels == label) & (logits.argmax(1) == label))
+        known = np.flatnonzero((sweeps.labels == label) & (logits.argmax(1) == label) & (also.argmax(1) == label))
         if not len(known):
             raise ExportRefused(f"no training sweep of {sweeps.materials[label]!r} is recognised; train longer")
         order = np.argsort(softmax(logits[known])[:, label], kind="stable")

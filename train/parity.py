@@ -21,7 +21,7 @@ from appliance.classifier import softmax
 from appliance.errors import FormatError
 
 from .layers import PERCENTILES, Layer, layers, outputs, tap_sum
-from .score import DRAWS
+from .score import widened
 
 Array = NDArray[Any]
 LAYER_SWEEPS = 96
@@ -85,8 +85,11 @@ class Parity:
     def summary(self) -> dict[str, Any]:
         """In small, for a manifest: of the tensors the worst."""
         told = (asdict(part) for part in (self.apart, self.lost) if part)
+        figures = {name: value for part in told for name, value in part.items()}
+        if not self.layers:  # nothing of it is in int8
+            return figures
         worst = {"saturated": max(x.saturated for x in self.layers), "sqnr_db": min(x.sqnr_db for x in self.layers)}
-        return {name: value for part in told for name, value in part.items()} | worst | {"tap_sum": self.tap_sum}
+        return figures | worst | {"tap_sum": self.tap_sum}
 
 
 def measure(
@@ -107,7 +110,7 @@ def measure(
         apart, lost = compare(want, have), loss(want.argmax(1) == labels, right, clusters)
     some = inputs[np.linspace(0, len(inputs) - 1, min(LAYER_SWEEPS, len(inputs))).astype(int)]
     told = tuple(layers(int8, reference, some))
-    if not told:
+    if not told and reference is None:
         raise FormatError(
             "the model has no int8 tensors: there is nothing to compare; export a fit with palpate-train export"
         )
@@ -143,13 +146,7 @@ def loss(float_right: Array, int8_right: Array, clusters: Array | None = None) -
     chance = sum(comb(fewer + more, k) for k in range(fewer, fewer + more + 1)) / 2 ** (fewer + more)
     middle = (worse - better) / (n + 2)
     reach = Z95 * np.sqrt(((worse + better) / (n + 2) - middle**2) / (n + 2))
-    low, high = middle - reach, middle + reach
-    if clusters is not None:
-        member = np.unique(clusters, return_inverse=True)[1]
-        sums, size = np.bincount(member, difference), np.bincount(member)
-        drawn = np.random.default_rng(0).integers(len(size), size=(DRAWS, len(size)))
-        shares = sums[drawn].sum(1) / size[drawn].sum(1)
-        low, high = min(low, np.quantile(shares, 0.025)), max(high, np.quantile(shares, 0.975))
+    low, high = widened((middle - reach, middle + reach), difference, clusters)
     lost = float(difference.mean())
     return Lost(
         n, int(float_right.sum()), int(int8_right.sum()), lost, float(max(low, -1)), float(min(high, 1)), chance
