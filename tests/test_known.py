@@ -105,11 +105,11 @@ def test_the_limit_knows_positions_that_were_not_seen():
 
     (x, y, at), (new, _, _) = world(300, 0), world(400, 5)
     one, every = known.embed(x, y, 2), np.ones(len(y), bool)
-    across = known.limit(known.crossed(x, y, at, every, 2))
+    across = known.limit(known.crossed(x, y, at, every, 2), 0.95)
     assert 0.93 < np.mean(one.strangeness(new) <= across) < 0.97
     seven = at < 7  # with few places the covariance is too small, and what fits itself is far too narrow
     narrow, mine, them = known.embed(x[seven], y[seven], 2), (x[seven], y[seven], at[seven]), every[seven]
-    itself, others = known.limit(narrow.strangeness(x[seven])), known.limit(known.crossed(*mine, them, 2))
+    itself, others = (known.limit(s, 0.95) for s in (narrow.strangeness(x[seven]), known.crossed(*mine, them, 2)))
     kept = [np.mean(narrow.strangeness(new) <= at_most) for at_most in (itself, others)]
     assert kept[0] < 0.9 < kept[1]
     few = np.isin(at, (0, 1))

@@ -162,7 +162,7 @@ def test_a_bundle_is_told_without_float(fitted: Fit):
     assert len(found.layers) >= len(fitted.shape.channels)
     assert "holds no float form" in parity.table(found)
     with pytest.raises(FormatError, match="no int8 tensors"):
-        parity.measure(reference, fitted.held.samples, fitted.held.labels, reference)
+        parity.measure(reference, fitted.held.samples, fitted.held.labels)
 
 
 def test_the_command_tells_fits_and_bundles(fitted: Fit, tmp_path: Path):

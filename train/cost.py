@@ -50,7 +50,10 @@ def macs(model: onnx.ModelProto) -> int:
     known = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in (*graph.value_info, *graph.output)}
     known |= {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in graph.input}
     known |= {c.name: list(c.dims) for c in graph.initializer}
-    return sum(_macs(node, known) for node in graph.node)
+    moved = {v.name for v in graph.input}  # what no sweep moves is computed once, when the box loads the graph
+    for node in graph.node:
+        moved |= set(node.output) if moved & set(node.input) else set()
+    return sum(_macs(node, known) for node in graph.node if moved & set(node.output))
 
 
 def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:

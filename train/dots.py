@@ -94,6 +94,8 @@ def _made(method: Method, sweeps: SweepSet, seed: int, work: Path) -> Iterator[d
         about = {"method": method.name, "form": form, "seed": seed, "ran": ran}
         content = pack.Content(one.graph(), method.input, train, held, by, about)
         precision = cost.precision(content.model)
+        if any(precision == told["precision"] for told in counted.values()):
+            continue  # nothing of it is in int8: it is its own float form
         folder = work / precision
         pack.pack(content, folder, f"{method.name}-{precision}", "1", commit())
         counted[form] = {

@@ -168,8 +168,9 @@ def unknown(partial: Sequence[tuple[Case, Finish]], materials: Sequence[str]) ->
 
 
 def _of_trunk(case: Case, done: Finish) -> Array:
-    """Squared distance in the trained features alone: all of them."""
-    size = case.seen.shape[2] - case.fixed
+    """Squared distance in the trained features alone: all of them; the same for all where there are none."""
+    if not (size := case.seen.shape[2] - case.fixed):
+        return np.zeros(len(case.new))
     return embed(case.seen[:, -1, :size], case.seen_labels, size).strangeness(case.new[:, -1, :size])
 
 
