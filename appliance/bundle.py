@@ -123,6 +123,8 @@ class Manifest:
             raise BundleError(
                 f"manifest schema {self.schema} is unknown; this version reads 1 and {SCHEMA}: update one of them"
             )
+        if self.input not in INPUTS:
+            raise BundleError(f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}")
         if self.schema == 1 and (self.early or self.known):
             raise BundleError("manifest schema 1 has no `early` and no `known`; export the bundle again")
         if (self.known is not None) != (MEANS in self.files):
@@ -131,8 +133,6 @@ class Manifest:
             raise BundleError(
                 f"manifest has `early`, but input {self.input!r} needs the whole window; export it without"
             )
-        if self.input not in INPUTS:
-            raise BundleError(f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}")
         if len(self.labels) < 2 or len(set(self.labels)) < len(self.labels):
             raise BundleError(f"manifest labels {list(self.labels)} must be at least two different names")
         for label in self.labels:

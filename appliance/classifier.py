@@ -218,8 +218,8 @@ class Classifier:
     def _verdict(self, sweep: Sweep, finding: Finding, scores: NDArray[np.float64] = _NONE, fused: int = 0) -> Verdict:
         label, best, second = "", 0.0, 0.0
         if len(scores):
-            order = np.argsort(scores)
-            label, best, second = self.bundle.manifest.labels[order[-1]], scores[order[-1]], scores[order[-2]]
+            order = np.argsort(-scores, kind="stable")  # of equals the first, as argmax has it
+            label, best, second = self.bundle.manifest.labels[order[0]], scores[order[0]], scores[order[1]]
         now = self._clock.now_ns()
         return Verdict(
             sweep=sweep.id, time_ns=now, status=finding.status, label=label, probability=float(best),

@@ -399,7 +399,7 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, monkeypatc
         'methods = ["static-svm", "L-gauss"]\nreduce = ["window", "classes"]\n[budget]\nms = 50\nkb = 500\nmb = 500\nslower = 3\n'
     )
     parser = argparse.ArgumentParser()
-    choose.register(parser)
+    choose.register(lambda *about: parser)
     args = [
         "--scene",
         str(tmp_path / "scene.toml"),
@@ -437,7 +437,7 @@ def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, mon
     hard.save(tmp_path / "skin.npz")
     (tmp_path / "scene.toml").write_text('sets = ["skin.npz"]\nvaries = ["place"]\naccuracy = 0.99\nreduce = []\n')
     parser = argparse.ArgumentParser()
-    choose.register(parser)
+    choose.register(lambda *about: parser)
     choose.run(parser.parse_args(["--scene", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "b"), "--jobs", "1",
                                   "--cache", str(tmp_path / "c")]))  # fmt: skip
     assert "Not reached: .990 is wanted" in capsys.readouterr().out

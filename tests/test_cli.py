@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -185,13 +186,17 @@ def test_the_sequential_test_is_configured(
     assert said() == [b"ok"] * 3
 
 
-def test_early_needs_a_bundle_that_can(capsys: pytest.CaptureFixture[str]):
+def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """classifier.early with a bundle without early heads ends before the first sweep; `check` names it."""
-    assert main(["run", "--sim", "skin", *VIRTUAL, "--set", "classifier.early=true"]) == 4
+    folder = Path(shutil.copytree(bundle.DEFAULT, tmp_path / "bundle"))
+    manifest = json.loads((folder / bundle.MANIFEST).read_text()) | {"early": None}
+    (folder / bundle.MANIFEST).write_text(json.dumps(manifest))
+    which = ["--set", "classifier.early=true", "--set", f"classifier.bundle={folder}"]
+    assert main(["run", "--sim", "skin", *VIRTUAL, *which]) == 4
     said = capsys.readouterr()
     assert "has no early heads" in said.err
     assert said.out == ""
-    assert main(["check", "--sim", "skin", "--virtual", "--set", "classifier.early=true"]) == 1
+    assert main(["check", "--sim", "skin", "--virtual", *which]) == 1
     assert "FAIL  golden sweeps" in capsys.readouterr().out
 
 

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 
 from . import page
 from .ink import ACCENT, FAINT, GREY, INK, SMALL, field, scale, share, svg
+from .known import KEPT
 
 Told = Mapping[str, Any]
 TARGETS = {"unknown": 0.95, "enrolment": 0.90, "early": 0.5, "lost": 0.005}
@@ -94,7 +95,7 @@ def strangers(told: Told, pictures: Mapping[str, str]) -> str:
         "Each material was left out of training in turn. Known sweeps are from places never trained on.",
         page.table(["left out", "AUROC", "false known\nat .95 kept", "kept by\nthe limit", "false known\nby the limit",
                     "known / unknown"], rows),
-        page.text("The limit is found on sweeps held out of training and meant to keep .95; kept and false known are what "
+        page.text(f"The limit is found on sweeps held out of training and meant to keep {share(KEPT)}; kept and false known are what "
                   "it does at places that neither training nor the limit has seen."),
         page.folded("Other scores on the same sweeps, mean AUROC", page.table(["score", "AUROC"], others, texts=(0,))),
     )  # fmt: skip
@@ -237,7 +238,7 @@ def _frame(axes: Axes, x: tuple[float, float], y: tuple[float, float], label: st
     axes.grid(color=FAINT, linewidth=0.6)
     step = 0.25 if right <= 1 else 1 if right >= 3 else 0.2 if right < 2 else 0.5
     scale(axes.xaxis, [left + step * k for k in range(int((right - left) / step + 1e-9) + 1)])
-    scale(axes.yaxis, [round(low + k * (1 - low) / 4, 3) for k in range(5)])
+    scale(axes.yaxis, [round(low + k * (1 - low) / 5, 3) for k in range(6)])
     axes.set_xlabel(label, color=GREY, size=SMALL)
 
 

@@ -23,6 +23,7 @@ from . import dots, evaluate, explorer, methods, options, pool, scatter, score, 
 from .dots import Packed
 from .evaluate import Plan, Where
 from .fold import fingerprint, whole
+from .ladder import LADDER
 from .methods import USUAL, Effort
 from .trial import Trial
 
@@ -78,7 +79,7 @@ class Chart:
     rounds: int = dots.ROUNDS
 
 
-LADDER = tuple(f"compact-{size}" for size in ("1k", "4k", "10k", "20k", "50k", "100k"))
+RUNGS = ("compact", *(f"compact-{size}" for size in LADDER))
 FULL = Chart(
     {
         "hard": Part(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1"),
@@ -88,7 +89,7 @@ FULL = Chart(
     },
     "sim:T-REAL:1",
     "sim:T-REAL:2:2",
-    (*LADDER, "L-gauss", "L-knn", "L-svm", "H-knn", "H-svm", "minirocket", "tactnet2", "paper-cnn-centred"),
+    (*RUNGS, "L-gauss", "L-knn", "L-svm", "H-knn", "H-svm", "minirocket", "tactnet2", "paper-cnn-centred"),
     ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm", "st-hmp", "recurrent"),
 )
 QUICK = Chart(
