@@ -108,7 +108,7 @@ class Shape:
 
 
 LADDER = {
-    "bands": Shape((), spectrum=True, fewest=0),
+    "bands": Shape((), planned=3, spectrum=True, fewest=0),
     "1k": Shape((2, 6, 8), 32, 8),
     "4k": Shape((5, 12, 16), 32, 8),
     "10k": Shape((8, 20, 36), 32, 8),
