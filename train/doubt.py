@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle import Classes, Early
+from appliance.bundle import Early
 from appliance.classifier import LEAST_PROBABILITY, softmax
 from appliance.enrol import joined
 from appliance.errors import FormatError
@@ -243,10 +243,7 @@ def _enrolled(
 def enrolled_logits(embedding: Embedding, z: Array, sweeps: Array) -> Array:
     """Logits [n, K + 1], not cooled, of embeddings z [n, r] with a label more, enrolled from `sweeps` [m, r] as the box
     does it."""
-    means, trained = embedding.means, len(embedding.means)
-    bias = (-(means.astype(np.float64) ** 2).sum(1) / 2).astype(np.float32)
-    classes = Classes(means, bias, np.zeros(trained, np.int64), np.ones(trained, np.float32))
-    enrolled = joined(classes, sweeps)
+    enrolled = joined(embedding.classes(), sweeps)
     logits: Array = z @ enrolled.means.T + enrolled.bias
     return logits
 

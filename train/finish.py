@@ -57,9 +57,8 @@ class Finish:
 
     def means(self) -> bytes:
         """The file means.npz of a bundle."""
-        packed, means = io.BytesIO(), self.embedding.means
-        bias = -(means.astype(np.float64) ** 2).sum(1) / 2
-        np.savez_compressed(packed, means=means, bias=bias.astype(np.float32), sweeps=np.zeros(len(means), np.int64))
+        packed, held = io.BytesIO(), self.embedding.classes()
+        np.savez_compressed(packed, means=held.means, bias=held.bias, sweeps=held.sweeps)
         return packed.getvalue()
 
     def graph(self, trunk: onnx.ModelProto, known: bool = True) -> onnx.ModelProto:

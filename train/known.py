@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
+from appliance.bundle import Classes
 from appliance.errors import FormatError
 
 Array = NDArray[Any]
@@ -48,6 +49,11 @@ class Embedding:
         away = z[..., None, :] - self.means.astype(np.float64)
         squares: Array = np.einsum("...kr,...kr->...k", away, away)
         return squares
+
+    def classes(self) -> Classes:
+        """The means as a bundle holds them, all of them trained."""
+        bias, k = -(self.means.astype(np.float64) ** 2).sum(1) / 2, len(self.means)
+        return Classes(self.means, bias.astype(np.float32), np.zeros(k, np.int64), np.ones(k, np.float32))
 
     def strangeness(self, features: Array) -> Array:
         """Squared distance [...] of features [..., F] to the nearest mean: what the limit is compared with."""
