@@ -30,7 +30,11 @@ MACHINES = {
 """Name: (architecture, processor as qemu calls it). The Pi 5 has dot products of eight bits, the Pi 4 has not."""
 PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
 PACKAGES = (f"{PYTHON}-minimal", f"lib{PYTHON}-stdlib", "libstdc++6")
-PLATFORMS = [f"manylinux{tag}_aarch64" for tag in ("_2_28", "_2_27", "_2_17", "2014")]
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
+ARM_WHEELS = (
+    "--no-deps", "--only-binary", ":all:", "--implementation", "cp",
+    *(f"--platform=manylinux{tag}_aarch64" for tag in ("_2_28", "_2_27", "_2_17", "2014")),
+)  # fmt: skip
 CPUINFO = (
     "processor\t: 0\nFeatures\t: fp asimd\nCPU implementer\t: 0x41\n"
     "CPU architecture: 8\nCPU variant\t: 0x0\nCPU part\t: 0xd08\nCPU revision\t: 3\n"
@@ -78,7 +82,7 @@ def set_up() -> Path:
     if target.exists():
         return target
     part = target.with_suffix(f".{os.getpid()}.part")
-    for made in ("lists/partial", "archives/partial", "root/proc", "root/sys/devices/system/cpu", "qemu"):
+    for made in ("root/proc", "root/sys/devices/system/cpu", "qemu"):
         (part / made).mkdir(parents=True)
     try:
         _unpack(part)
@@ -103,36 +107,44 @@ def set_up() -> Path:
 
 
 def _unpack(part: Path) -> None:
-    """Debian's Python for arm64, and qemu where this machine has none, with all they need; apt checks signatures."""
-    mine = _run("dpkg", "--print-architecture").strip()
+    """Debian's Python for arm64, and qemu where this machine has none, with all they need."""
+    mine = run("dpkg", "--print-architecture").strip()
     wanted = {"root": [f"{name}:arm64" for name in PACKAGES]}
     try:
         qemu("aarch64"), qemu("x86_64")
     except Missing:
         wanted["qemu"] = [f"qemu-user-static:{mine}"]
-    known = '"arm64"; ' + f'"{mine}"; ' * ("qemu" in wanted)
+    with_apt = apt(part, "arm64", *([mine] if "qemu" in wanted else []))
+    for where, names in wanted.items():
+        run(*with_apt, "apt-get", "-qq", "install", "-y", "--download-only", "--no-install-recommends", *names)
+        for package in (part / "archives").glob("*.deb"):
+            run("dpkg-deb", "-x", package, part / where)
+            package.unlink()
+
+
+def apt(part: Path, *known: str) -> tuple[str, str]:
+    """What to put before a command of apt, so that it sees these architectures, knows nothing as installed, and keeps
+    what it fetches in `part`. The lists are fetched here; apt checks their signatures with this machine's keys.
+    """
+    for made in ("lists/partial", "archives/partial"):
+        (part / made).mkdir(parents=True, exist_ok=True)
     (part / "status").write_bytes(b"")
     (part / "apt.conf").write_text(
-        f'APT::Architecture "arm64"; APT::Architectures {{ {known}}}; APT::Sandbox::User ""; Acquire::Languages "none";\n'
+        f'APT::Architecture "{known[0]}"; APT::Architectures {{ {" ".join(f"{name};" for name in known)} }};\n'
+        f'APT::Sandbox::User ""; Acquire::Languages "none";\n'
         f'Dir::State::Lists "{part}/lists"; Dir::State::Status "{part}/status"; Dir::Cache "{part}";\n'
     )
-    apt = ("env", f"APT_CONFIG={part / 'apt.conf'}", "apt-get", "-qq")
-    _run(*apt, "update")
-    for where, names in wanted.items():
-        _run(*apt, "install", "-y", "--download-only", "--no-install-recommends", *names)
-        for package in (part / "archives").glob("*.deb"):
-            _run("dpkg-deb", "-x", package, part / where)
-            package.unlink()
+    before = ("env", f"APT_CONFIG={part / 'apt.conf'}")
+    run(*before, "apt-get", "-qq", "update")
+    return before
 
 
 def _install(site: Path) -> None:
     """The locked wheels for arm64."""
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q", "install", "--no-deps")
-    wheels = ("--only-binary", ":all:", "--implementation", "cp", *(f"--platform={tag}" for tag in PLATFORMS))
-    _run(*pip, *wheels, "--require-hashes", "-r", LOCK, "--target", site)
+    run(*PIP, "install", *ARM_WHEELS, "--require-hashes", "-r", LOCK, "--target", site)
 
 
-def _run(*args: str | Path) -> str:
+def run(*args: str | Path) -> str:
     """A command's output; its errors go into the exception."""
     return subprocess.run(args, check=True, capture_output=True, text=True).stdout
 

@@ -1,0 +1,73 @@
+"""`python -m rig build|show|shell`: makes the virtual box, shows it at work, or opens a shell in it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from machines import Missing
+
+from .cell import Cell
+from .image import image
+from .machine import Machine
+
+
+def show(cell: Cell, sweeps: int) -> None:
+    """Let the robot sweep, and print what it touched, what the box said, and what its lines showed."""
+    begun = time.monotonic()
+    cell.plug()
+    cell.until_ready()
+    print(f"READY {time.monotonic() - begun:.1f} s after the skin was plugged in", flush=True)
+    for _ in range(sweeps):
+        touch, answer = cell.sweep()
+        cell.lines.wait("RESULT-VALID", True, 5)
+        heard_ns = next(t for t, line in reversed(cell.serial.heard) if ",RES," in line)
+        print(
+            f"{touch.act.label:<15} -> {answer.status} {answer.label:<15} {answer.probability:.3f}  class bits "
+            f"{cell.lines.code()}  {(heard_ns - touch.stop_ns) / 1e6:.1f} ms from edge to sentence",
+            flush=True,
+        )
+
+
+def shell(cell: Cell) -> None:
+    """Run lines of the keyboard in the guest, as root, while the skin streams; `sweep` makes the robot sweep."""
+    cell.plug()
+    print("a shell in the virtual box; `sweep` sweeps, `unplug` and `plug` do that, an empty line ends")
+    while line := input("box# ").strip():
+        if line == "sweep":
+            print(cell.sweep())
+        elif line in ("plug", "unplug"):
+            getattr(cell, line)()
+        else:
+            print(cell.machine.run(line).out, end="")
+
+
+def main() -> int:
+    """Read the arguments and do it; the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
+    parser.add_argument("what", choices=["build", "show", "shell"])
+    parser.add_argument("--sweeps", type=int, default=6)
+    args = parser.parse_args()
+    try:
+        made = image(lambda line: print(line, flush=True))
+    except Missing as e:
+        print(e, file=sys.stderr)
+        return 1
+    if args.what == "build":
+        print(made.disk)
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        begun = time.monotonic()
+        with Machine(made, Path(folder), snapshot=True) as machine:
+            machine.ready(60)
+            print(f"the virtual box goes on from its snapshot: {time.monotonic() - begun:.1f} s", flush=True)
+            cell = Cell(machine)
+            shell(cell) if args.what == "shell" else show(cell, args.sweeps)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

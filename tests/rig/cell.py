@@ -1,0 +1,144 @@
+"""The robot cell around a guest: a robot that sweeps when it is told to, and reads sentences and lines as a controller
+would. In: a Machine. Out: answers, beside what was really touched and when.
+"""
+
+from __future__ import annotations
+
+import itertools
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from appliance.clock import SystemClock
+from appliance.sim import rig, script, skin
+from appliance.sim.score import Answer
+
+from .machine import Machine
+
+IDLE = 75
+"""Frames of an empty skin between two sweeps: a tenth of a second."""
+ANSWER_S = 30
+"""Longest wait for an answer after the stop edge; an emulated processor that is busy takes seconds."""
+
+
+@dataclass(slots=True)
+class Touch:
+    """One sweep as the robot made it. first: number of its first frame; start_ns, stop_ns: host times of its edges.
+
+    played: set once the board has come to it.
+    """
+
+    act: rig.Act
+    start: bool = True
+    stop: bool = True
+    first: int = -1
+    start_ns: int = 0
+    stop_ns: int = 0
+    played: threading.Event = field(default_factory=threading.Event)
+
+
+class Hand:
+    """The script that a board plays: an empty skin, and a touch whenever one is asked for (see sim.rig.Robot)."""
+
+    def __init__(self, lines: rig.EdgeLines, seed: int) -> None:
+        self.skipped = None
+        self.touches: queue.SimpleQueue[Touch] = queue.SimpleQueue()
+        self._lines, self._rng = lines, np.random.default_rng(seed)
+
+    def next_act(self, first: int, frame_ns: Callable[[int], int]) -> rig.Act:
+        """The next touch, its edges scheduled, or an empty skin."""
+        try:
+            touch = self.touches.get_nowait()
+        except queue.Empty:
+            return rig.Act(skin.idle(IDLE, self._rng), 0, 0, "")
+        act = touch.act
+        touch.first, touch.start_ns, touch.stop_ns = first, frame_ns(first + act.start), frame_ns(first + act.stop)
+        for line, t_ns, wanted in (("START", touch.start_ns, touch.start), ("STOP", touch.stop_ns, touch.stop)):
+            if wanted:
+                self._lines.drive(line, True, t_ns)
+                self._lines.drive(line, False, t_ns + rig.PULSE_NS)
+        touch.played.set()
+        return act
+
+
+class Cell:
+    """A guest with a robot around it; the skin is in the robot's hand, and plugged in when `plug` is called.
+
+    acts: what the robot sweeps over, in order; the simulator's six tubes, drawn from `seed`.
+    """
+
+    def __init__(self, machine: Machine, seed: int = 1) -> None:
+        self.machine, self.lines, self.serial, self.cable = machine, machine.lines, machine.serial, machine.skin
+        self.clock = SystemClock()
+        self.hand = Hand(machine.lines, seed)
+        self.acts = script.tubes(seed)
+        self._serials = itertools.count(1)
+
+    def board(self, **how: Any) -> rig.Board:
+        """A board in the robot's hand: how are the arguments of sim.rig.Board (ppm, latency, serial, …)."""
+        return rig.Board(skin.FORMAT, self.hand, self.clock, **{"fifo_frames": 2250} | how)
+
+    def plug(self, board: rig.Board | None = None) -> rig.Board:
+        """Plug a board in, a sound one if none is given."""
+        board = board or self.board()
+        self.cable.plug(board)
+        return board
+
+    def unplug(self) -> None:
+        """Pull the skin's cable."""
+        self.cable.unplug()
+
+    def until_ready(self, timeout_s: float = 60) -> None:
+        """Wait until the box says READY. Raises AssertionError where it does not."""
+        if not self.lines.wait("READY", True, timeout_s):
+            raise AssertionError(f"not READY within {timeout_s} s; the box says: {self.journal()}")
+
+    def touch(self, *, start: bool = True, stop: bool = True) -> Touch:
+        """Begin a sweep, without waiting for its end. start, stop: whether the edge is given."""
+        touch = Touch(next(self.acts), start, stop)
+        self.hand.touches.put(touch)
+        return touch
+
+    def sweep(self, timeout_s: float = ANSWER_S) -> tuple[Touch, Answer]:
+        """A whole sweep; what was done, and how the box answered it. Raises AssertionError where no answer comes."""
+        since = len(self.serial.heard)
+        touch = self.touch()
+        return touch, self.answer(since, timeout_s + 6)
+
+    def answer(self, since: int, timeout_s: float = ANSWER_S) -> Answer:
+        """The first RES of the lines from number `since` on."""
+        answer = Answer.read(self.serial.wait_for("$PPLP,RES,", timeout_s, since))
+        assert answer
+        return answer
+
+    def answers(self, since: int = 0) -> list[Answer]:
+        """All RES of the lines from number `since` on."""
+        read = (Answer.read(line) for _, line in self.serial.heard[since:])
+        return [answer for answer in read if answer]
+
+    def state(self) -> list[str]:
+        """The fields of the newest STA after now."""
+        since = len(self.serial.heard)
+        return self.serial.wait_for("$PPLP,STA,", 30, since).split("*")[0].split(",")[2:]
+
+    def journal(self, lines: int = 15) -> str:
+        """What the service last wrote."""
+        return self.machine.run(f"journalctl -u palpate -n {lines} -o cat --no-pager").out
+
+    def restore(self) -> None:
+        """Make the world sound again: lines low, cable and port in order, a sound skin; wait until the box is READY."""
+        for name in ("START", "STOP"):
+            self.lines.set(name, False)
+        self.cable.mangle, self.cable.silent, self.cable.deaf = bytes, False, False
+        self.serial.deaf = False
+        self.plug()
+        self.until_ready()
+
+    def wait(self, seconds: float) -> None:
+        """Let the world go on."""
+        time.sleep(seconds)

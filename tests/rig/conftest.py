@@ -1,0 +1,89 @@
+"""What tests on the virtual box share. PALPATE_RIG=quick runs them, =full with the counts of the report; else they are
+skipped. `make test-rig` sets it, and makes the box first.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from machines import ROOT, Missing
+
+from .cell import Cell
+from .image import Image
+from .image import image as make_image
+from .machine import Machine
+
+HOW = os.environ.get("PALPATE_RIG", "")
+NOTES = ROOT / "build" / "rig" / "faults.jsonl"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what needs a guest where none is wanted."""
+    for item in items:
+        if not HOW and item.path.parent == Path(__file__).parent:
+            item.add_marker(pytest.mark.skip(reason="needs the virtual box; make test-rig"))
+
+
+@pytest.fixture(scope="session")
+def image() -> Image:
+    """The box of this checkout."""
+    if disk := os.environ.get("PALPATE_RIG_DISK"):
+        return Image(Path(os.environ["PALPATE_RIG_GROUND"]), Path(disk))
+    try:
+        return make_image()
+    except Missing as e:
+        pytest.fail(str(e))
+
+
+@pytest.fixture(scope="session")
+def count() -> Callable[[int, int], int]:
+    """How often something is done: count(quick, full)."""
+    return lambda quick, full: full if HOW == "full" else quick
+
+
+@pytest.fixture
+def fresh(image: Image, tmp_path: Path) -> Iterator[Cell]:
+    """A guest for one test, from the snapshot; the skin is plugged in and the box is READY."""
+    with Machine(image, tmp_path, snapshot=True) as machine:
+        cell = Cell(machine)
+        cell.plug()
+        cell.until_ready()
+        yield cell
+
+
+@pytest.fixture(scope="module")
+def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    """A guest for a whole file of tests."""
+    with Machine(image, tmp_path_factory.mktemp("guest"), snapshot=True) as machine:
+        yield Cell(machine)
+
+
+@pytest.fixture
+def cell(shared: Cell) -> Cell:
+    """The guest of this file, with a sound skin, quiet lines and a robot that listens; the box is READY."""
+    shared.restore()
+    return shared
+
+
+@pytest.fixture
+def note(request: pytest.FixtureRequest) -> Callable[[str, str, int], None]:
+    """Writes down what became of a fault, for the table of the report: note(fault, outcome, times)."""
+
+    def write(fault: str, outcome: str, times: int) -> None:
+        print(f"{fault}: {outcome}, {times} times")
+        NOTES.parent.mkdir(parents=True, exist_ok=True)
+        with NOTES.open("a") as f:
+            line = {
+                "test": request.node.nodeid,
+                "layer": "virtual box",
+                "fault": fault,
+                "outcome": outcome,
+                "times": times,
+            }
+            f.write(json.dumps(line) + "\n")
+
+    return write

@@ -1,0 +1,85 @@
+"""The robot's end of the guest's serial port. In: what to send. Out: the sentences that came, with host times."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from pathlib import Path
+
+
+class FarEnd:
+    """heard: (host ns, line) of all lines, in order. While `deaf` nothing is read, and the guest's port fills up."""
+
+    def __init__(self, path: Path) -> None:
+        self.heard: list[tuple[int, str]] = []
+        self._path, self._came = path, threading.Condition()
+        self._reading = threading.Event()
+        self._reading.set()
+        self._socket: socket.socket | None = None
+        self.open()
+
+    def open(self) -> None:
+        """Connect the cable."""
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.connect(str(self._path))
+        threading.Thread(target=self._listen, args=(self._socket,), daemon=True).start()
+
+    def close(self) -> None:
+        """Pull the cable out."""
+        if self._socket:
+            self._reading.set()
+            self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.close()
+            self._socket = None
+
+    @property
+    def deaf(self) -> bool:
+        """True while nothing is read."""
+        return not self._reading.is_set()
+
+    @deaf.setter
+    def deaf(self, value: bool) -> None:
+        (self._reading.clear if value else self._reading.set)()
+
+    def say(self, data: bytes) -> None:
+        """Send bytes to the box."""
+        if not self._socket:
+            raise RuntimeError("the cable is pulled out; open it first")
+        self._socket.sendall(data)
+
+    def ask(self, command: str, timeout_s: float = 10) -> str:
+        """Send a command; the sentence that answers it."""
+        since = len(self.heard)
+        self.say(command.encode() + b"\r\n")
+        return self.wait_for("$PPLP,ANS,", timeout_s, since)
+
+    def wait_for(self, start: str, timeout_s: float, since: int = 0) -> str:
+        """The first line that begins so, of those from number `since` on. Raises AssertionError where none comes."""
+        found: list[str] = []
+
+        def there() -> bool:
+            found[:] = [line for _, line in self.heard[since:] if line.startswith(start)]
+            return bool(found)
+
+        with self._came:
+            if not self._came.wait_for(there, timeout_s):
+                last = [line for _, line in self.heard[since:]][-5:]
+                raise AssertionError(f"no line {start}… within {timeout_s} s; the last ones were {last}")
+        return found[0]
+
+    def _listen(self, port: socket.socket) -> None:
+        rest = b""
+        try:
+            while True:
+                self._reading.wait()
+                data = port.recv(4096)
+                if not data:
+                    return
+                *lines, rest = (rest + data).split(b"\n")
+                with self._came:
+                    now = time.monotonic_ns()
+                    self.heard += [(now, line.decode("ascii", "replace").rstrip("\r")) for line in lines]
+                    self._came.notify_all()
+        except OSError:
+            return  # closed

@@ -1,0 +1,38 @@
+"""In the guest: runs shell lines for whoever sits at the other end of a virtio port. One JSON line in, one out.
+
+In: {"run": "...", "timeout_s": 30}. Out: {"rc": 0, "out": "..."}; rc 124 where the time was up.
+"""
+
+import base64
+import json
+import os
+import subprocess
+
+PORT = "/dev/virtio-ports/palpate.agent"
+
+
+def answer(request: dict) -> dict:
+    """Run the shell line; what it gives on its standard input stands in `stdin`, in base64."""
+    given = base64.b64decode(request.get("stdin", ""))
+    try:
+        done = subprocess.run(
+            ["/bin/sh", "-c", request["run"]], input=given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            timeout=request["timeout_s"], check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired as e:
+        return {"rc": 124, "out": base64.b64encode(e.stdout or b"").decode()}
+    return {"rc": done.returncode, "out": base64.b64encode(done.stdout).decode()}
+
+
+def main() -> None:
+    """Answer for ever. Nobody at the other end reads as nothing: wait for the next."""
+    with open(PORT, "r+b", buffering=0) as port:
+        rest = b""
+        while True:
+            *lines, rest = (rest + os.read(port.fileno(), 65536)).split(b"\n")
+            for line in lines:
+                port.write(json.dumps(answer(json.loads(line))).encode() + b"\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""The room that makes the virtual box. In: Debian's and Python's packages, this checkout. Out: disks, kept by their hash.
+
+Two steps. A *ground*: Debian for arm64 with its stock kernel and a virtual environment with the box's locked
+dependencies; minutes, and the same for every commit. On it a *box*: the wheel, units, rules and settings of this
+checkout, installed in the running guest as a person would, and a snapshot of the guest when its service has started.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import machines
+from machines import ROOT, Missing, run
+
+HERE = Path(__file__).parent
+GUEST = HERE / "guest"
+CACHE = machines.HOME.parent / "rig"
+SUITE = "bookworm"
+GUEST_PYTHON = "3.11"
+"""Python of that suite."""
+PACKAGES = (
+    "systemd", "systemd-sysv", "udev", "dbus", "kmod", "libpam-systemd", "python3-venv", "libusb-1.0-0", "e2fsprogs",
+    "procps", "usbutils",
+)  # fmt: skip
+MODULES = (
+    "virtio_blk", "virtio_pci", "ext4", "crc32c_generic", "virtio_console", "virtio_rng", "autofs4", "xhci-pci",
+    "cdc-acm", "ftdi_sio", "usbserial", "tmpfs",
+)  # fmt: skip
+EARLY = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic")
+"""Modules that the ramdisk loads; everything else comes from the disk."""
+LINES = ("START", "STOP", "READY", "FAULT", "RESULT-VALID", "CLASS-0", "CLASS-1", "CLASS-2")
+"""What the kernel of the guest calls the eight lines of its PL061, by offset."""
+DISK = "2G"
+MACHINE = ("-machine", "virt,gic-version=3", "-cpu", "cortex-a72", "-smp", "2", "-m", "512", "-nic", "none")
+"""The guest's hardware as far as its device tree tells it."""
+TOOLS = {
+    "qemu-system-aarch64": "qemu-system-arm", "qemu-img": "qemu-utils", "qemu-aarch64-static": "qemu-user-static",
+    "mmdebstrap": "mmdebstrap", "arch-test": "arch-test", "fdtput": "device-tree-compiler", "mke2fs": "e2fsprogs",
+    "depmod": "kmod", "cpio": "cpio",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """Where a box lies: kernel, ramdisk and device tree, and a disk with the snapshot `ready` in it."""
+
+    ground: Path
+    disk: Path
+
+    @property
+    def kernel(self) -> Path:
+        """The stock kernel."""
+        return self.ground / "vmlinuz"
+
+
+def image(log: Callable[[str], None] = print) -> Image:
+    """The box of this checkout, made where it is not there. Raises Missing where that is not possible here."""
+    return box(ground(log), log)
+
+
+def built() -> Image | None:
+    """The box of this checkout where it has been made, else None."""
+    folder = CACHE / _box_name()
+    return Image(CACHE / _ground_name(), folder / "disk.qcow2") if folder.exists() else None
+
+
+def ground(log: Callable[[str], None] = print) -> Path:
+    """Folder with vmlinuz, ramdisk, tree.dtb and disk.img, made where it is not there. Raises Missing."""
+    target = CACHE / _ground_name()
+    if not target.exists():
+        _need(TOOLS)
+        if os.geteuid():
+            raise Missing("the virtual box is made as root, since files of many owners are; use sudo")
+        log(f"making the ground of the virtual box: Debian {SUITE} for arm64, about three minutes")
+        _in_place_of(target, _make_ground)
+    return target
+
+
+def box(on: Path, log: Callable[[str], None] = print) -> Image:
+    """This checkout installed on a ground, made where it is not there. Raises Missing."""
+    target = CACHE / _box_name()
+    made = Image(on, target / "disk.qcow2")
+    if not target.exists():
+        _need(["qemu-system-aarch64", "qemu-img", "mke2fs"])
+        log("installing this checkout on it, about a minute")
+        _in_place_of(target, lambda part: _make_box(part, on))
+    return made
+
+
+def _need(tools: Iterable[str]) -> None:
+    os.environ["PATH"] += ":/usr/sbin:/sbin"
+    if lacking := [name for name in tools if not shutil.which(name)]:
+        raise Missing(f"no {', '.join(lacking)} here; apt-get install {' '.join(TOOLS[name] for name in lacking)}")
+
+
+def _ground_name() -> str:
+    parts = [machines.LOCK, HERE / "arm.py", GUEST / "agent.py", GUEST / "agent.service", GUEST / "init"]
+    said = repr((SUITE, PACKAGES, MODULES, EARLY, LINES, DISK, MACHINE))
+    return f"ground-{_hash(parts, said)}"
+
+
+def _box_name() -> str:
+    parts = [
+        p for room in ("appliance", "systemd", "firmware_config") for p in sorted((ROOT / room).rglob("*"))
+        if p.is_file() and "__pycache__" not in p.parts
+    ]  # fmt: skip
+    parts += [ROOT / "pyproject.toml", GUEST / "install.sh", GUEST / "palpate.toml", HERE / "machine.py"]
+    return f"box-{_hash(parts, _ground_name())}"
+
+
+def _hash(parts: Iterable[Path], said: str) -> str:
+    total = hashlib.sha256(said.encode())
+    for part in parts:
+        total.update(hashlib.sha256(part.read_bytes()).digest() + part.name.encode())
+    return total.hexdigest()[:16]
+
+
+def _in_place_of(target: Path, make: Callable[[Path], None]) -> None:
+    """Make a folder whole or not at all. Raises Missing with what the failed command said."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=f"{target.name}.", suffix=".part", dir=target.parent))
+    try:
+        make(part)
+        if not target.exists():
+            part.rename(target)
+    except subprocess.CalledProcessError as e:
+        raise Missing(f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout or '').strip()[-800:]}") from e
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _make_ground(part: Path) -> None:
+    apt = machines.apt(part, "arm64")
+    about = run(*apt, "apt-cache", "depends", "linux-image-arm64").split()
+    package = next(word for word in about if word.startswith("linux-image-6") or word[12:13].isdigit())
+    subprocess.run([*apt, "apt-get", "-qq", "download", package, "busybox-static"], cwd=part, check=True)
+    for deb in part.glob("*.deb"):
+        run("dpkg-deb", "-x", deb, part / ("kernel" if "linux-image" in deb.name else "busybox"))
+    run(*machines.PIP, "download", *machines.ARM_WHEELS, "--python-version", GUEST_PYTHON,
+        "--require-hashes", "-r", machines.LOCK, "-d", part / "wheels")  # fmt: skip
+    version = package.removeprefix("linux-image-")
+    _make_root(part, version)
+    _make_ramdisk(part, version)
+    run("mke2fs", "-q", "-t", "ext4", "-E", "lazy_itable_init=1", "-d", part / "root", part / "disk.img", DISK)
+    shutil.copy(part / "kernel" / "boot" / f"vmlinuz-{version}", part / "vmlinuz")
+    _make_tree(part / "tree.dtb")
+    for rest in part.iterdir():
+        if rest.name not in ("vmlinuz", "ramdisk", "tree.dtb", "disk.img"):
+            shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+
+
+def _make_root(part: Path, version: str) -> None:
+    """Debian with the box's virtual environment, the agent and the modules of its kernel."""
+    shutil.copy(machines.LOCK, part / "wheels")
+    (part / "wheels").chmod(0o755)
+    pip = "/opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --find-links /wheels"
+    hooks = (
+        f"copy-in {part / 'wheels'} /",
+        f"mkdir -p $1/opt/rig && cp {GUEST}/agent.py $1/opt/rig/ && cp {GUEST}/agent.service $1/etc/systemd/system/",
+        'chroot "$1" python3 -m venv /opt/palpate',
+        f'chroot "$1" {pip} --require-hashes -r /wheels/{machines.LOCK.name}',
+        'rm -r "$1/wheels"; echo box > "$1/etc/hostname"; echo uninitialized > "$1/etc/machine-id"; : > "$1/etc/fstab"',
+        'chroot "$1" systemctl enable agent.service serial-getty@ttyAMA0.service',
+        'chroot "$1" systemctl mask apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer e2scrub_reap.service '
+        "getty@tty1.service systemd-timesyncd.service systemd-binfmt.service",
+    )
+    here = [] if not subprocess.run(["arch-test", "arm64"], capture_output=True, check=False).returncode else [
+        sys.executable, HERE / "arm.py"
+    ]  # fmt: skip
+    run(*here, "mmdebstrap", "--architectures=arm64", "--variant=minbase", f"--include={','.join(PACKAGES)}",
+        "--dpkgopt=path-exclude=/usr/share/man/*", "--dpkgopt=path-exclude=/usr/share/doc/*",
+        "--dpkgopt=path-exclude=/usr/share/locale/*", *(f"--customize-hook={hook}" for hook in hooks),
+        "--format=directory", SUITE, part / "root")  # fmt: skip
+    _modules(part / "kernel", part / "root", version, MODULES)
+
+
+def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> list[Path]:
+    """Copy modules and what they need to a root; their files in the order of loading."""
+    source, target = kernel / "lib/modules" / version, root / "lib/modules" / version
+    if not (source / "modules.dep").exists():
+        run("depmod", "-b", kernel, version)
+    found: dict[Path, None] = {}
+    for name in names:
+        told = subprocess.run(
+            ["modprobe", "-d", kernel, "-S", version, "--show-depends", name],
+            capture_output=True,
+            text=True,
+            check=False,
+        ).stdout
+        found |= dict.fromkeys(Path(line.split()[1]) for line in told.splitlines() if line.startswith("insmod"))
+    for file in found:
+        place = target / file.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(file, place)
+    for file in source.glob("modules.*"):
+        if file.name in ("modules.builtin", "modules.builtin.modinfo", "modules.order"):
+            shutil.copy(file, target)
+    run("depmod", "-b", root, version)
+    return list(found)
+
+
+def _make_ramdisk(part: Path, version: str) -> None:
+    ramdisk = part / "ram"
+    for folder in ("bin", "modules"):
+        (ramdisk / folder).mkdir(parents=True)
+    order = _modules(part / "kernel", part / "scrap", version, EARLY)
+    for file in order:
+        shutil.copy(file, ramdisk / "modules")
+    (ramdisk / "order").write_text("".join(f"{file.name}\n" for file in order))
+    shutil.copy(part / "busybox/bin/busybox", ramdisk / "bin")
+    shutil.copy(GUEST / "init", ramdisk / "init")
+    (ramdisk / "init").chmod(0o755)
+    run("sh", "-c", f"cd {ramdisk} && find . | cpio -o -H newc --quiet | gzip -1 > {part / 'ramdisk'}")
+
+
+def _make_tree(path: Path) -> None:
+    """The machine's device tree, with names for its lines and none of them taken for a power button."""
+    run("qemu-system-aarch64", MACHINE[0], f"{MACHINE[1]},dumpdtb={path}", *MACHINE[2:], "-display", "none")
+    run("fdtput", "-r", path, "/gpio-keys")
+    run("fdtput", "-t", "s", path, "/pl061@9030000", "gpio-line-names", *LINES)
+
+
+def _make_box(part: Path, on: Path) -> None:
+    from .machine import Machine
+
+    code = part / "code"
+    code.mkdir()
+    # out of the tree: setuptools leaves its build folder beside what it builds
+    source = part / "source"
+    shutil.copytree(ROOT / "appliance", source / "appliance", ignore=shutil.ignore_patterns("__pycache__"))
+    for file in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / file, source)
+    run(*machines.PIP, "wheel", "--no-deps", "-w", code, source)
+    for room in ("systemd", "firmware_config"):
+        shutil.copytree(ROOT / room, code / room)
+    for file in ("install.sh", "palpate.toml"):
+        shutil.copy(GUEST / file, code)
+    disk = part / "disk.qcow2"
+    run("qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", on / "disk.img", disk)
+    with Machine(Image(on, disk), part, code=code) as guest:
+        guest.ready(180)
+        guest.run("mkdir -p /code && mount -o ro /dev/vdb /code", check=True)
+        guest.run("sh /code/install.sh /code", timeout_s=180, check=True)
+        guest.serial.wait_for("$PPLP,STA,", 120)
+        guest.run("umount /code && sync && systemctl is-system-running --wait", timeout_s=60)
+        guest.save()
+    for rest in ("code", "source"):
+        shutil.rmtree(part / rest)

@@ -1,0 +1,206 @@
+"""One guest. In: an image. Out: a running machine whose USB, lines and serial port are at hand outside.
+
+Boots from its disk, or goes on from the snapshot in two seconds. `cut` pulls the plug. Nothing of a run is kept: each
+has a disk of its own on top of the image's, unless it is asked to write into the image itself.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import socket
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from machines import run
+
+from .far_end import FarEnd
+from .image import LINES, MACHINE, Image
+from .lines import GuestLines
+from .usbredir import Peer
+
+START_S = 20
+"""Longest wait for QEMU to open its sockets, or to load a snapshot."""
+
+
+class Failed(AssertionError):
+    """The guest did not do what it was asked to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """How a shell line ended: its exit code, and what it wrote. rc 124: the time was up."""
+
+    rc: int
+    out: str
+
+
+class Machine:
+    """A guest that runs until `close`, `cut`, or it powers off.
+
+    image: what it runs. folder: where its sockets and its disk go. snapshot: go on from there, instead of booting.
+    disk: use this disk as it is and write into it. code: a folder that is its second disk, read-only.
+    lines, serial, skin: the robot's ends of trigger and result lines, of the serial port, and of the USB cable.
+    """
+
+    def __init__(
+        self, image: Image, folder: Path, *, snapshot: bool = False, disk: Path | None = None, code: Path | None = None
+    ) -> None:
+        self._folder = Path(folder) / f"vm{time.monotonic_ns()}"
+        self._folder.mkdir(parents=True)
+        if disk is None and snapshot:
+            disk = self._folder / "disk.qcow2"
+            shutil.copy(image.disk, disk)
+        self.disk = disk or image.disk
+        self._code_disk(code)
+        redir = socket.socket(socket.AF_UNIX)
+        redir.bind(str(self._folder / "skin"))
+        redir.listen(1)
+        self._process = subprocess.Popen(
+            self._command(image, snapshot), stdin=subprocess.DEVNULL, stdout=(self._folder / "qemu.log").open("wb"),
+            stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        try:
+            self._qmp = self._connect("qmp").makefile("rw")
+            self._qmp.readline()
+            self.qmp("qmp_capabilities")
+            self._agent = self._connect("agent")
+            self._rest = b""
+            self.serial = FarEnd(self._folder / "robot")
+            self.lines = GuestLines(self._connect("qtest"), self._find("pl061"), LINES)
+            self.skin = self._plug_cable(redir)
+        except BaseException:
+            self.cut()
+            raise
+        finally:
+            redir.close()
+
+    def _code_disk(self, code: Path | None) -> None:
+        # always there and always as large, since a snapshot has to find the hardware that it left
+        given = ["-d", code] if code else []
+        path = self._folder / "code.img"
+        run("mke2fs", "-q", "-t", "ext4", "-O", "^has_journal", *given, path, "48M")
+
+    def _command(self, image: Image, snapshot: bool) -> list[str | Path]:
+        at = self._folder
+        chardevs = [f"socket,id={name},path={at}/{name},server=on,wait=off" for name in ("agent", "robot")]
+        return [
+            "qemu-system-aarch64", *MACHINE, "-accel", "tcg,thread=multi", "-display", "none",
+            "-kernel", image.kernel, "-initrd", image.ground / "ramdisk", "-dtb", image.ground / "tree.dtb",
+            "-append", "console=ttyAMA0 quiet systemd.show_status=0 panic=-1", "-no-reboot",
+            "-drive", f"file={self.disk},format=qcow2,if=none,id=d0", "-device", "virtio-blk-pci,drive=d0,addr=4",
+            "-drive", f"file={at}/code.img,format=raw,if=none,id=d1,readonly=on",
+            "-device", "virtio-blk-pci,drive=d1,addr=5",
+            "-device", "qemu-xhci,id=xhci,addr=6", "-device", "virtio-rng-pci,addr=7",
+            "-chardev", chardevs[1], "-device", "pci-serial,chardev=robot,addr=8",
+            "-device", "virtio-serial-pci,addr=9", "-chardev", chardevs[0],
+            "-device", "virtserialport,chardev=agent,name=palpate.agent",
+            "-chardev", f"file,id=console,path={at}/console", "-serial", "chardev:console",
+            "-qmp", f"unix:{at}/qmp,server=on,wait=off",
+            "-qtest", f"unix:{at}/qtest,server=on,wait=off", "-qtest-log", "/dev/null",
+            *(["-loadvm", "ready"] if snapshot else []),
+        ]  # fmt: skip
+
+    def _connect(self, name: str) -> socket.socket:
+        end = time.monotonic() + START_S
+        while True:
+            s = socket.socket(socket.AF_UNIX)
+            try:
+                s.connect(str(self._folder / name))
+                return s
+            except OSError as e:
+                s.close()
+                if self._process.poll() is not None or time.monotonic() > end:
+                    log = (self._folder / "qemu.log").read_text(errors="replace")
+                    raise Failed(f"qemu opened no {name} socket: {log[-800:] or e}") from e
+                time.sleep(0.02)
+
+    def _find(self, kind: str) -> str:
+        """Place of a device of the board in QEMU's tree of objects."""
+        devices = self.qmp("qom-list", path="/machine/unattached")
+        return next(f"/machine/unattached/{d['name']}" for d in devices if d["type"] == f"child<{kind}>")
+
+    def _plug_cable(self, listener: socket.socket) -> Peer:
+        """Put the far end of a USB cable on the guest's port; nothing hangs on it yet."""
+        address = {"type": "unix", "data": {"path": str(self._folder / "skin")}}
+        self.qmp("chardev-add", id="skin", backend={"type": "socket", "data": {"addr": address, "server": False}})
+        self.qmp("device_add", driver="usb-redir", id="cable", chardev="skin", bus="xhci.0")
+        listener.settimeout(START_S)
+        return Peer(listener.accept()[0])
+
+    def qmp(self, execute: str, **arguments: Any) -> Any:
+        """Ask QEMU's monitor; what it returns. Raises Failed where it refuses."""
+        self._qmp.write(json.dumps({"execute": execute, "arguments": arguments}) + "\n")
+        self._qmp.flush()
+        for line in self._qmp:
+            reply = json.loads(line)
+            if "error" in reply:
+                raise Failed(f"qemu: {execute}: {reply['error']['desc']}")
+            if "return" in reply:
+                return reply["return"]
+        raise Failed(f"qemu has left during {execute}")
+
+    def ready(self, timeout_s: float) -> None:
+        """Wait until the guest runs shell lines. Raises Failed where it does not."""
+        self.run("true", timeout_s=timeout_s)
+
+    def run(self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b"") -> Done:
+        """Run a shell line as root; waits for its end. Raises Failed where the guest says nothing, or check asks."""
+        request = {"run": line, "timeout_s": timeout_s, "stdin": base64.b64encode(stdin).decode()}
+        self._agent.settimeout(timeout_s + START_S)
+        try:
+            self._agent.sendall(json.dumps(request).encode() + b"\n")
+            while b"\n" not in self._rest:
+                more = self._agent.recv(1 << 20)
+                if not more:
+                    raise Failed(f"the guest has left during: {line}")
+                self._rest += more
+        except TimeoutError as e:
+            raise Failed(f"the guest said nothing for {timeout_s + START_S:.0f} s to: {line}") from e
+        answer, _, self._rest = self._rest.partition(b"\n")
+        told = json.loads(answer)
+        done = Done(told["rc"], base64.b64decode(told["out"]).decode(errors="replace"))
+        if check and done.rc:
+            raise Failed(f"rc {done.rc} of: {line}\n{done.out[-2000:]}")
+        return done
+
+    def put(self, path: str, data: bytes) -> None:
+        """Write a file of the guest."""
+        self.run(f"cat > {path}", stdin=data, check=True)
+
+    def get(self, path: str) -> bytes:
+        """Read a file of the guest."""
+        return base64.b64decode(self.run(f"base64 {path}", check=True).out)
+
+    def save(self) -> None:
+        """Keep the running guest in its disk as the snapshot `ready`, without what hangs on its USB, and end."""
+        self.qmp("device_del", id="cable")
+        self.run("udevadm settle")
+        said = self.qmp("human-monitor-command", **{"command-line": "savevm ready"})
+        if said.strip():
+            raise Failed(f"qemu: savevm: {said}")
+        self.close()
+
+    def console(self) -> str:
+        """What the kernel and systemd wrote on the console."""
+        return (self._folder / "console").read_text(errors="replace")
+
+    def cut(self) -> None:
+        """Cut the power: the guest does not get to say anything."""
+        self._process.kill()
+        self._process.wait()
+        for part in ("serial", "lines", "skin"):
+            if hasattr(self, part):
+                getattr(self, part).close()
+
+    close = cut
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
