@@ -7,10 +7,11 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check machines lint types bench bundle chart paper wheel lock clean
+.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools test-rig test-hw wheel \
+  lock clean
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(RUNTIME) ## watch simulated sweeps being classified, live
 	$(BIN)/palpate demo
@@ -19,6 +20,24 @@ test: $(DESKTOP) ## run the tests (set PALPATE_DATA to the folder of real sweeps
 	$(BIN)/python -m pytest -q
 
 check: lint types test ## lint, types and tests
+
+RIG := PYTHONPATH=tests $(BIN)/python -m rig
+
+rig: rig-tools ## the virtual box: an arm64 Debian with skin, lines and serial port, and a robot around it, at work
+	$(RIG) show
+
+rig-shell: rig-tools ## a shell in the virtual box
+	$(RIG) shell
+
+test-rig: rig-tools ## the tests on the virtual box; COUNTS=full does each fault as often as the report says (an hour)
+	PALPATE_RIG=$(or $(COUNTS),quick) $(BIN)/python -m pytest -q tests/rig
+
+test-hw: $(DESKTOP) ## the contract of skin, lines and port on this board (wiring: docs/board-checklist.md)
+	PALPATE_UNDERSIDE=wired $(BIN)/python -m pytest -q -rs tests/test_contract.py
+
+rig-tools: $(DESKTOP)
+	@lacking=`$(RIG) lacking`; [ -z "$$lacking" ] || { echo "installing $$lacking"; \
+	  $$( [ `id -u` = 0 ] || echo sudo ) apt-get install -y -q --no-install-recommends $$lacking; }
 
 lint: $(DESKTOP) ## ruff
 	$(BIN)/ruff check .

@@ -1,4 +1,6 @@
-"""`python -m rig build|show|shell`: makes the virtual box, shows it at work, or opens a shell in it."""
+"""`python -m rig build|show|shell|lacking`: makes the virtual box, shows it at work, opens a shell in it, or tells which
+Debian packages that takes.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from pathlib import Path
 from machines import Missing
 
 from .cell import Cell
-from .image import image
+from .image import image, lacking
 from .machine import Machine
 
 
@@ -48,9 +50,12 @@ def shell(cell: Cell) -> None:
 def main() -> int:
     """Read the arguments and do it; the exit code."""
     parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
-    parser.add_argument("what", choices=["build", "show", "shell"])
+    parser.add_argument("what", choices=["build", "show", "shell", "lacking"])
     parser.add_argument("--sweeps", type=int, default=6)
     args = parser.parse_args()
+    if args.what == "lacking":
+        print(*lacking())
+        return 0
     try:
         made = image(lambda line: print(line, flush=True))
     except Missing as e:

@@ -95,10 +95,16 @@ def box(on: Path, log: Callable[[str], None] = print) -> Image:
     return made
 
 
+def lacking(tools: Iterable[str] = TOOLS) -> list[str]:
+    """Debian packages of those tools that are not here."""
+    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
+    return sorted({TOOLS[name] for name in tools if not shutil.which(name, path=path)})
+
+
 def _need(tools: Iterable[str]) -> None:
     os.environ["PATH"] += ":/usr/sbin:/sbin"
-    if lacking := [name for name in tools if not shutil.which(name)]:
-        raise Missing(f"no {', '.join(lacking)} here; apt-get install {' '.join(TOOLS[name] for name in lacking)}")
+    if packages := lacking(tools):
+        raise Missing(f"the virtual box needs more than is here; apt-get install {' '.join(packages)}")
 
 
 def _ground_name() -> str:

@@ -87,7 +87,10 @@ class Machine:
 
     def _command(self, image: Image, snapshot: bool) -> list[str | Path]:
         at = self._folder
-        chardevs = [f"socket,id={name},path={at}/{name},server=on,wait=off" for name in ("agent", "robot")]
+
+        def port(name: str) -> tuple[str, str]:
+            return "-chardev", f"socket,id={name},path={at}/{name},server=on,wait=off"
+
         return [
             "qemu-system-aarch64", *MACHINE, "-accel", "tcg,thread=multi", "-display", "none",
             "-kernel", image.kernel, "-initrd", image.ground / "ramdisk", "-dtb", image.ground / "tree.dtb",
@@ -96,9 +99,10 @@ class Machine:
             "-drive", f"file={at}/code.img,format=raw,if=none,id=d1,readonly=on",
             "-device", "virtio-blk-pci,drive=d1,addr=5",
             "-device", "qemu-xhci,id=xhci,addr=6", "-device", "virtio-rng-pci,addr=7",
-            "-chardev", chardevs[1], "-device", "pci-serial,chardev=robot,addr=8",
-            "-device", "virtio-serial-pci,addr=9", "-chardev", chardevs[0],
-            "-device", "virtserialport,chardev=agent,name=palpate.agent",
+            *port("robot"), "-device", "pci-serial,chardev=robot,addr=8",
+            "-device", "virtio-serial-pci,addr=9",
+            *port("agent"), "-device", "virtserialport,chardev=agent,name=palpate.agent",
+            *port("bench"), "-device", "virtserialport,chardev=bench,name=palpate.bench",
             "-chardev", f"file,id=console,path={at}/console", "-serial", "chardev:console",
             "-qmp", f"unix:{at}/qmp,server=on,wait=off",
             "-qtest", f"unix:{at}/qtest,server=on,wait=off", "-qtest-log", "/dev/null",
@@ -184,6 +188,10 @@ class Machine:
         if said.strip():
             raise Failed(f"qemu: savevm: {said}")
         self.close()
+
+    def bench(self) -> socket.socket:
+        """The other end of the guest's port palpate.bench, over which tests inside ask for what happens outside."""
+        return self._connect("bench")
 
     def console(self) -> str:
         """What the kernel and systemd wrote on the console."""
