@@ -22,6 +22,10 @@ from .machine import Machine
 
 IDLE = 75
 """Frames of an empty skin between two sweeps: a tenth of a second."""
+PULSE_NS = 250_000_000
+"""Length of the robot's pulses: an emulated processor that is busy takes an interrupt tens of milliseconds late, and what
+has risen and fallen by then was no edge.
+"""
 ANSWER_S = 30
 """Longest wait for an answer after the stop edge; an emulated processor that is busy takes seconds."""
 
@@ -61,7 +65,7 @@ class Hand:
         for line, t_ns, wanted in (("START", touch.start_ns, touch.start), ("STOP", touch.stop_ns, touch.stop)):
             if wanted:
                 self._lines.drive(line, True, t_ns)
-                self._lines.drive(line, False, t_ns + rig.PULSE_NS)
+                self._lines.drive(line, False, t_ns + PULSE_NS)
         touch.played.set()
         return act
 
