@@ -20,12 +20,12 @@ from appliance.sim.score import Answer
 
 from .machine import Machine
 
+FIFO = 22_500
+"""Frames that a board holds: half a minute, so that what is lost was lost by the box and not by an emulator that stood
+still while this machine did something else.
+"""
 IDLE = 75
 """Frames of an empty skin between two sweeps: a tenth of a second."""
-PULSE_NS = 250_000_000
-"""Length of the robot's pulses: an emulated processor that is busy takes an interrupt tens of milliseconds late, and what
-has risen and fallen by then was no edge.
-"""
 ANSWER_S = 30
 """Longest wait for an answer after the stop edge; an emulated processor that is busy takes seconds."""
 
@@ -65,7 +65,7 @@ class Hand:
         for line, t_ns, wanted in (("START", touch.start_ns, touch.start), ("STOP", touch.stop_ns, touch.stop)):
             if wanted:
                 self._lines.drive(line, True, t_ns)
-                self._lines.drive(line, False, t_ns + PULSE_NS)
+                self._lines.drive(line, False, t_ns + rig.PULSE_NS)
         touch.played.set()
         return act
 
@@ -85,7 +85,7 @@ class Cell:
 
     def board(self, **how: Any) -> rig.Board:
         """A board in the robot's hand: how are the arguments of sim.rig.Board (ppm, latency, serial, …)."""
-        return rig.Board(skin.FORMAT, self.hand, self.clock, **{"fifo_frames": 2250} | how)
+        return rig.Board(skin.FORMAT, self.hand, self.clock, **{"fifo_frames": FIFO} | how)
 
     def plug(self, board: rig.Board | None = None) -> rig.Board:
         """Plug a board in, a sound one if none is given."""
@@ -138,7 +138,8 @@ class Cell:
         """Make the world sound again: lines low, cable and port in order, a sound skin; wait until the box is READY."""
         for name in ("START", "STOP"):
             self.lines.set(name, False)
-        self.cable.mangle, self.cable.silent, self.cable.deaf = bytes, False, False
+        self.cable.mangle, self.cable.slow_s = bytes, 0.0
+        self.cable.silent = self.cable.deaf = self.cable.halted = False
         self.serial.deaf = False
         self.plug()
         self.until_ready()

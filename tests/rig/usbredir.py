@@ -23,7 +23,11 @@ SET_CONFIGURATION, GET_CONFIGURATION, CONFIGURATION, SET_ALT, GET_ALT, ALT = 6, 
 CANCEL, ACK, CONTROL, BULK = 21, 24, 100, 101
 DONE, CANCELLED, STALL = 0, 1, 4
 IN = 0x81
+CLEAR_HALT = 0x02, 1, 0
+"""Request type, request and value with which a host lets a stalled endpoint go on."""
 FULL_SPEED = 1
+KEPT = 64
+"""Replies that are remembered; a cancellation is on its way for milliseconds."""
 ABLE = 1 << 1 | 1 << 4 | 1 << 5 | 1 << 6
 """connect_device_version, ep_info_max_packet_size, 64bits_ids, 32bits_bulk_length; the guest's side agrees."""
 
@@ -53,18 +57,23 @@ class Descriptors:
 class Peer:
     """A cable. `plug` hangs a board on it, `unplug` takes it off; both may be called from any thread.
 
-    mangle: what the cable does to a transfer. silent: transfers never end. deaf: requests are never answered.
+    mangle: what the cable does to a transfer; more than was asked for is a babble. silent: transfers never end.
+    deaf: requests are never answered. slow_s: they are answered so late. halted: the endpoint stalls until it is cleared.
     sent: transfers that the guest took. opened: how often the guest's kernel has set up a device.
     """
 
     def __init__(self, connection: socket.socket) -> None:
         self.board: rig.Board | None = None
         self.mangle: Callable[[bytes], bytes] = bytes
-        self.silent = self.deaf = False
+        self.silent = self.deaf = self.halted = False
+        self.slow_s = 0.0
         self.descriptors = Descriptors()
         self.sent = self.opened = 0
         self._socket, self._wide = connection, False
         self._waiting: deque[tuple[int, int]] = deque()  # (id, length) of bulk transfers that the guest has asked for
+        self._replied: dict[int, bytes] = {}
+        self._again: deque[bytes] = deque()
+        self._later: deque[tuple[float, bytes, int]] = deque()  # (monotonic s, body, id) of answers to requests
         self._jobs: deque[Callable[[], None]] = deque()
         self._wake, self._woken = socket.socketpair()
         self._said_hello = threading.Event()
@@ -118,8 +127,13 @@ class Peer:
         if self.board:
             self.board.present = self.board.running = False
             self.board = None
-            self._waiting.clear()
+            self._forget()
             self._send(DISCONNECT, 0)
+
+    def _forget(self) -> None:
+        """Nothing is on its way any more."""
+        for what in (self._waiting, self._again, self._replied, self._later):
+            what.clear()
 
     def _send(self, kind: int, ident: int, body: bytes = b"") -> None:
         head = "<IIQ" if self._wide and kind != HELLO else "<III"
@@ -145,8 +159,11 @@ class Peer:
             return  # closed
 
     def _patience_s(self) -> float | None:
+        if self._again and self._waiting:
+            return 0.0
         due_ns = self.board.due_ns() if self.board and self._waiting and not self.silent else None
-        return None if due_ns is None else max(0.0, (due_ns - time.monotonic_ns()) / 1e9)
+        due_s = [at_s for at_s, _, _ in self._later] + ([due_ns / 1e9] if due_ns is not None else [])
+        return max(0.0, min(due_s) - time.monotonic()) if due_s else None
 
     def _take(self, data: bytes) -> bytes:
         """Answer all whole messages; the rest."""
@@ -169,7 +186,7 @@ class Peer:
             case 3:  # RESET: the board starts from the beginning
                 if self.board:
                     self.board.running = False
-                self._waiting.clear()
+                self._forget()
             case 6 | 7:
                 self._send(CONFIGURATION, ident, struct.pack("<BB", DONE, 1))
             case 9 | 10:
@@ -178,6 +195,9 @@ class Peer:
                 for waiting in [w for w in self._waiting if w[0] == ident]:
                     self._waiting.remove(waiting)
                     self._reply(ident, CANCELLED, b"")
+                if ident in self._replied:
+                    # it crossed our reply, which QEMU throws away; a controller on a board would have delivered it
+                    self._again.append(self._replied.pop(ident))
             case 100:
                 self._control(ident, body)
             case 101:
@@ -191,24 +211,35 @@ class Peer:
         reply: bytes | None = b""
         if kind & 0x60:
             reply = self.board.request(request)
+        elif (kind, request, value) == CLEAR_HALT:
+            self.halted = False
         elif request == 6:
             reply = self.descriptors.reply(value >> 8, value & 0xFF)
         elif kind & 0x80:
             reply = bytes(length)  # status and the like
         status, data = (STALL, b"") if reply is None else (DONE, reply[:length] if kind & 0x80 else b"")
         size = len(data) if kind & 0x80 else length
-        self._send(CONTROL, ident, struct.pack("<BBBBHHH", ep, request, kind, status, value, index, size) + data)
+        answer = struct.pack("<BBBBHHH", ep, request, kind, status, value, index, size) + data
+        self._later.append((time.monotonic() + self.slow_s, answer, ident))
 
     def _deliver(self) -> None:
         """Give the guest what is due."""
+        while self._later and self._later[0][0] <= time.monotonic():
+            _, answer, ident = self._later.popleft()
+            self._send(CONTROL, ident, answer)
+        while self._waiting and self.halted:
+            self._reply(self._waiting.popleft()[0], STALL, b"")
         while self._waiting and self.board and not self.silent:
             due_ns = self.board.due_ns()
-            if due_ns is None or due_ns > time.monotonic_ns():
+            if not self._again and (due_ns is None or due_ns > time.monotonic_ns()):
                 return
-            ident, length = self._waiting.popleft()
-            data = self.mangle(self.board.take())
+            ident, _ = self._waiting.popleft()
+            data = self._again.popleft() if self._again else self.mangle(self.board.take())
             self.sent += 1
-            self._reply(ident, DONE, data[:length])
+            self._replied[ident] = data
+            if len(self._replied) > KEPT:
+                del self._replied[next(iter(self._replied))]
+            self._reply(ident, DONE, data)
 
     def _reply(self, ident: int, status: int, data: bytes) -> None:
         n = len(data)
