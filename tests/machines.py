@@ -167,8 +167,8 @@ def work(given: Path, told: Path) -> None:
             said[f"{path.name}/golden"] = np.stack([box.logits(sweep) for sweep in box.bundle.golden])
             said[f"{path.name}/sweeps"] = np.stack([box.logits(sweep) for sweep in sweeps])
         if (path / "shown.onnx").exists():
-            run = classifier.session((path / "shown.onnx").read_bytes())
-            each = [run.run(None, {run.get_inputs()[0].name: sweep[None]}) for sweep in sweeps]
+            shown = classifier.session((path / "shown.onnx").read_bytes())
+            each = [shown.run(None, {shown.get_inputs()[0].name: sweep[None]}) for sweep in sweeps]
             said[f"{path.name}/shown"] = np.stack([np.concatenate([x.ravel() for x in one]) for one in each])
     np.savez(told, **said)
 
