@@ -31,7 +31,9 @@ def main() -> None:
         while True:
             *lines, rest = (rest + os.read(port.fileno(), 65536)).split(b"\n")
             for line in lines:
-                port.write(json.dumps(answer(json.loads(line))).encode() + b"\n")
+                told = json.dumps(answer(json.loads(line))).encode() + b"\n"
+                while told:  # the port takes 32 KB at once
+                    told = told[os.write(port.fileno(), told) :]
 
 
 if __name__ == "__main__":
