@@ -46,7 +46,9 @@ class DeviceClock:
     envelope of these points. Until `settle_s` have been seen it is their minimum. Then it is the line below all points
     of the last `span_s` that lies closest to them on average: the edge of their lower convex hull over the mean time,
     with its slope bounded by `max_ppm` (two crystals differ by less). What stays is the shortest delay itself, some
-    0.1 ms, which cannot be told from the offset. Make a new one after each enumeration: the device's clock starts anew.
+    0.1 ms, which cannot be told from the offset. A line that lies higher than such crystals can have drifted since the
+    last one is none: frames that all come late, from a full FIFO, were not taken late; the last line goes on.
+    Make a new one after each enumeration: the device's clock starts anew.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class DeviceClock:
         self._device_us: int | None = None
         self._first_ns = 0
         self._line = (0, 0.0, 0.0)  # at device ns, offset ns, slope
+        self._fitted_ns = 0  # device time when it was found
 
     def unwrap(self, device_us: int) -> int:
         """Full microseconds of a 32-bit stamp, which wraps each 71.6 minutes; the nearest to the one before."""
@@ -83,12 +86,15 @@ class DeviceClock:
                 return  # above the line: it stays the lower envelope
         else:
             self._points.append((device_ns, offset))
-        self._line = self._fit()
+        line = self._fit()
+        settled = device_ns - self._first_ns >= self._settle_ns
+        drift_ns = 2 * self._max_slope * (device_ns - self._fitted_ns)
+        if not settled or _at(line, device_ns) <= _at(self._line, device_ns) + drift_ns:
+            self._line, self._fitted_ns = line, device_ns
 
     def to_host_ns(self, device_ns: float) -> int:
         """Host time of `device_ns`; needs one `update` before."""
-        at, offset, slope = self._line
-        return round(device_ns + offset + slope * (device_ns - at))
+        return round(device_ns + _at(self._line, device_ns))
 
     def _fit(self) -> tuple[int, float, float]:
         points = self._points
@@ -107,6 +113,12 @@ class DeviceClock:
         # with a bounded slope the line may cut the hull: lower it until it touches from below
         x, y = min(hull, key=lambda p: p[1] - slope * p[0])
         return x, y, slope
+
+
+def _at(line: tuple[int, float, float], device_ns: float) -> float:
+    """Offset of a line (at device ns, offset ns, slope) at another device time, ns."""
+    at, offset, slope = line
+    return offset + slope * (device_ns - at)
 
 
 def _turns_up(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> int:

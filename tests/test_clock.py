@@ -64,3 +64,16 @@ def test_system_clock_sleeps():
     clock.sleep_until(until)
     assert clock.now_ns() >= until
     clock.sleep_until(0)
+
+
+@pytest.mark.parametrize("ppm", [80, -80, 0, 150])
+def test_frames_that_all_come_late_were_not_taken_late(ppm: float):
+    """A FIFO that stays 400 ms full for a minute moves the clock by what crystals drift, and not by 400 ms."""
+    clock, errors_ms = DeviceClock(), []
+    for i in range(100 * 125):
+        true_ns = i * 8_000_000
+        device_ns = round(true_ns * (1 + ppm * 1e-6))
+        clock.update(device_ns, true_ns + 150_000 + (400_000_000 if i > 40 * 125 else 0))
+        errors_ms.append((clock.to_host_ns(device_ns) - true_ns) / 1e6)
+    assert np.abs(errors_ms[5 * 125 : 40 * 125]).max() < 1
+    assert np.abs(errors_ms[40 * 125 :]).max() < 25
