@@ -7,8 +7,8 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools test-rig test-hw wheel \
-  lock clean
+.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools test-rig test-hw soak \
+  wheel lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,6 +31,10 @@ rig-shell: rig-tools ## a shell in the virtual box
 
 test-rig: rig-tools ## the tests on the virtual box; COUNTS=full does each fault as often as the report says (an hour)
 	PALPATE_RIG=$(or $(COUNTS),quick) $(BIN)/python -m pytest -q tests/rig
+
+soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box and on this machine: docs/soak/
+	$(RIG) build
+	PYTHONPATH=tests $(BIN)/python -m rig.soak --hours $(or $(HOURS),1) --out docs/soak $(SOAK)
 
 test-hw: $(DESKTOP) ## the contract of skin, lines and port on this board (wiring: docs/board-checklist.md)
 	PALPATE_UNDERSIDE=wired $(BIN)/python -m pytest -q -rs tests/test_contract.py

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, MutableSequence, Sequence
 from contextlib import nullcontext
 from itertools import count
 from types import SimpleNamespace
@@ -26,7 +26,8 @@ Config = Mapping[Iterable[int], gpiod.LineSettings]  # offsets of a chip -> how 
 class SimGpio:
     """Stands where `import gpiod` would. chips: path (/dev/gpiochip0 and so on) -> its line names, '' for none.
 
-    written: (t_ns, name, level) of everything that was driven, in order. requests: the lines that are held now.
+    written: (t_ns, name, level) of everything that was driven, in order; nothing where not told to remember.
+    requests: the lines that are held now.
     watchers: output line -> what is called with the time when the box raises it.
     refuse: path -> errno with which a chip refuses from now on: 13 permission denied, 19 pulled out.
     """
@@ -36,8 +37,8 @@ class SimGpio:
     EdgeEvent = gpiod.EdgeEvent
     line = gpiod.line
 
-    def __init__(self, clock: Clock, chips: Mapping[str, Sequence[str]]) -> None:
-        self.written: list[tuple[int, str, bool]] = []
+    def __init__(self, clock: Clock, chips: Mapping[str, Sequence[str]], *, remember: bool = True) -> None:
+        self.written: MutableSequence[tuple[int, str, bool]] = [] if remember else deque(maxlen=0)
         self.requests: list[SimRequest] = []
         self.refuse: dict[str, int] = {}
         self.watchers: dict[str, Callable[[int], None]] = {}

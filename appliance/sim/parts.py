@@ -64,7 +64,8 @@ def _memory(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str
     growth_last_900: since a tenth of them; holds what the allocator takes while it warms up. growth_next_900: after it.
     """
     n = MEMORY_SWEEPS
-    world = stage.build(fmt, cycle(acts), rig.VirtualClock(), "sim")
+    # what the simulator remembers is not the box's
+    world = stage.build(fmt, cycle(acts), rig.VirtualClock(), "sim", remember=False)
     rss_mb = {}
     with ExitStack() as stack:
         box, far_end = build(world, stack)
@@ -72,8 +73,6 @@ def _memory(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str
             if box.step() and box.answered in (n // 10, n, n * 19 // 10):
                 rss_mb[box.answered] = _rss_mb()
             drain(far_end)
-            world.robot.played.clear()  # what the simulator remembers is not the box's
-            world.gpio.written.clear()
     first, after, later = rss_mb.values()
     figures = {"after_1000": after, "growth_last_900": after - first, "growth_next_900": later - after}
     return {"rss_mb": {name: round(value, 2) for name, value in figures.items()}}

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, MutableSequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -79,13 +80,18 @@ class EdgeLines(Protocol):
 
 
 class Robot:
-    """Plays a script of acts: drives start, stop and NEW OBJECT at the right frames. `played` is what it did.
+    """Plays a script of acts: drives start, stop and NEW OBJECT at the right frames.
 
+    acts: how many it has begun. played: what it did; the newest act alone where not told to remember.
     skipped: numbers of the frames [from, to) that it did not slide, as it stopped early; the board leaves them out.
     """
 
-    def __init__(self, script: Iterator[Act], lines: EdgeLines, *, start: str, stop: str, new_object: str = "") -> None:
-        self.played: list[Act] = []
+    def __init__(
+        self, script: Iterator[Act], lines: EdgeLines, *, start: str, stop: str, new_object: str = "",
+        remember: bool = True,
+    ) -> None:  # fmt: skip
+        self.acts = 0
+        self.played: MutableSequence[Act] = [] if remember else deque(maxlen=1)
         self.finished = False
         self.skipped: tuple[int, int] | None = None
         self._script, self._lines = script, lines
@@ -101,6 +107,7 @@ class Robot:
         if act is None:
             self.finished = True
             return None
+        self.acts += 1
         self.played.append(act)
         begin_ns, start_ns, stop_ns = (frame_ns(first + i) for i in (0, act.start, act.stop))
         if act.new_object and self._new_object:

@@ -39,16 +39,20 @@ class SimWorld(World):
 
     def finished(self, answered: int) -> bool:
         """True when the script has ended and everything in it was answered."""
-        return self.robot.finished and answered >= len(self.robot.played)
+        return self.robot.finished and answered >= self.robot.acts
 
 
 def build(
-    fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False, stops: bool = True
-) -> SimWorld:
-    """A world that plays `acts`: the same drivers above, nothing real below. stops: the robot heeds DECIDED."""
+    fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False, stops: bool = True,
+    remember: bool = True,
+) -> SimWorld:  # fmt: skip
+    """A world that plays `acts`: the same drivers above, nothing real below. stops: the robot heeds DECIDED.
+
+    remember: keep all acts and all that was driven, for who looks at them later; without it memory stays as it is.
+    """
     outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
-    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]})
-    robot = rig.Robot(iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT)
+    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember)
+    robot = rig.Robot(iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT, remember=remember)
     if stops:
         lines.watchers[DECIDED] = robot.react
     board = rig.Board(fmt, robot, clock)

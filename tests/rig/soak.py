@@ -1,0 +1,298 @@
+"""`python -m rig.soak --hours 1`: boxes sweep without pause, and everything they say is judged. In: hours, a seed.
+Out: one record for each box, a page with four charts, and 1 where a target was not reached.
+
+Each box has a process of its own that records it. A soak that was interrupted goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from appliance.sim import skin
+from appliance.sim.bench import commit
+from appliance.sim.score import Answer
+from appliance.sink import checksum
+
+from . import soak_judge, soak_page
+from .soak_boxes import BoxUnderTest, Gone, Script, ThisMachine
+from .soak_guest import VirtualBox
+from .soak_judge import Run
+
+ROOT = Path(__file__).parent.parent.parent
+BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
+Clock = Callable[[], float]
+WAIT_S, SAMPLE_S, MINUTE_S = 0.2, 10.0, 60.0
+SILENT_S = 60.0
+"""A box that says nothing for so long has gone; one that is well says its state each second."""
+GRACE_S = 5.0
+"""While a soak goes on, an answer may take so long after its stop edge; at the end, all are awaited."""
+MARGIN_S = 0.5
+"""A box is stopped so far inside a sweep, so that there is no doubt whether this sweep had begun."""
+NOTED = 200
+"""Faults of a run that are written out; what goes on failing would fill the disk."""
+
+
+class Recorder:
+    """Writes the record of a run from what a box says and from looks at its process. clock: tells seconds, monotonic."""
+
+    def __init__(self, box: BoxUnderTest, run: Run, sweeps: Script, clock: Clock) -> None:
+        self.run = run
+        self._box, self._sweeps, self._clock = box, sweeps, clock
+        self._last, self._behind = 0, math.inf
+        self._begun_s = self._heard_s = self._looked_s = clock()
+        self._state: list[int] = []
+        self._streaming = False
+
+    def start(self) -> None:
+        """Start the box; the run begins when it has started. Raises Gone."""
+        self._box.start(self.run.seed, self._sweeps)
+        self._begun_s = self._heard_s = self._looked_s = self._clock()
+
+    def listen(self, seconds: float, stopped: Callable[[], bool]) -> None:
+        """Judge what comes, and look now and then, for so long or until `stopped()`. Raises Gone."""
+        end_s = self._clock() + seconds
+        while (now_s := self._clock()) < end_s and not stopped():
+            for line in self._box.heard(WAIT_S):
+                self.hear(*line)
+            if now_s - self._heard_s > SILENT_S:
+                raise Gone(f"the box has said nothing for {now_s - self._heard_s:.0f} s")
+            if now_s - self._looked_s >= SAMPLE_S:
+                self._looked_s += SAMPLE_S
+                self._look(now_s)
+            self.run.length_s = round(self._clock() - self._begun_s, 1)
+
+    def sweeping(self) -> bool:
+        """Whether a sweep is under way, beyond doubt."""
+        now_s = self._clock()
+        (_, stops), (starts, _) = self._box.edges(now_s + MARGIN_S), self._box.edges(now_s - MARGIN_S)
+        return starts > stops
+
+    def stop(self) -> None:
+        """Tell the box to end: all sweeps that have begun are due. Raises Gone."""
+        self.run.due = self._box.edges(self._clock())[0]
+        for line in self._box.stop():
+            self.hear(*line)
+
+    def hear(self, at_s: float, line: str) -> None:
+        """Judge a sentence."""
+        self.run.silence_s = round(max(self.run.silence_s, at_s - self._heard_s), 2)
+        self._heard_s = at_s
+        body, _, end = line.removeprefix("$").rpartition("*")
+        if not (line.startswith("$PPLP,") and body.isascii() and end == checksum(body)):
+            self.fault(f"broken sentence {line[:80]!r}", at_s)
+        elif answer := Answer.read(line):
+            self._answer(at_s, answer)
+        elif line.startswith("$PPLP,STA,"):
+            self._note(at_s, body.split(",")[2:])
+
+    def fault(self, what: str, at_s: float | None = None) -> None:
+        """Take note of what must not be."""
+        if len(self.run.faults) < NOTED:
+            self.run.faults.append([self._since(self._clock() if at_s is None else at_s), what])
+
+    def _look(self, now_s: float) -> None:
+        taken = self._box.process()
+        if self._state:
+            behind = 0.0 if math.isinf(self._behind) else round(self._behind, 1)
+            self.run.samples.append([self._since(now_s), *taken, *self._state, behind])
+            self._behind = math.inf
+        self.run.due = self._box.edges(now_s - GRACE_S)[1]
+
+    def _since(self, at_s: float) -> float:
+        return round(self.run.began_s + at_s - self._begun_s, 2)
+
+    def _answer(self, at_s: float, answer: Answer) -> None:
+        fact = self._sweeps[max(answer.sweep, 1)]
+        if wrong := soak_judge.numbering(answer.sweep, self._last, self._box.edges(at_s + MARGIN_S)[0]):
+            self.fault(wrong, at_s)
+        self._last = max(self._last, answer.sweep)
+        self.run.answers.append([
+            self._since(at_s), answer.sweep, fact.label, answer.status, answer.label, fact.alone, answer.latency_ms,
+            answer.lost,
+        ])  # fmt: skip
+
+    def _note(self, at_s: float, state: list[str]) -> None:
+        if state[1] == "streaming":
+            self._streaming = True
+        elif self._streaming:
+            self.fault(f"the skin is {state[1]}", at_s)
+        self._state = [int(n) for n in state[4:9]]  # received, lost, garbage, enumerations, dropped
+        if self._state[0]:
+            self._behind = min(self._behind, self._box.taken(at_s) - sum(self._state[:2]))
+
+
+def record(
+    box: BoxUnderTest, run: Run, length_s: float, save: Callable[[], None], *,
+    stopped: Callable[[], bool] = lambda: False, clock: Clock = time.monotonic, log: Callable[[str], None] = print,
+) -> None:  # fmt: skip
+    """Have a box sweep for so long; `save` is called each minute and at the end. What goes wrong stands in the run."""
+    recorder = Recorder(box, run, Script(run.seed), clock)
+    try:
+        recorder.start()
+        while run.length_s < length_s and not stopped():
+            recorder.listen(min(MINUTE_S, length_s - run.length_s), stopped)
+            save()
+            log(f"{box.name}: {progress(run)}")
+        recorder.listen(SILENT_S, recorder.sweeping)
+        recorder.stop()
+        run.ended = "time" if run.length_s >= length_s else "interrupted"
+    except Gone as e:
+        recorder.fault(str(e))
+        run.ended = "gone"
+    finally:
+        box.close()
+        save()
+
+
+def progress(run: Run) -> str:
+    """A run in a line."""
+    told = soak_judge.sums({"runs": [asdict(run)]})
+    memory = f"{told['rss_kib'][-1] / 1024:.1f} MiB, " if told["rss_kib"] else ""
+    return (
+        f"{run.length_s / 60:.0f} min, {told['answers']} sweeps, {told['unanswered']} unanswered, {told['wrong']['n']} "
+        f"wrong, {memory}{told['lost']} frames lost, {told['unaccounted']} unaccounted for, {told['faults']} faults"
+    )
+
+
+def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[Run], str]:
+    """The runs of an interrupted soak and when it was started; none and now where there is none, or where it was of other
+    code, another seed or another machine."""
+    if path.exists():
+        held = json.loads(path.read_text())
+        if all(held.get(name) == value for name, value in about.items()):
+            return [Run(**run) for run in held["runs"]], held["started"]
+    return [], datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def write(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON whole or not at all, a row a line."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_suffix(".part")
+    aside.write_text(_text(content) + "\n")
+    aside.replace(path)
+
+
+def _text(value: Any, indent: str = "") -> str:
+    flat = isinstance(value, list | tuple) and not any(isinstance(v, dict | list | tuple) for v in value)
+    if flat or not isinstance(value, dict | list | tuple):
+        return json.dumps(value)
+    deeper = indent + " "
+    named = isinstance(value, dict)
+    each = (
+        [f"{json.dumps(k)}: {_text(v, deeper)}" for k, v in value.items()]
+        if named
+        else [_text(v, deeper) for v in value]
+    )
+    begin, end = "{}" if named else "[]"
+    return f"{begin}\n{deeper}" + f",\n{deeper}".join(each) + f"\n{indent}{end}"
+
+
+def soak(
+    box: BoxUnderTest, seed: int, hours: float, work: Path, *, stopped: Callable[[], bool] = lambda: False,
+    clock: Clock = time.monotonic, log: Callable[[str], None] = print,
+) -> Path:  # fmt: skip
+    """Record one box for what is left of `hours`; its record."""
+    path = work / f"{box.name.replace(' ', '-')}.json"
+    about = {"box": box.name, "commit": commit(), "seed": seed, "format": str(skin.FORMAT), **box.about()}
+    runs, started = restore(path, about)
+    done_s = sum(run.length_s for run in runs)
+    if done_s >= hours * 3600 - 1:
+        log(f"{box.name}: {done_s / 3600:.2f} h are there already; remove {path} to begin anew")
+        return path
+    run = Run(seed + len(runs), done_s)
+    runs.append(run)
+
+    def save() -> None:
+        write(path, about | {"started": started, "hours": hours, "runs": [asdict(r) for r in runs]})
+
+    record(box, run, hours * 3600 - done_s, save, stopped=stopped, clock=clock, log=log)
+    log(f"{box.name}: ended ({run.ended}); {progress(run)}")
+    return path
+
+
+def draw(work: Path, out: Path) -> bool:
+    """Put the records together, judge and draw them; False where a target was not reached."""
+    paths = [work / f"{name.replace(' ', '-')}.json" for name in BOXES]
+    records = [json.loads(path.read_text()) for path in paths if path.exists()]
+    boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}
+    told = {
+        "columns": {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE},
+        "left_out": {
+            name: kind.missing() or "it was not recorded" for name, kind in BOXES.items() if name not in boxes
+        },
+        "boxes": boxes,
+    }
+    html, svg = soak_page.tell(told)
+    write(out / "results.json", told)
+    (out / "index.html").write_text(html)
+    (out / "soak.svg").write_text(svg)
+    reached = True
+    for name, box in told["boxes"].items():
+        for what, wanted, came, met in soak_judge.targets(box["sums"]):
+            mark = {True: "ok  ", False: "FAIL", None: "    "}[met]
+            print(
+                f"{mark} {name:<13} {what}: {came} (wanted {wanted}){'' if met is not None else ', too short to tell'}"
+            )
+            reached &= met is not False
+    return reached and bool(records)
+
+
+def main() -> int:
+    """Run what the arguments say; its exit code."""
+    parser = argparse.ArgumentParser(
+        "python -m rig.soak", description="Has boxes sweep without pause, and judges them."
+    )
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--hours", type=float, default=1.0, help="how long in all (default 1)")
+    length.add_argument("--minutes", type=float, help="the same in minutes, for a try")
+    parser.add_argument("--seed", type=int, default=1, help="of the robot's sweeps (default 1)")
+    parser.add_argument("--work", type=Path, default=ROOT / "build" / "soak", help="where records are kept")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "soak" / "page", help="where the page goes")
+    parser.add_argument("--box", choices=BOXES, help="record this one alone, and draw nothing")
+    parser.add_argument("--draw", action="store_true", help="only draw what is there")
+    args = parser.parse_args()
+    hours = args.minutes / 60 if args.minutes else args.hours
+    if args.box:
+        got: list[int] = []
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda n, frame: got.append(n))
+        soak(BOXES[args.box](), args.seed, hours, args.work, stopped=lambda: bool(got), log=partial(print, flush=True))
+        return 0
+    how = ["--seed", str(args.seed), "--hours", repr(hours), "--work", str(args.work.resolve())]
+    recorded = args.draw or _together(how)
+    return 0 if draw(args.work, args.out) and recorded else 1
+
+
+def _together(arguments: list[str]) -> bool:
+    """Each box that can be had here in a process of its own; who interrupts this one interrupts them. False if one fell."""
+    children = []
+    for name, kind in BOXES.items():
+        if missing := kind.missing():
+            print(f"{name}: left out, {missing}", flush=True)
+        else:
+            command = [sys.executable, "-m", "rig.soak", "--box", name, *arguments]
+            children.append(subprocess.Popen(command, cwd=ROOT / "tests", start_new_session=True))
+
+    def pass_on(number: int, frame: object) -> None:
+        for child in children:
+            child.terminate()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, pass_on)
+    return not any([child.wait() for child in children])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

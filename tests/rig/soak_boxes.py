@@ -1,0 +1,250 @@
+"""The room of boxes under test. In: a script of sweeps. Out: a box at work in real time: what it says, what was done to it,
+what its process takes.
+
+One is the installed command on this machine with the simulated skin, its serial line a pseudo-terminal; the other the
+virtual box, with its skin, lines and serial port on real buses of the guest.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import onnxruntime as ort
+
+from appliance import bundle
+from appliance.classifier import Classifier
+from appliance.clock import SystemClock
+from appliance.sim import rig, script, skin, terminal
+from appliance.sim.score import Answer
+from appliance.sweep import Frames, Status, Sweep
+
+from .soak_judge import said
+
+STOP_S = 30
+"""Longest wait for a box to end after it was told to."""
+TICKS = os.sysconf("SC_CLK_TCK")
+SMAPS = re.compile(r"^(Rss|Pss): +(\d+) kB", re.M)
+
+
+class Gone(AssertionError):
+    """The box has ended though nobody told it to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """A sweep of the script: what is touched, the numbers of the frames at its edges, what the bundle by itself says."""
+
+    label: str
+    start: int
+    stop: int
+    alone: str
+
+
+class Script:
+    """The robot's sweeps in order, as facts; worked out as far as somebody asks. Numbers begin with 1, as in sentences."""
+
+    def __init__(self, seed: int) -> None:
+        self._acts, self._facts, self._next = script.tubes(seed), list[Fact](), 0
+        self._classifier = Classifier(bundle.load(bundle.DEFAULT), SystemClock())
+
+    def __getitem__(self, number: int) -> Fact:
+        """The sweep with this number."""
+        while number > len(self._facts):
+            self._add()
+        return self._facts[number - 1]
+
+    def edges(self, frame: float) -> tuple[int, int]:
+        """Start and stop edges until this frame."""
+        while self._next <= frame:
+            self._add()
+        starts, stops = (bisect_right(self._facts, frame, key=key) for key in (lambda f: f.start, lambda f: f.stop))
+        return starts, stops
+
+    def _add(self) -> None:
+        act = next(self._acts)
+        self._facts.append(Fact(act.label, self._next + act.start, self._next + act.stop, self._alone(act)))
+        self._next += len(act.frames)
+
+    def _alone(self, act: rig.Act) -> str:
+        first = (act.start + act.stop) // 2 - skin.FORMAT.window // 2
+        window = act.frames[first : first + skin.FORMAT.window]
+        seq = np.arange(len(window))
+        verdict = self._classifier(Sweep(1, 0, 1, Status.OK, Frames(seq, seq, window)))
+        return said(verdict.status, verdict.label)
+
+
+class BoxUnderTest(Protocol):
+    """A box with a robot that sweeps without pause. All times are seconds of this machine's monotonic clock."""
+
+    name: str
+
+    def start(self, seed: int, sweeps: Script) -> None:
+        """Start the box and its robot."""
+        ...
+
+    def heard(self, wait_s: float) -> list[tuple[float, str]]:
+        """Lines that have come since the last call, each with its time; waits no longer. Raises Gone."""
+        ...
+
+    def edges(self, at_s: float) -> tuple[int, int]:
+        """Start and stop edges that the robot had given by then."""
+        ...
+
+    def taken(self, at_s: float) -> float:
+        """Frames that the board had taken by then, from any beginning."""
+        ...
+
+    def process(self) -> tuple[int, int, float, int, int]:
+        """RSS and PSS in KiB, processor seconds, open files, threads. Raises Gone."""
+        ...
+
+    def about(self) -> Mapping[str, Any]:
+        """What kind of box this is, for the record."""
+        ...
+
+    def stop(self) -> list[tuple[float, str]]:
+        """Tell it to end, and wait for that; the last lines. Raises Gone where it does not end well."""
+        ...
+
+    def close(self) -> None:
+        """Leave nothing behind, whatever has happened."""
+        ...
+
+
+def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, int]:
+    """A process from the texts of /proc/PID/smaps_rollup and /proc/PID/stat, as `BoxUnderTest.process` tells it."""
+    kib = dict(SMAPS.findall(smaps))
+    fields = stat.rpartition(")")[2].split()
+    cpu_s = (int(fields[11]) + int(fields[12])) / TICKS
+    return int(kib["Rss"]), int(kib["Pss"]), cpu_s, files, int(fields[17])
+
+
+class Reckoned:
+    """A robot and a board that cannot be asked: their sweeps and frames by the clock, since the script is known.
+
+    The first answer fixes where the script is, the first frames that were counted where the board is.
+    """
+
+    def __init__(self, sweeps: Script) -> None:
+        self._sweeps = sweeps
+        self._origin_s = self._board_s = 0.0
+
+    def hear(self, at_s: float, line: str) -> None:
+        """Take note of a sentence."""
+        if not self._origin_s and (answer := Answer.read(line)):
+            self._origin_s = at_s - self._sweeps[answer.sweep].stop / skin.FORMAT.rate_hz
+        if not self._board_s and line.startswith("$PPLP,STA,") and int(frames := line.split(",")[6]):
+            self._board_s = at_s - int(frames) / skin.FORMAT.rate_hz
+
+    def edges(self, at_s: float) -> tuple[int, int]:
+        """As BoxUnderTest.edges."""
+        return self._sweeps.edges((at_s - self._origin_s) * skin.FORMAT.rate_hz) if self._origin_s else (0, 0)
+
+    def taken(self, at_s: float) -> float:
+        """As BoxUnderTest.taken."""
+        return (at_s - self._board_s) * skin.FORMAT.rate_hz if self._board_s else 0.0
+
+
+class ThisMachine:
+    """`palpate run --sim skin`, as installed beside this Python, in real time."""
+
+    name = "this machine"
+
+    def __init__(self) -> None:
+        self._stack, self._rest = ExitStack(), b""
+
+    @staticmethod
+    def missing() -> str:
+        """Why this box cannot be had here; "" where it can."""
+        return ""
+
+    def start(self, seed: int, sweeps: Script) -> None:
+        """As BoxUnderTest."""
+        self._robot = Reckoned(sweeps)
+        self._far, port = self._stack.enter_context(terminal.pair())
+        command = [Path(sys.executable).with_name("palpate"), "run", "--sim", "skin", "--seed", str(seed)]
+        self._log = Path(self._stack.enter_context(tempfile.TemporaryDirectory())) / "log"
+        self._box = subprocess.Popen([*command, "--set", f"serial.port={port}"], stderr=self._log.open("wb"))
+        self._stack.callback(self._end)
+
+    def _end(self) -> None:
+        self._box.kill()
+        self._box.wait()
+
+    def heard(self, wait_s: float) -> list[tuple[float, str]]:
+        """As BoxUnderTest."""
+        if self._box.poll() is not None:
+            raise Gone(f"the box ended with {self._box.returncode}: {self._said()}")
+        return self._read(wait_s)
+
+    def _read(self, wait_s: float) -> list[tuple[float, str]]:
+        if not select.select([self._far], [], [], wait_s)[0]:
+            return []
+        *lines, self._rest = (self._rest + os.read(self._far, 65536)).split(b"\r\n")
+        found = [(time.monotonic(), line.decode("ascii", "replace")) for line in lines]
+        for at_s, line in found:
+            self._robot.hear(at_s, line)
+        return found
+
+    def _said(self) -> str:
+        return self._log.read_text(errors="replace").strip()[-300:]
+
+    def edges(self, at_s: float) -> tuple[int, int]:
+        """As BoxUnderTest."""
+        return self._robot.edges(at_s)
+
+    def taken(self, at_s: float) -> float:
+        """As BoxUnderTest."""
+        return self._robot.taken(at_s)
+
+    def process(self) -> tuple[int, int, float, int, int]:
+        """As BoxUnderTest."""
+        place = Path("/proc", str(self._box.pid))
+        try:
+            smaps, stat = ((place / name).read_text() for name in ("smaps_rollup", "stat"))
+            return process(smaps, stat, len(os.listdir(place / "fd")))
+        except (OSError, KeyError) as e:
+            raise Gone(f"the box cannot be looked at: {e}; it said {self._said()!r}") from e
+
+    def about(self) -> Mapping[str, Any]:
+        """As BoxUnderTest."""
+        versions = {"python": platform.python_version(), "numpy": np.__version__, "onnxruntime": ort.__version__}
+        return {
+            "what": "palpate run --sim skin, the serial line a pseudo-terminal; its memory holds the simulated skin too",
+            "machine": f"{platform.machine()}, {os.cpu_count()} cores, Linux {platform.release()}",
+            "versions": versions,
+        }
+
+    def stop(self) -> list[tuple[float, str]]:
+        """As BoxUnderTest."""
+        self._box.terminate()
+        lines = list(self._until_ended())
+        if self._box.poll() != 0:
+            raise Gone(f"the box was told to end, and ended with {self._box.poll()}: {self._said()}")
+        return lines
+
+    def close(self) -> None:
+        """As BoxUnderTest."""
+        self._stack.close()
+
+    def _until_ended(self) -> Iterator[tuple[float, str]]:
+        end_s = time.monotonic() + STOP_S
+        ended = False
+        while not ended and time.monotonic() < end_s:
+            ended = self._box.poll() is not None  # before the last look, so that nothing is left in the line
+            with suppress(BlockingIOError):
+                yield from self._read(0.2)

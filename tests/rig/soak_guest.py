@@ -1,0 +1,164 @@
+"""The virtual box under test. In: a script of sweeps. Out: what the guest says, what was done to it, what its process takes.
+
+The skin hangs on the guest's USB port, the robot drives its lines, and sentences come over its serial port: the way of a
+real box. Only what it takes of memory is asked for inside.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import tempfile
+import threading
+import time
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machines import LOCK
+
+from appliance import wire
+from appliance.clock import SystemClock
+from appliance.sim import rig, script, skin
+
+from . import image
+from .machine import Failed, Machine
+from .soak_boxes import Gone, Script, process
+
+IDLE = 75
+"""Frames of an empty skin at a time, until the box is ready: a tenth of a second."""
+PULSE_NS = 250_000_000
+"""Length of the robot's pulses; an emulated processor that is busy misses shorter ones."""
+READY_S = 180
+LOCKED = re.compile(r"^onnxruntime==(\S+)", re.M)
+SENT = 4096
+"""Packets of which it is remembered when they went: half a minute, longer than any sentence takes."""
+
+
+class Hand:
+    """The robot: sweeps without pause as soon as `ready` is set (see sim.rig.Robot). edges_ns: of starts, and of stops.
+
+    The edges of a sweep are planned while the one before it is made: they come in time however late frames are fetched.
+    """
+
+    def __init__(self, lines: rig.EdgeLines, seed: int) -> None:
+        self.skipped = None
+        self.ready = threading.Event()
+        self.edges_ns: tuple[list[int], list[int]] = ([], [])
+        self._lines, self._acts, self._rng = lines, script.tubes(seed), np.random.default_rng(seed)
+        self._next: rig.Act | None = None
+
+    def next_act(self, first: int, frame_ns: Callable[[int], int]) -> rig.Act:
+        """The next sweep, which begins with frame `first`, or an empty skin."""
+        if not self.ready.is_set():
+            return rig.Act(skin.idle(IDLE, self._rng), 0, 0, "")
+        act = self._next or self._plan(first, frame_ns)
+        self._next = self._plan(first + len(act.frames), frame_ns)
+        return act
+
+    def _plan(self, first: int, frame_ns: Callable[[int], int]) -> rig.Act:
+        act = next(self._acts)
+        for line, frame, edges in zip(("START", "STOP"), (act.start, act.stop), self.edges_ns, strict=True):
+            at_ns = frame_ns(first + frame)
+            self._lines.drive(line, True, at_ns)
+            self._lines.drive(line, False, at_ns + PULSE_NS)
+            edges.append(at_ns)
+        return act
+
+
+class VirtualBox:
+    """A guest that goes on from its snapshot, as BoxUnderTest."""
+
+    name = "virtual box"
+
+    def __init__(self) -> None:
+        self._stack, self._heard = ExitStack(), 0
+        self._sent: deque[tuple[float, int]] = deque(maxlen=SENT)
+
+    @staticmethod
+    def missing() -> str:
+        """Why this box cannot be had here; "" where it can."""
+        return "" if image.built() else "it has not been built here; make rig builds it"
+
+    def start(self, seed: int, sweeps: Script) -> None:
+        """As BoxUnderTest."""
+        made = image.built()
+        if not made:
+            raise Gone(self.missing())
+        folder = self._stack.enter_context(tempfile.TemporaryDirectory())
+        try:
+            self._guest = self._stack.enter_context(Machine(made, Path(folder), snapshot=True))
+            self._guest.ready(READY_S)
+            self._pid = self._guest.run("systemctl show -P MainPID palpate", check=True).out.strip()
+        except (Failed, OSError) as e:
+            raise Gone(str(e)) from e
+        self._guest.skin.mangle = self._note
+        self._hand = Hand(self._guest.lines, seed)
+        self._board = rig.Board(skin.FORMAT, self._hand, SystemClock(), fifo_frames=2250)
+        self._guest.skin.plug(self._board)
+        if not self._guest.lines.wait("READY", True, READY_S):
+            raise Gone(f"the guest was not READY within {READY_S} s")
+        self._hand.ready.set()
+
+    def heard(self, wait_s: float) -> list[tuple[float, str]]:
+        """As BoxUnderTest."""
+        time.sleep(wait_s)
+        lines = self._guest.serial.heard[self._heard :]
+        self._heard += len(lines)
+        return [(t_ns / 1e9, line) for t_ns, line in lines]
+
+    def edges(self, at_s: float) -> tuple[int, int]:
+        """As BoxUnderTest."""
+        starts, stops = (bisect_right(edges, at_s * 1e9) for edges in self._hand.edges_ns)
+        return starts, stops
+
+    def taken(self, at_s: float) -> float:
+        """As BoxUnderTest; those that have left the board's FIFO, handed over or dropped."""
+        sent = list(self._sent)
+        at = bisect_right(sent, at_s, key=lambda s: s[0])
+        return sent[at - 1][1] if at else 0
+
+    def _note(self, packet: bytes) -> bytes:
+        """Take note of the last frame of a packet that goes to the guest; the packet as it is."""
+        _, _, _, _, _, count, *_, seq, _ = wire.HEADER.unpack_from(packet)
+        self._sent.append((time.monotonic(), seq + count))
+        return packet
+
+    def process(self) -> tuple[int, int, float, int, int]:
+        """As BoxUnderTest."""
+        place = f"/proc/{self._pid}"
+        try:
+            told = self._guest.run(f"cat {place}/smaps_rollup {place}/stat && ls {place}/fd | wc -l", check=True).out
+        except (Failed, OSError) as e:
+            raise Gone(f"the box cannot be looked at: {e}; did it end?") from e
+        *_, stat, files = told.strip().splitlines()
+        return process(told, stat, int(files))
+
+    def about(self) -> Mapping[str, Any]:
+        """As BoxUnderTest; of the emulated machine alone, since the guest does not run yet."""
+        return {
+            "what": "an arm64 Debian in QEMU; the skin on its USB port, the robot on its lines and its serial port",
+            "machine": f"QEMU {' '.join(image.MACHINE[1:])}, on {platform.machine()}, {os.cpu_count()} cores",
+            "versions": {
+                "debian": image.SUITE,
+                "python": image.GUEST_PYTHON,
+                "onnxruntime": LOCKED.findall(LOCK.read_text())[0],
+            },
+        }
+
+    def stop(self) -> list[tuple[float, str]]:
+        """As BoxUnderTest."""
+        try:
+            self._guest.run("systemctl stop palpate", timeout_s=60, check=True)
+        except (Failed, OSError) as e:
+            raise Gone(f"the box was told to end: {e}") from e
+        return self.heard(1.0)
+
+    def close(self) -> None:
+        """As BoxUnderTest."""
+        self._stack.close()

@@ -1,0 +1,211 @@
+"""The room that judges a soak. In: what a recorder wrote of one box. Out: sums with intervals, and which targets they meet.
+
+Pure: nothing is read, started or timed here, so that a made-up record is judged like a real one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from appliance.sim.score import wilson
+from appliance.sweep import Status
+
+Json = Mapping[str, Any]
+ANSWER = ("s", "number", "touched", "status", "label", "alone", "latency_ms", "lost")
+"""Columns of an answer: when it came (seconds of the soak), its RES sentence beside what was touched. alone: what the
+same bundle says, in the recorder, of the very frames that the script has there (see `said`)."""
+SAMPLE = ("s", "rss_kib", "pss_kib", "cpu_s", "files", "threads", "received", "lost", "garbage", "enumerations", "dropped",
+          "behind")  # fmt: skip
+"""Columns of a sample: the process, then the counters of the last STA. behind: frames that the board had taken and the
+box had not counted yet, received or lost; the least since the sample before."""
+GROWTH_KIB_H = 256.0
+"""Memory is flat where the upper end of the slope's 95 % interval stays below this; stated before the first run."""
+IN_FLIGHT = 12
+"""Two packets: what a board has taken and the box not counted may differ by so much between two looks."""
+LOOKS = 6
+"""Samples, a minute of them, of which the least `behind` counts: a box that is late for a while has lost nothing."""
+SECURE_MIN = 10
+"""Minutes that the second half must have before growth or flatness is told."""
+
+
+@dataclass(slots=True)
+class Run:
+    """One unbroken run of one box; a soak that was interrupted has several.
+
+    began_s, length_s: in seconds of the soak, interruptions left out. due: sweeps that ought to be answered by its end.
+    faults: [seconds, what was wrong]. silence_s: longest time without a sentence. ended: why, "" while it goes on.
+    """
+
+    seed: int
+    began_s: float = 0.0
+    length_s: float = 0.0
+    due: int = 0
+    answers: list[list[Any]] = field(default_factory=list)
+    samples: list[list[Any]] = field(default_factory=list)
+    faults: list[list[Any]] = field(default_factory=list)
+    silence_s: float = 0.0
+    ended: str = ""
+
+
+def columns(rows: Sequence[Sequence[Any]], names: Sequence[str]) -> dict[str, list[Any]]:
+    """Rows as named columns."""
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
+
+
+def numbering(number: int, last: int, started: int) -> str:
+    """What is wrong with the number of an answer after the answer `last`, when `started` sweeps had begun; "" if nothing."""
+    if number == last + 1:
+        return "" if number <= started else f"answer {number} came before its start edge, the robot had given {started}"
+    if number <= last:
+        return f"answer {number} came again, {last} was answered already"
+    return f"answer {number} came after {last}: {number - last - 1} left out"
+
+
+def kind(status: str, label: str, touched: str) -> str:
+    """An answer as right, wrong, unsure or refused; cut, where the soak's own end aborted the sweep."""
+    if status == Status.OK:
+        return "right" if label == touched else "wrong"
+    if status == Status.ABORTED:
+        return "cut"
+    return "unsure" if status in (Status.UNSURE, Status.UNDECIDED) else "refused"
+
+
+def said(status: str, label: str) -> str:
+    """An answer in a word: the label where it is sure, else the status."""
+    return label if status == Status.OK else status
+
+
+def sums(box: Json) -> dict[str, Any]:
+    """All figures of a box."""
+    runs = box["runs"]
+    rows = [row for run in runs for row in run["answers"]]
+    a = columns(rows, ANSWER)
+    kinds = Counter(kind(*row) for row in zip(a["status"], a["label"], a["touched"], strict=True))
+    judged = len(rows) - kinds["cut"]
+    due = sum(run["due"] for run in runs)
+    told = {
+        "hours": sum(run["length_s"] for run in runs) / 3600,
+        "due": due,
+        "answers": len(rows),
+        "unanswered": sum(len({*range(1, run["due"] + 1)} - {row[1] for row in run["answers"]}) for run in runs),
+        "cut": kinds["cut"],
+        "differs": sum(row[3] != Status.ABORTED and said(row[3], row[4]) != row[5] for row in rows),
+        "statuses": dict(Counter(a["status"])),
+        "faults": sum(len(run["faults"]) for run in runs),
+        "silence_s": max((run["silence_s"] for run in runs), default=0.0),
+        "latency_ms": _percentiles([row[6] for row in rows if row[3] != Status.ABORTED]),
+        "memory": slope(runs),
+        "wrong_band": band(rows)[1][-1] if judged else [0, 0],
+    }  # fmt: skip
+    told |= {name: share(kinds[name], judged) for name in ("right", "wrong", "unsure", "refused")}
+    return told | _counted(runs)
+
+
+def share(n: int, total: int) -> dict[str, Any]:
+    """`n` of `total` with its 95 % Wilson interval."""
+    low, high = wilson(n, total) if total else (0.0, 1.0)
+    return {"n": n, "of": total, "low": round(max(low, 0.0), 5), "high": round(min(high, 1.0), 5)}
+
+
+def band(rows: Sequence[Sequence[Any]]) -> tuple[list[float], list[list[int]]]:
+    """Seconds of the answers, and how many wrong ones are to be expected by then: 95 % of a binomial whose rate is that of
+    the same bundle by itself on the script's own frames."""
+    rows = [row for row in rows if row[3] != Status.ABORTED]
+    alone = [row[5] not in (row[2], *Status) for row in rows]  # a wrong label, and no refusal
+    rate = sum(alone) / len(rows) if rows else 0.0
+    n = np.arange(1, len(rows) + 1)
+    low, high = stats.binom.ppf([[0.025], [0.975]], n, rate).astype(int)
+    return [row[0] for row in rows], np.stack([low, high], axis=1).tolist()
+
+
+def _percentiles(values: Sequence[float]) -> dict[str, float]:
+    if not values:
+        return {}
+    return {f"p{q}": round(float(np.percentile(values, q)), 2) for q in (50, 99)} | {"max": max(values)}
+
+
+def slope(runs: Sequence[Json]) -> dict[str, Any]:
+    """Growth of resident memory over the second half of each run, KiB an hour, by least squares with its 95 % interval.
+
+    Runs are separate processes: each has a level of its own, all have one slope. Neighbouring samples are alike, so the
+    interval is that of so many independent ones as their correlation leaves (Bartlett 1946, first order).
+    """
+    held = [columns(half, SAMPLE) for run in runs if len(half := run["samples"][len(run["samples"]) // 2 :]) > 1]
+    told = {"samples": sum(len(h["s"]) for h in held), "minutes": sum(h["s"][-1] - h["s"][0] for h in held) / 60}
+    n, fitted = told["samples"], len(held) + 1
+    if n <= fitted:
+        return told | {"kib_h": None, "low": None, "high": None}
+    x, y = (np.concatenate([np.subtract(v, np.mean(v)) for v in values])
+            for values in ([h["s"] for h in held], [h["rss_kib"] for h in held]))  # fmt: skip
+    x = x / 3600
+    b = float(x @ y / (x @ x))
+    rest = y - b * x
+    power = float(rest @ rest)
+    alike = min(max(float(rest[:-1] @ rest[1:]) / power, 0.0), 0.99) if power > 0 else 0.0
+    fewer = (1 + alike) / (1 - alike)
+    error = math.sqrt(power / (n - fitted) / float(x @ x) * fewer)
+    half = float(stats.t.ppf(0.975, max(n / fewer - fitted, 1))) * error
+    return told | {"kib_h": round(b, 1), "low": round(b - half, 1), "high": round(b + half, 1)}
+
+
+def _counted(runs: Sequence[Json]) -> dict[str, Any]:
+    """Counters of the box, and what the board took that it never counted."""
+    last = [columns(run["samples"], SAMPLE) for run in runs if run["samples"]]
+    told: dict[str, Any] = {name: sum(c[name][-1] for c in last)
+                            for name in ("received", "lost", "garbage", "enumerations", "dropped")}  # fmt: skip
+    told["unaccounted"] = sum(unaccounted(c["behind"]) for c in last)
+    told["cpu"] = sum(c["cpu_s"][-1] - c["cpu_s"][0] for c in last) / max(sum(c["s"][-1] - c["s"][0] for c in last), 1)
+    for name in ("rss_kib", "pss_kib", "files", "threads"):
+        told[name] = [c[name][i] for c in last[-1:] for i in (0, len(c[name]) // 2, -1)]
+    return told
+
+
+def unaccounted(behind: Sequence[float]) -> int:
+    """Frames that the board took and the box counted neither as received nor as lost, from what it was behind over time.
+
+    What is on its way comes back down within a minute; what was dropped in silence never does. More than was taken,
+    frames out of nowhere, counts as well.
+    """
+    if not behind:
+        return 0
+    more = round(min(behind[-LOOKS:]) - min(behind[:LOOKS]))
+    return abs(more) if abs(more) > IN_FLIGHT else 0
+
+
+def targets(told: Json) -> Iterator[tuple[str, str, str, bool | None]]:
+    """(what, what is wanted, what came out, whether it was reached) of each target; None where the run was too short."""
+    yield "sweeps without an answer", "0", f"{told['unanswered']} of {told['due']}", told["unanswered"] == 0
+    yield "sentences out of order, broken or missing", "0", f"{told['faults']}", told["faults"] == 0
+    yield "frames lost and not accounted for", "0", f"{told['unaccounted']} of {_taken(told)}", told["unaccounted"] == 0
+    yield "sentences dropped", "0", f"{told['dropped']}", told["dropped"] == 0
+    most = told["wrong_band"][1]
+    wrong = told["wrong"]["n"]
+    yield "wrong verdicts, against the network by itself", f"at most {most}", f"{wrong}", wrong <= most
+    m = told["memory"]
+    grown = "" if m["high"] is None else estimate(m["kib_h"], m["low"], m["high"])
+    flat = grown and m["high"] < GROWTH_KIB_H
+    yield (
+        "growth of memory, KiB an hour",
+        f"< {GROWTH_KIB_H:g}",
+        grown,
+        bool(flat) if m["minutes"] >= SECURE_MIN else None,
+    )
+    steady = all(told[name][-1] <= max(told[name][:2]) for name in ("files", "threads") if told[name])
+    held = ", ".join(str(told[name][-1]) for name in ("files", "threads") if told[name])
+    yield "open files, threads", "no more", held, steady
+
+
+def estimate(value: float, low: float, high: float) -> str:
+    """A figure with its interval."""
+    return f"{value:,.0f} [{low:,.0f}, {high:,.0f}]".replace("-", "−")
+
+
+def _taken(told: Json) -> str:
+    return f"{told['received'] + told['lost']:,}"

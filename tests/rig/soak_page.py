@@ -1,0 +1,234 @@
+"""The room that draws a soak. In: records with their sums. Out: a page and its picture of four charts over time.
+
+Nothing is computed here but what a chart needs; every sentence with a number takes it from the sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from train import page
+from train.ink import ACCENT, FAINT, INK, SMALL, WIDTH, add, scale, svg
+
+from .soak_judge import ANSWER, GROWTH_KIB_H, IN_FLIGHT, SAMPLE, SECURE_MIN, band, columns, estimate, kind, targets
+
+Json = Mapping[str, Any]
+LOOKS = {"color": ACCENT, "linewidth": 1.8}, {"color": INK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))}
+"""Of the boxes; where both do the same, one shows through the other."""
+DOTS = 1500
+"""Dots of a chart; of more sweeps the slowest of each few is drawn."""
+MARKS = {True: "reached", False: "not reached", None: "too short to tell"}
+
+
+def tell(told: Json) -> tuple[str, str]:
+    """The page (HTML) and its picture (SVG)."""
+    picture = charts(told)
+    return page.page("Soak", opening(told), drawn(told, picture), figures(told), faults(told), run(told)), picture
+
+
+def opening(told: Json) -> str:
+    """What was asked and what came out, target by target."""
+    boxes = told["boxes"]
+    rows = []
+    for each in zip(*(targets(box["sums"]) for box in boxes.values()), strict=True):
+        marks = [met for *_, met in each]
+        reached = MARKS[False if False in marks else None if None in marks else True]
+        rows.append([each[0][0], each[0][1], *(came for _, _, came, _ in each), reached])
+    hours = ", ".join(f"{_hours(box['sums']['hours'])} on {_the(name)}" for name, box in boxes.items())
+    left = [page.text(f"Left out: {_the(name)}; {why}.", kind="note") for name, why in told["left_out"].items()]
+    return "\n".join([
+        page.text(f"Sweeps without pause, in real time: {hours or 'none yet'}. The skin is simulated in both boxes; each sentence "
+                  "is compared with what the robot did."),
+        *left,
+        page.table(["what", "wanted", *boxes, ""], rows, texts=(0,)) if rows else "",
+    ])  # fmt: skip
+
+
+def drawn(told: Json, picture: str) -> str:
+    """The charts with what they show."""
+    names = " and ".join(f"{_the(name)} {'dashed' if i else 'in blue'}" for i, name in enumerate(told["boxes"]))
+    return page.heading("Over time") + page.figure(
+        picture,
+        f"{names[:1].upper()}{names[1:]}. Memory is resident memory, latency the box's own figure for each sweep, loss all "
+        "frames of a minute that never came, and the band is where the count of wrong verdicts lies in 95 % of cases if the box "
+        "errs as often as its network by itself does on the same sweeps.",
+    )
+
+
+def figures(told: Json) -> str:
+    """All sums."""
+    sums = [box["sums"] for box in told["boxes"].values()]
+    lines: list[tuple[str, Any]] = [
+        ("hours", lambda s: f"{s['hours']:.2f}"),
+        ("sweeps, answered of begun", lambda s: f"{s['due'] - s['unanswered']:,} of {s['due']:,}"),
+        ("aborted by the end of the soak", lambda s: f"{s['cut']}"),
+        *((name, lambda s, n=name: _share(s[n])) for name in ("right", "wrong", "unsure", "refused")),
+        ("answers by status", lambda s: ", ".join(f"{n:,} {status}" for status, n in s["statuses"].items())),
+        ("other than the network by itself", lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}"),
+        ("frames received", lambda s: f"{s['received']:,}"),
+        ("frames lost, told by the box", lambda s: f"{s['lost']:,}"),
+        ("not accounted for", lambda s: f"{s['unaccounted']:,}"),
+        ("bytes of no packet", lambda s: f"{s['garbage']:,}"),
+        ("enumerations", lambda s: f"{s['enumerations']}"),
+        ("sentences dropped", lambda s: f"{s['dropped']}"),
+        ("longest silence, s", lambda s: f"{s['silence_s']:.1f}"),
+        ("latency, ms: median, 99 %, worst", lambda s: " / ".join(f"{v:.1f}" for v in s["latency_ms"].values())),
+        ("RSS, MiB: start, half-way, end", lambda s: _mib(s["rss_kib"])),
+        ("PSS, MiB: start, half-way, end", lambda s: _mib(s["pss_kib"])),
+        ("slope of the second half, KiB an hour", lambda s: _slope(s["memory"])),
+        ("the same, KiB for 1,000 sweeps", _each),
+        ("share of a core", lambda s: f"{s['cpu']:.3f}"),
+    ]
+    rows = [[what, *(of(s) for s in sums)] for what, of in lines]
+    return page.heading("Sums") + page.table(["", *told["boxes"]], rows, texts=(0,)) + page.text(
+        "Shares with 95 % Wilson intervals. Refused are all answers without a label, such as unknown, and count neither as right "
+        f"nor as wrong. Memory is flat where the 95 % interval of its slope ends below {GROWTH_KIB_H:g} KiB an hour, a bound set "
+        f"before the first run, and told only of second halves of {SECURE_MIN} minutes or more. Frames that the board "
+        f"took and the box counted neither as received nor as lost are not accounted for; {IN_FLIGHT} may be on their way.",
+    )  # fmt: skip
+
+
+def faults(told: Json) -> str:
+    """What must not be and was."""
+    rows = [[name, f"{at_s:.1f}", what] for name, box in told["boxes"].items() for run in box["runs"]
+            for at_s, what in run["faults"]]  # fmt: skip
+    return page.heading("Faults") + page.table(["box", "s", "what"], rows, texts=(0, 2)) if rows else ""
+
+
+def run(told: Json) -> str:
+    """What was run."""
+    names = ("what", "machine", "versions", "commit", "seed", "format", "started", "runs")
+    rows = [[name, *(_about(box, name) for box in told["boxes"].values())] for name in names]
+    return page.heading("What was run") + page.table(["", *told["boxes"]], rows, texts=range(len(told["boxes"]) + 1))
+
+
+def charts(told: Json) -> str:
+    """Four small charts, memory and latency above loss and verdicts."""
+    figure = Figure((WIDTH, 4.4))
+    boxes = list(told["boxes"].items())
+    hours = max([box["sums"]["hours"] for _, box in boxes] or [0]) or 1
+    by, unit = (1, "min") if hours < 4 else (60, "h")
+    for i, (title, draw) in enumerate(
+        (
+            ("memory, MiB", _memory),
+            ("latency, ms", _latency),
+            ("frames lost in a minute", _loss),
+            ("wrong verdicts", _wrong),
+        )
+    ):
+        row, column = divmod(i, 2)
+        left, top = 0.075 + 0.5 * column, 0.91 - 0.48 * row
+        axes = add(figure, left, left + 0.41, top, top - 0.34)
+        axes.set_title(title, color=INK, size=SMALL + 0.5, loc="left", pad=5)
+        axes.set_xlim(0, 60 * hours / by * 1.01)
+        for (_, box), look in zip(boxes, LOOKS, strict=False):
+            draw(axes, box, look, 60 * by)
+        _scales(axes, unit if row else "")
+    for i, ((name, _), look) in enumerate(zip(boxes, LOOKS, strict=False)):
+        mark = "╍" if "linestyle" in look else "—"
+        figure.text(0.075 + 0.25 * i, 0.985, f"{mark} {name}", color=look["color"], size=SMALL + 0.5, va="center")
+    return svg(figure, "memory, latency, loss and wrong verdicts of a soak over time")
+
+
+def _memory(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
+    held = columns([row for run in box["runs"] for row in run["samples"]], SAMPLE)
+    mib = np.divide(held["rss_kib"], 1024)
+    axes.plot(np.divide(held["s"], unit_s), mib, **look)
+    low, high = (axes.get_ylim() if axes.lines[1:] else (np.inf, -np.inf)) if len(mib) else (0, 1)
+    axes.set_ylim(min(low, np.min(mib, initial=np.inf) - 4), max(high, np.max(mib, initial=-np.inf) + 4))
+
+
+def dots(box: Json) -> tuple[Any, Any]:
+    """Seconds and latencies in ms of the sweeps that are drawn: all, or the slowest of each few."""
+    rows = [row for run in box["runs"] for row in run["answers"] if kind(row[3], row[4], row[2]) != "cut"]
+    s, ms = (np.array(columns(rows, ANSWER)[name], float) for name in ("s", "latency_ms"))
+    each = max(-(-len(s) // DOTS), 1)
+    pick = [k + int(np.argmax(ms[k : k + each])) for k in range(0, len(s), each)]
+    return s[pick], ms[pick]
+
+
+def _latency(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
+    s, ms = dots(box)
+    # dots as strokes without length: one path of them all, and not an element each
+    x, y = (np.repeat(v, 3).astype(float) for v in (s / unit_s, ms))
+    x[2::3] = np.nan
+    (line,) = axes.plot(x, y, color=look["color"], linewidth=2.2, alpha=0.7, solid_capstyle="round")
+    line.get_path().should_simplify = False
+    axes.set_yscale("log")
+    low, high = axes.get_ylim() if axes.lines[1:] else (1.0, 10.0)
+    axes.set_ylim(min(low, 0.8 * float(ms.min(initial=1))), max(high, 1.5 * float(ms.max(initial=1))))
+
+
+def _loss(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
+    most = 1.0
+    for run in box["runs"]:
+        held = columns(run["samples"], SAMPLE)
+        minutes = np.arange(run["began_s"], run["began_s"] + run["length_s"] + 1, 60)
+        if len(minutes) < 2 or not held["s"]:
+            continue
+        lost = np.interp(minutes, held["s"], held["lost"])
+        axes.stairs(np.diff(lost), minutes / unit_s, baseline=None, **look)
+        most = max(most, 1.1 * float(np.diff(lost).max(initial=0)))
+    axes.set_ylim(-0.04 * most, max(most, axes.get_ylim()[1] if axes.patches[1:] else 0))
+
+
+def _wrong(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
+    rows = [row for run in box["runs"] for row in run["answers"]]
+    s, ends = band(rows)
+    low, high = np.transpose(ends) if ends else ([], [])
+    axes.fill_between(np.divide(s, unit_s), low, high, color=look["color"], alpha=0.13, linewidth=0, step="post")
+    wrong = np.cumsum([kind(row[3], row[4], row[2]) == "wrong" for row in rows])
+    axes.step(np.divide([row[0] for row in rows], unit_s), wrong, where="post", **look)
+    most = max([1, *high, *wrong[-1:]])
+    axes.set_ylim(-0.04 * most, max(1.1 * most, axes.get_ylim()[1] if axes.lines[1:] else 0))
+
+
+def _scales(axes: Axes, unit: str) -> None:
+    """Few round ticks; the last of the horizontal ones names its unit."""
+    for axis, ends in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        along = MaxNLocator(4, integer=True, steps=[1, 1.5, 2, 3, 6, 10]) if axis is axes.xaxis else MaxNLocator(4)
+        there = [10.0**k for k in range(-3, 7)] if axis.get_scale() == "log" else along.tick_values(*ends)
+        ticks = [tick for tick in there if ends[0] <= tick <= ends[1]]
+        labels = [f"{tick / 1000:g}k" if tick >= 10_000 else f"{tick:g}" for tick in ticks]
+        if axis is axes.xaxis and labels:
+            labels[-1] += f" {unit}"
+        scale(axis, ticks, labels)
+    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+
+
+def _the(name: str) -> str:
+    return name if name.startswith("this") else f"the {name}"
+
+
+def _hours(hours: float) -> str:
+    return f"{hours:.3g} h" if hours >= 0.995 else f"{60 * hours:.0f} min"
+
+
+def _share(s: Json) -> str:
+    return f"{s['n']:,}: {s['n'] / max(s['of'], 1):.3f} [{s['low']:.3f}, {s['high']:.3f}]"
+
+
+def _mib(kib: Sequence[float]) -> str:
+    return " / ".join(f"{k / 1024:.1f}" for k in kib)
+
+
+def _slope(m: Json, by: float = 1.0) -> str:
+    return "" if m["high"] is None else estimate(*(m[name] * by for name in ("kib_h", "low", "high")))
+
+
+def _each(s: Json) -> str:
+    return _slope(s["memory"], 1000 * s["hours"] / s["answers"]) if s["answers"] else ""
+
+
+def _about(box: Json, name: str) -> str:
+    if name == "versions":
+        return ", ".join(f"{k} {v}" for k, v in box[name].items())
+    if name == "runs":
+        return "; ".join(f"{run['length_s'] / 60:.1f} min, {run['ended'] or 'not ended'}" for run in box[name])
+    return str(box[name])
