@@ -7,7 +7,7 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools test-rig test-hw soak \
+.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools test-rig test-hw systemd soak \
   wheel lock clean
 
 help: ## this list
@@ -31,6 +31,11 @@ rig-shell: rig-tools ## a shell in the virtual box
 
 test-rig: rig-tools ## the tests on the virtual box; COUNTS=full does each fault as often as the report says (an hour)
 	PALPATE_RIG=$(or $(COUNTS),quick) $(BIN)/python -m pytest -q tests/rig
+
+systemd: $(DESKTOP) ## the unit under a real systemd, in a container (as root; gets a Debian of 370 MB, once)
+	@{ command -v systemd-nspawn && command -v mmdebstrap; } >/dev/null || \
+	  apt-get install -y -q --no-install-recommends systemd-container mmdebstrap
+	PALPATE_SYSTEMD=1 $(BIN)/python -m pytest -q -rP tests/test_systemd.py
 
 soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box and on this machine: docs/soak/
 	$(RIG) build

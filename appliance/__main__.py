@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from . import bundle, config
 from .arguments import parser
-from .box import Box, World
+from .box import Box, Pulse, World
 from .capture import CaptureWriter, Playback, keeper
 from .check import check
 from .classifier import Classifier
@@ -28,6 +28,7 @@ from .config import Config
 from .early import Decider
 from .errors import ApplianceError, ConfigError, FormatError
 from .lines import Lines
+from .notify import Manager
 from .recorder import Recorder
 from .sensor import UsbSensor
 from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort, result
@@ -71,7 +72,7 @@ def _bundle(settings: Config) -> bundle.Bundle:
 def _world(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> World:
     """The real devices, or the rig where `--sim` names it; `fmt` tells what the simulated skin has to send."""
     if args.sim:
-        return _simulated(args.sim, fmt(), args)
+        return _simulated(args.sim, fmt(), args, remember=False)
     if args.virtual:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
     import gpiod
@@ -79,12 +80,12 @@ def _world(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> World:
     return World(SystemClock(), gpiod)
 
 
-def _simulated(name: str, fmt: SweepFormat, args: argparse.Namespace) -> SimWorld:
+def _simulated(name: str, fmt: SweepFormat, args: argparse.Namespace, *, remember: bool = True) -> SimWorld:
     from .sim import rig, script, stage
 
     acts, source = script.named(name, fmt, args.seed)
     clock = rig.VirtualClock() if args.virtual else SystemClock()
-    return stage.build(fmt, islice(acts, args.sweeps), clock, source)
+    return stage.build(fmt, islice(acts, args.sweeps), clock, source, remember=remember)
 
 
 def _log(line: str) -> None:
@@ -95,6 +96,7 @@ def build(
     settings: Config, model: bundle.Bundle, world: World, port: Port, stack: ExitStack, *,
     capture: CaptureWriter | None = None, keep: Callable[[Sweep], None] | None = None,
     log: Callable[[str], None] = lambda line: None, also: Iterable[ResultSink] = (), labels: tuple[str, ...] = (),
+    pulse: Pulse | None = None,
 ) -> Box:  # fmt: skip
     """Put the parts together; `stack` takes them apart again. labels: what class bits must hold beside the bundle's."""
     settings = world.wire(settings)
@@ -117,7 +119,7 @@ def build(
         sensor, trigger, Recorder(model.format, settings.sweep), classifier, world.clock,
         early=_early(settings, classifier), sinks=sinks,
         port=port, panel=lines, state_s=settings.serial.state_s, source=world.source, log=log,
-        tap=capture, keep=keep,
+        tap=capture, keep=keep, pulse=pulse,
     )  # fmt: skip
 
 
@@ -154,7 +156,10 @@ def run_box(args: argparse.Namespace) -> int:
         if capture:
             stack.callback(capture.close)
         keep = keeper(args.keep, model.format, _log) if args.keep else None
-        box = build(settings, model, world, _port(settings, world), stack, capture=capture, keep=keep, log=_log)
+        box = build(
+            settings, model, world, _port(settings, world), stack, capture=capture, keep=keep, log=_log,
+            pulse=Manager(SystemClock()),
+        )  # fmt: skip
 
         def done() -> bool:
             enough = args.sweeps is not None and box.answered >= args.sweeps

@@ -47,6 +47,18 @@ class Tap(Protocol):
         ...
 
 
+class Pulse(Protocol):
+    """Whoever watches over the program: a turn that does not end is noticed by its silence."""
+
+    def turn(self, ready: bool, status: str) -> None:
+        """A turn of the loop is over. ready: the skin streams. status: how the box is, in words."""
+        ...
+
+    def stopping(self) -> None:
+        """The loop has ended; what is open is being answered."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class World:
     """What the drivers stand on. These are the real devices; the rig's world says otherwise.
@@ -74,6 +86,7 @@ class Box:
     early: answers sweeps that still go on, or None. panel: READY, BUSY, FAULT, DECIDED, or None.
     port: where commands come from and state sentences go, or None.
     tap: takes note of edges and commands, for captures. keep: called with each sweep, for recordings.
+    pulse: told at the end of each turn, or None.
     """
 
     def __init__(
@@ -81,14 +94,14 @@ class Box:
         early: Decider | None = None,
         sinks: Sequence[ResultSink] = (), port: Port | None = None, panel: Panel | None = None,
         state_s: float = 1.0, source: str = "usb", log: Callable[[str], None] = lambda line: None,
-        tap: Tap | None = None, keep: Callable[[Sweep], None] | None = None,
+        tap: Tap | None = None, keep: Callable[[Sweep], None] | None = None, pulse: Pulse | None = None,
     ) -> None:  # fmt: skip
         self.answered = 0
         self._sensor, self._trigger, self._recorder, self._classifier = sensor, trigger, recorder, classifier
         self._early, self._clock, self._sinks, self._port, self._panel = early, clock, sinks, port, panel
         self._decided = False
         self._state_ns, self._source, self._log = round(state_s * 1e9), source, log
-        self._tap, self._keep = tap, keep or (lambda sweep: None)
+        self._tap, self._keep, self._pulse = tap, keep or (lambda sweep: None), pulse
         self._next_state_ns = clock.now_ns()
         self._troubles: dict[str, str] = {}
 
@@ -111,6 +124,8 @@ class Box:
         """Take turns until `stopped()`; what is open then is answered `aborted`."""
         while not stopped():
             self.step()
+        if self._pulse:
+            self._pulse.stopping()
         self._recorder.interrupt(Status.ABORTED, self._clock.now_ns())
         self._answer(self._recorder.finished(self._clock.now_ns()))
 
@@ -130,6 +145,7 @@ class Box:
         self._show()
         verdicts += self._answer(self._recorder.finished(now))
         self._report(now)
+        self._beat()
         return verdicts
 
     @property
@@ -183,6 +199,14 @@ class Box:
         if now_ns >= self._next_state_ns:
             self._next_state_ns = now_ns + self._state_ns
             self._port.say(sentence("STA", *self._state()))
+
+    def _beat(self) -> None:
+        """The turn is over: frames came in or the skin's absence was told, edges were polled, answers are out."""
+        if self._pulse:
+            sensor = self._sensor
+            skin = f"skin {sensor.state}: {sensor.trouble}" if sensor.trouble else f"skin {sensor.state}"
+            streams = sensor.state == "streaming" and sensor.tally.frames > 0
+            self._pulse.turn(streams, f"{skin}. Sweeps answered: {self.answered}")
 
     def _note(self, what: str, trouble: str, fine: str) -> None:
         if self._troubles.get(what) != trouble:

@@ -1,0 +1,191 @@
+"""The room of the real systemd: a Debian in a container, with systemd as PID 1 and the box installed as on a board.
+
+`python tests/nspawn.py` makes the Debian, once, in ~/.cache/palpate/nspawn: packages from Debian, a virtual environment
+with the wheels of appliance/requirements.lock. `Machine` boots it in half a second; what is changed in it lies in
+memory and is gone at the end. It has no devices, and its limits of memory and processor are not enforced. Needs root.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Self
+
+from machines import HOME, LOCK, PIP, ROOT, Missing, run
+
+CACHE = HOME.parent / "nspawn"
+SUITE, PYTHON = "bookworm", "3.11"
+"""Debian 12, what the boards run, and its Python."""
+PACKAGES = ("systemd", "systemd-sysv", "python3-venv", "libstdc++6", "libusb-1.0-0")
+TOOLS = {
+    "mmdebstrap": "mmdebstrap", "systemd-nspawn": "systemd-container", "nsenter": "util-linux", "setpriv": "util-linux",
+}  # fmt: skip
+PLACES = {
+    "palpate.service": "/etc/systemd/system/palpate.service",
+    "palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
+    "palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
+}
+"""Where the files of systemd/ go."""
+PATH = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
+BOOT_S = 60
+
+
+def folder() -> Path:
+    """Where the Debian lies, or will: another one for another lock, suite or processor."""
+    said = repr((SUITE, PYTHON, PACKAGES, platform.machine())).encode()
+    return CACHE / hashlib.sha256(LOCK.read_bytes() + said).hexdigest()[:16]
+
+
+def check() -> None:
+    """Raise Missing where a container cannot be run at all."""
+    if os.geteuid():
+        raise Missing("systemd in a container needs root; use sudo")
+    if lacking := [name for name in TOOLS if not shutil.which(name)]:
+        wanted = sorted({TOOLS[name] for name in lacking})
+        raise Missing(f"no {', '.join(lacking)} here; apt-get install {' '.join(wanted)}")
+
+
+def set_up() -> Path:
+    """The folder of the Debian, made where it is not there. Raises Missing where mmdebstrap or pip cannot."""
+    check()
+    target = folder()
+    if target.exists():
+        return target
+    CACHE.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=f"{target.name}.", suffix=".part", dir=CACHE))
+    try:
+        _make(part / "root", part / "wheels")
+        with suppress(OSError):  # somebody else was quicker
+            (part / "root").rename(target)
+    except subprocess.CalledProcessError as e:
+        raise Missing(f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout).strip()[-500:]}") from e
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return target
+
+
+def _make(root: Path, wheels: Path) -> None:
+    run("mmdebstrap", "--variant=minbase", f"--include={','.join(PACKAGES)}", "--aptopt=Acquire::Languages none",
+        *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
+        "--format=directory", SUITE, root)  # fmt: skip
+    run(*PIP, "download", "--no-deps", "--only-binary", ":all:", "--python-version", PYTHON,
+        "--require-hashes", "-r", LOCK, "-d", wheels)  # fmt: skip
+    shutil.copytree(wheels, root / "wheels")
+    shutil.copy(LOCK, root / "wheels")
+    inside = ("chroot", root, "env", "-i", PATH)
+    run(*inside, "python3", "-m", "venv", "/opt/palpate")
+    run(*inside, *_pip("--find-links", "/wheels", "--require-hashes", "-r", f"/wheels/{LOCK.name}"))
+    shutil.rmtree(root / "wheels")
+
+
+def _pip(*args: str) -> tuple[str, ...]:
+    return ("/opt/palpate/bin/pip", "--disable-pip-version-check", "-q", "install", "--no-index", *args)
+
+
+class Machine:
+    """A container that has booted; `run` runs a command in it, as root.
+
+    root: what `set_up` gave. parcel: a folder that it sees, read-only, as /parcel. log: where nspawn's own words go.
+    Raises Missing where a container cannot be booted on this machine.
+    """
+
+    def __init__(self, root: Path, parcel: Path, log: Path) -> None:
+        self._log = log
+        with tempfile.TemporaryDirectory() as place, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ear:
+            ear.bind(f"{place}/notify")
+            command = (
+                "setpriv", "--pdeathsig", "TERM",  # a test run that is killed leaves no container behind
+                "systemd-nspawn", "--quiet", f"--directory={root}", f"--machine=palpate-{os.getpid()}", "--register=no",
+                "--keep-unit", "--console=pipe", "--private-network", "--volatile=overlay", "--notify-ready=yes",
+                f"--bind-ro={parcel}:/parcel", "--boot",
+            )  # fmt: skip
+            env = os.environ | {"NOTIFY_SOCKET": f"{place}/notify", "SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
+            with log.open("wb") as out:
+                self._process = subprocess.Popen(
+                    command, env=env, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
+                )
+            try:
+                self._first = self._booted(ear)
+            except BaseException:
+                self.close()
+                raise
+
+    def _booted(self, ear: socket.socket) -> str:
+        """Wait until its systemd has booted; the number of its first process."""
+        ear.settimeout(0.2)
+        first, end = "", time.monotonic() + BOOT_S
+        while time.monotonic() < end and self._process.poll() is None:
+            with suppress(TimeoutError):
+                said = dict(line.partition("=")[::2] for line in ear.recv(4096).decode().splitlines())
+                first = said.get("X_NSPAWN_LEADER_PID", first)
+                if said.get("READY") == "1":
+                    return first
+        raise Missing(f"systemd does not boot in a container here: {self._log.read_text(errors='replace').strip()}")
+
+    def run(self, *command: str, say: str = "", limit_s: float = 60) -> subprocess.CompletedProcess[str]:
+        """Run a command in it to its end, with `say` as its input."""
+        enter = ("nsenter", "-t", self._first, "-m", "-u", "-i", "-n", "-p", "-C", "-r", "-w", "env", "-i", PATH)
+        return subprocess.run(
+            [*enter, *command], input=say, capture_output=True, text=True, timeout=limit_s, check=False
+        )
+
+    def get(self, *command: str, say: str = "") -> str:
+        """What a command prints; it must succeed."""
+        done = self.run(*command, say=say)
+        assert done.returncode == 0, f"{command} gave {done.returncode}: {done.stdout}{done.stderr}"
+        return done.stdout.strip()
+
+    def put(self, path: str, text: str) -> None:
+        """Write a file, with its folder."""
+        self.get("mkdir", "-p", str(Path(path).parent))
+        self.get("tee", path, say=text)
+
+    def install(self) -> None:
+        """Put the box on it as on a board: `parcel` holds its wheel and the files of systemd/."""
+        self.get("sh", "-c", f"{' '.join(_pip('--no-deps'))} /parcel/*.whl")
+        for name, place in PLACES.items():
+            self.get("install", "-D", "-m", "644", f"/parcel/{name}", place)
+        self.get("systemd-sysusers", PLACES["palpate.sysusers"])
+        self.get("systemd-tmpfiles", "--create", PLACES["palpate.tmpfiles"])
+        self.get("systemctl", "daemon-reload")
+
+    def close(self) -> None:
+        """Shut it down."""
+        self._process.terminate()
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def pack(parcel: Path, source: Path) -> None:
+    """Fill a parcel with the wheel of this checkout and systemd/. source: an empty folder to build in."""
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    shutil.copytree(ROOT / "appliance", source / "appliance", ignore=shutil.ignore_patterns("__pycache__"))
+    run(*PIP, "wheel", "--no-deps", "-w", parcel, source)
+    for name in PLACES:
+        shutil.copy(ROOT / "systemd" / name, parcel)
+
+
+if __name__ == "__main__":
+    try:
+        print(set_up())
+    except Missing as e:
+        sys.exit(str(e))
