@@ -41,7 +41,8 @@ soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box
 	$(RIG) build
 	PYTHONPATH=tests $(BIN)/python -m rig.soak --hours $(or $(HOURS),1) --out docs/soak $(SOAK)
 
-test-hw: $(DESKTOP) ## the contract of skin, lines and port on this board (wiring: docs/board-checklist.md)
+test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/board-checklist.md)
+	$(PIP) install -e '.[board]'
 	PALPATE_UNDERSIDE=wired $(BIN)/python -m pytest -q -rs tests/test_contract.py
 
 rig-tools: $(DESKTOP)
