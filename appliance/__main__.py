@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -89,7 +89,8 @@ def _simulated(name: str, fmt: SweepFormat, args: argparse.Namespace, *, remembe
 
 
 def _log(line: str) -> None:
-    print(f"palpate: {line}", file=sys.stderr, flush=True)
+    with suppress(OSError):  # a full disk costs the log, never the classifying
+        print(f"palpate: {line}", file=sys.stderr, flush=True)
 
 
 def build(

@@ -6,6 +6,7 @@ A capture played through the same rooms gives the same verdicts bit for bit, sin
 from __future__ import annotations
 
 import json
+import re
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -26,6 +27,7 @@ MAGIC = b"PPLPCAP1"
 _RECORD = struct.Struct("<BQI")
 _EDGE = struct.Struct("<QB")
 _KINDS = tuple(EdgeKind)
+_KEPT = re.compile(r"sweep-[0-9]+\.(npy|json)(\.part)?")
 
 
 class Kind(IntEnum):
@@ -89,19 +91,28 @@ class CaptureWriter:
 def keeper(folder: Path, fmt: SweepFormat, log: Callable[[str], None]) -> Callable[[Sweep], None]:
     """Saves the sweeps that have a window to `folder`. A full disk costs the recording, never the classifying.
 
-    Raises ConfigError where the folder cannot be made.
+    A file's number is the sweep's, counted on from what an earlier run has left there: nothing is written over. What a
+    run that was killed had not finished is taken away. Raises ConfigError where the folder cannot be made or read.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        there = [path for path in folder.iterdir() if _KEPT.fullmatch(path.name)]
     except OSError as e:
         raise ConfigError(f"--keep {folder}: {e.strerror}; name a folder that can be written") from e
+    for part in (path for path in there if path.suffix == ".part"):
+        with suppress(OSError):
+            part.unlink()
+    last = max((int(path.name[6:].partition(".")[0]) for path in there), default=0)
 
     def keep(sweep: Sweep) -> None:
         if len(sweep.frames):
             try:
-                save(folder / f"sweep-{sweep.id:06d}.npy", sweep, fmt)
+                save(folder / f"sweep-{last + sweep.id:06d}.npy", sweep, fmt)
             except OSError as e:
-                log(f"keep: sweep {sweep.id} cannot be saved: {e.strerror}; make room in {folder}, classifying goes on")
+                log(
+                    f"keep: sweep {sweep.id} cannot be saved: {e.strerror}; "
+                    f"see that {folder} has room and may be written; classifying goes on"
+                )
 
     return keep
 

@@ -5,9 +5,11 @@ Nothing here knows where frames come from. Times are nanoseconds of the host's `
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -176,21 +178,29 @@ def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
 def save(path: Path, sweep: Sweep, fmt: SweepFormat) -> None:
     """Write `sweep` as `path` (.npy, one record a frame) and a JSON sidecar beside it, whole or not at all.
 
-    Each file is written aside, synced and renamed; the sidecar comes first, so an .npy never lacks its description.
+    Both are written aside and synced, then renamed; the sidecar comes first, so an .npy never lacks its description.
+    Raises OSError where that fails, and then leaves nothing behind.
     """
     table = np.zeros(len(sweep.frames), _record_dtype(fmt))
     table["t_ns"], table["seq"], table["taxels"] = sweep.frames.t_ns, sweep.frames.seq, sweep.frames.taxels
     about = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"} | {"format": asdict(fmt), "schema": 1}
-    for target, write in (
-        (path.with_suffix(".json"), lambda f: f.write(json.dumps(about, indent=1).encode())),
-        (path, lambda f: np.save(f, table, allow_pickle=False)),
-    ):
-        aside = target.with_name(target.name + ".part")
-        with aside.open("wb") as f:
-            write(f)
-            f.flush()
-            os.fsync(f.fileno())
-        aside.replace(target)
+    packed = io.BytesIO()  # into a file np.save writes past Python, and a full disk has no errno then
+    np.save(packed, table, allow_pickle=False)
+    held = {path.with_suffix(".json"): json.dumps(about, indent=1).encode(), path: packed.getvalue()}
+    asides = {target: target.with_name(target.name + ".part") for target in held}
+    try:
+        for target, data in held.items():
+            with asides[target].open("wb") as f:
+                f.write(data)
+                f.flush()
+                os.fsync(f.fileno())
+        for target, aside in asides.items():
+            aside.replace(target)
+    except OSError:
+        for left in (*asides.values(), *(target for target in held if not path.is_file())):
+            with suppress(OSError):
+                left.unlink(missing_ok=True)
+        raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

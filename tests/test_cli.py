@@ -140,6 +140,15 @@ def test_a_full_disk_costs_the_recording_never_the_classifying(
     assert said.err.count("capture: /dev/full cannot be written: No space left on device") == 1
 
 
+def test_a_log_on_a_full_disk_costs_the_log_alone():
+    """Where standard error cannot be written, sweeps are answered all the same, and the exit code is 0."""
+    command = [sys.executable, "-m", "appliance", "run", "--sim", "skin", *VIRTUAL, "--capture", "/dev/full"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=full, text=True, timeout=60, check=False)
+    assert done.returncode == 0
+    assert done.stdout.count("$PPLP,RES,") == 3
+
+
 def test_replay_of_a_sweep_set(
     tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
 ):
