@@ -108,14 +108,14 @@ def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
 
 
 def request_lines(
-    gpio: Any, names: Sequence[str], settings: Any, stack: ExitStack
+    gpio: Any, names: Sequence[str], settings: Any, stack: ExitStack, *, apart: bool = False
 ) -> list[tuple[LineRequest, dict[int, str]]]:
-    """One request per chip, each with {offset: name}; `stack` releases them."""
-    chips: dict[str, dict[int, str]] = {}
+    """One request per chip, or with `apart` one per line, each with {offset: name}; `stack` releases them."""
+    groups: dict[tuple[str, str], dict[int, str]] = {}
     for name, (path, offset) in find_lines(gpio, names).items():
-        chips.setdefault(path, {})[offset] = name
+        groups.setdefault((path, name if apart else ""), {})[offset] = name
     requests = []
-    for path, lines in chips.items():
+    for (path, _), lines in groups.items():
         with naming("request", lines.values()):
             request = gpio.request_lines(path, {tuple(lines): settings}, consumer="palpate", event_buffer_size=QUEUE)
         stack.callback(request.release)

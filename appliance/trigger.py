@@ -6,7 +6,7 @@ What the kernel dropped or a storm buried is told as LOST; nothing is made up fo
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from gpiod import EdgeEvent, LineRequest
 
     from .config import TriggerConfig
-
-OVERTAKING = 16
-"""No more events than this overtake one; with more of them here, the one before them was dropped."""
 
 
 class EdgeKind(StrEnum):
@@ -62,30 +59,19 @@ _Meaning = tuple[EdgeKind | None, EdgeKind | None]
 
 @dataclass(slots=True)
 class _Line:
-    """An input line: its settled level, and the burst of edges that has not settled yet."""
+    """An input line: its kernel queue, its settled level, and the burst of edges that has not settled yet."""
 
+    request: LineRequest
+    offset: int
+    name: str
     meaning: _Meaning
+    seqno: int = 0  # of the newest event that was taken
+    known_ns: int = 0  # all events up to here were taken
     level: bool = False
     count: int = 0  # edges in the burst
     first_ns: int = 0
     last_ns: int = 0
     after: bool = False  # level after the last of them
-
-
-@dataclass(slots=True)
-class _Bank:
-    """The input lines of one chip, which share a kernel queue."""
-
-    request: LineRequest
-    names: dict[int, str]
-    lines: dict[int, _Line]
-    early: list[EdgeEvent] = field(default_factory=list)  # read, but an event before them is missing
-    seqno: int = 0  # of the newest event that was taken
-    known_ns: int = 0  # all events up to here were taken
-
-    def step(self, event: EdgeEvent) -> int:
-        """1 for the event that comes next; the kernel counts in 32 bits."""
-        return (event.global_seqno - self.seqno + 2**31) % 2**32 - 2**31
 
 
 class GpioTrigger:
@@ -108,10 +94,12 @@ class GpioTrigger:
         self._blind_ns: int | None  # newest edge since the levels became unknown; None: they are known
         roles = _roles(config)
         with ExitStack() as stack:
-            requests = request_lines(gpio, [name for name, _ in roles], _input_settings(config, gpio), stack)
+            # apart: in a request of several lines the interrupt numbers an edge and its thread tells it; of two edges
+            # before the thread has run one number is never told, so every bounce would look like a loss
+            names = [name for name, _ in roles]
+            requests = request_lines(gpio, names, _input_settings(config, gpio), stack, apart=True)
             meaning = dict(roles)
-            self._banks = [_Bank(r, names, {o: _Line(meaning[n]) for o, n in names.items()}) for r, names in requests]
-            self._lines = [line for bank in self._banks for line in bank.lines.values()]
+            self._lines = [_Line(r, o, name, meaning[name]) for r, found in requests for o, name in found.items()]
             self._active, self._rising = gpio.line.Value.ACTIVE, gpio.EdgeEvent.Type.RISING_EDGE
             self._read_levels()
             self._open = stack.pop_all()
@@ -138,14 +126,14 @@ class GpioTrigger:
 
     def edges(self, now_ns: int) -> list[Edge]:
         """Edges that have settled by `now_ns` (read before the call), in order of time; never waits."""
-        for bank in self._banks:
+        for line in self._lines:
             try:  # not `naming`, whose generator costs more than a look at an empty queue
-                self._read(bank, now_ns)
+                self._read(line, now_ns)
             except OSError as e:
-                raise line_error("read", bank.names.values(), e) from e
+                raise line_error("read", [line.name], e) from e
         if self._blind_ns is None and not self._pending and not any(line.count for line in self._lines):
             return []
-        horizon_ns = min(bank.known_ns for bank in self._banks)
+        horizon_ns = min(line.known_ns for line in self._lines)
         for line in self._lines:
             if line.count and horizon_ns - line.last_ns >= self._glitch_ns:
                 self._settle(line)
@@ -168,38 +156,27 @@ class GpioTrigger:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _read(self, bank: _Bank, now_ns: int) -> None:
-        """Take the chip's share of events, in the order of their numbers."""
-        left = max(1, self._storm_edges // len(self._banks))
-        while left > 0 and bank.request.wait_edge_events(0):
-            events = bank.request.read_edge_events(left)
-            bank.early += events
+    def _read(self, line: _Line, now_ns: int) -> None:
+        """Take the line's share of events."""
+        left = max(1, self._storm_edges // len(self._lines))
+        while left > 0 and line.request.wait_edge_events(0):
+            events = line.request.read_edge_events(left)
             left -= len(events)
-        if len(bank.early) > 1:
-            bank.early.sort(key=bank.step)
-        while bank.early:
-            event = bank.early[0]
-            # interrupt threads of two lines may overtake each other: wait a little before calling an event dropped
-            young = now_ns - event.timestamp_ns < self._glitch_ns and len(bank.early) <= OVERTAKING
-            if bank.step(event) > 1 and young:
-                break
-            self._take(bank, bank.early.pop(0))
-        if left > 0 and not bank.early:
-            bank.known_ns = max(bank.known_ns, now_ns)
+            for event in events:
+                self._take(line, event)
+        if left > 0:
+            line.known_ns = max(line.known_ns, now_ns)
 
-    def _take(self, bank: _Bank, event: EdgeEvent) -> None:
-        step, t_ns = bank.step(event), event.timestamp_ns
-        if step < 1:
-            return  # so late that it counts as dropped already
-        if step > 1:
-            self._lost_events += step - 1
+    def _take(self, line: _Line, event: EdgeEvent) -> None:
+        t_ns = event.timestamp_ns
+        dropped = (event.line_seqno - line.seqno - 1) % 2**32  # the kernel counts in 32 bits
+        line.seqno, line.known_ns = event.line_seqno, max(line.known_ns, t_ns)
+        if dropped:
+            self._lost_events += dropped
             self._lose(t_ns)
-        bank.seqno = event.global_seqno
-        bank.known_ns = max(bank.known_ns, t_ns)
         if self._blind_ns is not None:
             self._blind_ns = max(self._blind_ns, t_ns)
             return
-        line = bank.lines[event.line_offset]
         if line.count and t_ns - line.last_ns >= self._glitch_ns:
             self._settle(line)
         if not line.count:
@@ -230,11 +207,9 @@ class GpioTrigger:
 
     def _read_levels(self) -> None:
         """Begin anew from the lines' levels."""
-        for bank in self._banks:
-            with naming("read", bank.names.values()):
-                values = bank.request.get_values(list(bank.lines))
-            for line, value in zip(bank.lines.values(), values, strict=True):
-                line.level = value is self._active
+        for line in self._lines:
+            with naming("read", [line.name]):
+                line.level = line.request.get_values([line.offset]) == [self._active]
         self._blind_ns = None
 
 
