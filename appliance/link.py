@@ -13,6 +13,7 @@ import usb.core
 import usb.util
 
 from . import wire
+from .clock import Clock
 from .config import SensorConfig
 from .errors import SensorAbsent, SensorBusy, SensorDenied, SensorError, SensorLost, SensorMismatch
 
@@ -23,8 +24,8 @@ REPLY_MS = 500
 class VendorLink:
     """An opened vendor-class board: control requests and one bulk IN endpoint."""
 
-    def __init__(self, device: usb.core.Device, interface: Any) -> None:
-        self._device, self._number = device, interface.bInterfaceNumber
+    def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
+        self._device, self._number, self._clock = device, interface.bInterfaceNumber, clock
         self._in = _endpoint(interface, usb.util.ENDPOINT_IN)
         for number in self._claimed():
             _claim(device, number)
@@ -39,8 +40,14 @@ class VendorLink:
         return bytes(reply) if length else b""
 
     def read(self, size: int, timeout_ms: int) -> bytes:
-        """One bulk transfer of at most `size` bytes."""
-        return bytes(self._device.read(self._in, size, timeout_ms))
+        """One bulk transfer of at most `size` bytes. An endpoint that has stalled is cleared, for whoever reads next."""
+        try:
+            return bytes(self._device.read(self._in, size, timeout_ms))
+        except usb.core.USBError as e:
+            if e.errno == errno.EPIPE:
+                with contextlib.suppress(usb.core.USBError):
+                    self._device.clear_halt(self._in)
+            raise
 
     def close(self) -> None:
         """Ask the board to stop and release it; a board that is gone cannot be asked."""
@@ -52,9 +59,9 @@ class VendorLink:
 class AcmLink(VendorLink):
     """An opened CDC-ACM board: the same requests as single bytes on bulk OUT, their replies among the packets."""
 
-    def __init__(self, device: usb.core.Device, interface: Any) -> None:
+    def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
         self._out = _endpoint(interface, usb.util.ENDPOINT_OUT)
-        super().__init__(device, interface)
+        super().__init__(device, interface, clock)
 
     def _claimed(self) -> list[int]:
         # the kernel's cdc_acm holds the control interface beside the data interface
@@ -63,20 +70,21 @@ class AcmLink(VendorLink):
     def request(self, request: wire.Request, length: int) -> bytes:
         """Send a request byte; its reply where `length` asks for one. The board is idle, so no frames are lost here."""
         self._device.write(self._out, bytes([request]), REPLY_MS)
-        data = b""
+        data, until_ns = b"", self._clock.now_ns() + REPLY_MS * 1_000_000
         while length:
             data += self.read(512, REPLY_MS)
             for reply in wire.unpack(data).replies:
                 if reply.request == request:
                     return reply.payload
-            if len(data) > 4 * wire.MAX_PAYLOAD:
+            # a few bytes now and then would go on for ever
+            if len(data) > 4 * wire.MAX_PAYLOAD or self._clock.now_ns() >= until_ns:
                 raise SensorMismatch(
                     f"the skin sends frames but does not answer request {request.name}; check its firmware"
                 )
         return b""
 
 
-def open_board(config: SensorConfig, backend: Any) -> VendorLink:
+def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
     """Find and claim the configured board."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
     try:
@@ -94,7 +102,7 @@ def open_board(config: SensorConfig, backend: Any) -> VendorLink:
         interface = usb.util.find_descriptor(_configuration(device), bInterfaceClass=wanted)
         if interface is None:
             raise SensorMismatch(f"skin {ids} has no {config.link} interface (class {wanted}); see sensor.link")
-        return link(device, interface)
+        return link(device, interface, clock)
     except usb.core.USBError as e:
         usb.util.dispose_resources(device)
         raise explain(e) from e
@@ -105,6 +113,8 @@ def _serial(device: usb.core.Device) -> str:
         return device.serial_number or ""
     except usb.core.USBError as e:
         raise explain(e) from e
+    except UnicodeDecodeError as e:
+        raise SensorMismatch(f"the skin's serial number is no text ({e}); check its firmware") from e
     except ValueError as e:  # pyusb's answer where the string descriptors may not be read
         raise SensorDenied(
             f"the skin's serial number cannot be read ({e}); install the udev rule, join group plugdev"

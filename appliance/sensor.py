@@ -20,7 +20,8 @@ from .sweep import EPOCH_BITS, Frames, SweepFormat
 
 RATE_TOLERANCE = 0.01
 """How far a board's rate may be from the bundle's: one per cent, as crystals and timers differ."""
-
+STAMPS_NS = 5_000_000
+"""How far a board's stamps may waver: it may stamp in milliseconds, or late under an interrupt. That moves no window."""
 
 _COUNT = np.arange(wire.MAX_FRAMES, dtype=np.int64)
 
@@ -88,16 +89,20 @@ class Stream:
         self._place = wire.Place(-1)
         self._device = DeviceClock()
         self._leftover = b""
+        self._mark: tuple[int, int] | None = None  # (number, device ns) of a frame at most a second ago
 
     def restart(self) -> None:
         """A new enumeration, the first one too: numbers get the next epoch, the device's clock starts anew."""
         self._tally.enumerations += 1
         self._place = wire.Place(self._place.epoch + 1)
-        self._device = DeviceClock()
+        self._device, self._mark = DeviceClock(), None
         self._leftover = b""
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
-        """Frames of a transfer that ended at `arrival_ns`. Raises SensorMismatch where they have another form."""
+        """Frames of a transfer that ended at `arrival_ns`.
+
+        Raises SensorMismatch where they have another form, or where the board's clock does not go with its count.
+        """
         got = wire.unpack(self._leftover + data)
         self._leftover = got.leftover
         self._tally.garbage_bytes += got.garbage
@@ -108,17 +113,21 @@ class Stream:
             self._tally.fifo_overflows += bool(p.flags & wire.Flag.OVERFLOW.value)
         fresh, place, lost, stale = wire.follow(got.packets, self._place)
         if place.epoch != self._place.epoch:
-            self._device = DeviceClock()
+            self._device, self._mark = DeviceClock(), None
         self._place = place
-        self._tally.lost_frames += lost
+        now = [item for item in fresh if item[0] >> EPOCH_BITS == place.epoch]
+        # what came before the board started anew, in the same transfer, has no host time any more
+        self._tally.lost_frames += lost + sum(len(p.taxels) for _, p in fresh) - sum(len(p.taxels) for _, p in now)
         self._tally.stale_frames += stale
-        return self._stamp([item for item in fresh if item[0] >> EPOCH_BITS == place.epoch], arrival_ns)
+        return self._stamp(now, arrival_ns)
 
     def _stamp(self, fresh: list[tuple[int, wire.Packet]], arrival_ns: int) -> Frames:
         """Put numbers and host times to packets [(first number, packet)] of one epoch."""
         if not fresh:
             return Frames.empty(self._format)
         starts = [self._device.unwrap(p.t_us) * 1000 for _, p in fresh]
+        for start, (first, _) in zip(starts, fresh, strict=True):
+            self._check_pace(first, start)
         self._device.update(starts[-1] + int(self._within_ns[len(fresh[-1][1].taxels) - 1]), arrival_ns)
         runs = []
         for start, (first, p) in zip(starts, fresh, strict=True):
@@ -126,6 +135,23 @@ class Stream:
             self._tally.frames += n
             runs.append(Frames(self._device.to_host_ns(start) + self._within_ns[:n], first + _COUNT[:n], p.taxels))
         return runs[0] if len(runs) == 1 else Frames.joined(runs)
+
+    def _check_pace(self, first: int, start_ns: int) -> None:
+        """Hold the board's clock against its count. Where they part, no host time is right, and a window cut by it is wrong.
+
+        Compared with a frame up to a second ago: a jump of either is seen at once, another pace within that second.
+        """
+        self._mark = self._mark or (first, start_ns)
+        counted_ns = round((first - self._mark[0]) * self._format.period_ns)
+        passed_ns = start_ns - self._mark[1]
+        slack_ns = max(STAMPS_NS, self._format.period_ns) + RATE_TOLERANCE * counted_ns
+        if abs(passed_ns - counted_ns) > slack_ns:
+            raise SensorMismatch(
+                f"the skin's clock went on {passed_ns / 1e6:.1f} ms during frames of {counted_ns / 1e6:.1f} ms; "
+                "starting it again, check its firmware if this stays"
+            )
+        if counted_ns >= 1_000_000_000:
+            self._mark = first, start_ns
 
 
 class UsbSensor:
@@ -173,7 +199,7 @@ class UsbSensor:
             self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
             return False
         try:
-            self._link = link.open_board(self._config, self._backend)
+            self._link = link.open_board(self._config, self._backend, self._clock)
             self.identity = self._check(self._link)
             self._link.request(wire.Request.START, 0)
         except SensorError as e:

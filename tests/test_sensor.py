@@ -316,6 +316,24 @@ def test_acm_board_that_never_answers():
     assert sensor.trouble is not None
 
 
+def test_acm_board_that_answers_a_byte_at_a_time():
+    """A reply that never gets whole is given up after its half second, however much of it still comes."""
+    world = idle_world(acm=True)
+    sensor = sensor_on(world)
+    backend = world.backend
+    backend.bulk_write = lambda *args: 1
+
+    def a_byte(handle, ep, intf, buff, ms) -> int:
+        world.clock.sleep_until(world.clock.now_ns() + 400_000_000)
+        return 1
+
+    backend.bulk_read = a_byte
+    begun = world.clock.now_ns()
+    sensor.read()
+    assert sensor.state == "mismatch"
+    assert world.clock.now_ns() - begun < 3 * SECOND
+
+
 def test_another_format_is_not_other_code():
     """16x1 int16 at 35.61 Hz over the same wire."""
     fmt = SweepFormat(16, 1, 35.61, 128, "int16")

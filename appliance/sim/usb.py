@@ -27,13 +27,15 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
     """A pyusb backend with one board on it.
 
     errors: an errno that the next calls of a kind raise, by name
-    ("claim", "open", "read"). mangle: what the cable does to the bytes of a transfer.
+    ("claim", "open", "read"). mangle: what the cable does to the bytes of a transfer. halted: the bulk endpoint stalls
+    until it is cleared.
     """
 
     def __init__(self, board: Board, clock: Clock, *, acm: bool = False) -> None:
         self.board = board
         self.errors: dict[str, int] = {}
         self.mangle: Callable[[bytes], bytes] = lambda data: data
+        self.halted = False
         self.kernel_driver = acm
         self.acm = acm
         self._clock = clock
@@ -141,6 +143,11 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         """pyusb: take the board from the kernel's driver."""
         self.kernel_driver = False
 
+    def clear_halt(self, handle: str, ep: int) -> None:
+        """pyusb: let a stalled endpoint go on."""
+        self._touch("clear")
+        self.halted = False
+
     def ctrl_transfer(
         self, handle: str, kind: int, request: int, value: int, index: int, data: array[int], ms: int
     ) -> int:
@@ -172,6 +179,8 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         deadline_ns = self._clock.now_ns() + ms * 1_000_000
         while True:
             self._touch("read")
+            if self.halted:
+                raise usb.core.USBError("Pipe error", -9, errno.EPIPE)
             due_ns = self.board.due_ns()
             if self._pending or (due_ns is not None and due_ns <= self._clock.now_ns()):
                 return self._deliver(buff)
