@@ -7,7 +7,7 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools test-rig test-hw systemd soak \
+.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools test-rig test-hw systemd soak fuzz \
   wheel lock clean
 
 help: ## this list
@@ -48,6 +48,10 @@ test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/
 rig-tools: $(DESKTOP)
 	@lacking=`$(RIG) lacking`; [ -z "$$lacking" ] || { echo "installing $$lacking"; \
 	  $$( [ `id -u` = 0 ] || echo sudo ) apt-get install -y -q --no-install-recommends $$lacking; }
+
+fuzz: $(DESKTOP) ## fuzz all that comes from outside: MINUTES=10 of processor time each, TARGETS= some of them
+	$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install atheris==3.0.0
+	PYTHONPATH=tests $(BIN)/python -m fuzz $(TARGETS) --minutes $(or $(MINUTES),10)
 
 lint: $(DESKTOP) ## ruff
 	$(BIN)/ruff check .

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import re
+import sys
 import zipfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from . import features
 from .errors import BundleError, FormatError
+from .keys import typed
 from .sweep import SweepFormat
 
 try:  # not from hashlib: that loads OpenSSL, 4 MB for a function which Python has by itself
@@ -97,7 +98,7 @@ class Known:
 
 
 def _positive(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value) and value > 0  # type: ignore[arg-type,operator]
+    return type(value) in (int, float) and 0 < value <= sys.float_info.max  # type: ignore[operator]
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,15 +151,13 @@ class Manifest:
         """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong type."""
         try:
             raw = json.loads(text)
-            raw["format"] = SweepFormat(**raw["format"])
-            raw["thresholds"] = Thresholds(**raw["thresholds"])
-            raw["labels"] = tuple(raw["labels"])
-            if raw.get("early") is not None:
-                raw["early"] = Early(tuple(raw["early"].pop("least")), **raw["early"])
-            if raw.get("known") is not None:
-                raw["known"] = Known(**raw["known"])
-            return cls(**raw)
-        except (ValueError, KeyError, TypeError, AttributeError, FormatError) as e:
+            for name, kind in (("format", SweepFormat), ("thresholds", Thresholds), ("early", Early), ("known", Known)):
+                if raw.get(name) is not None:
+                    raw[name] = typed(kind, raw[name])
+            made = typed(cls, raw)
+            made.json()  # nested so deeply that it could not be written again after enrolment
+            return made
+        except (ValueError, TypeError, AttributeError, RecursionError, FormatError) as e:
             raise BundleError(f"manifest cannot be read: {e}; export the bundle again") from e
 
 

@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import IO
 
 from .errors import ConfigError, FormatError, SensorError, SensorMismatch
+from .keys import typed
 from .sensor import Stream, Tally
-from .sink import Command
+from .sink import COMMANDS, Command
 from .sweep import Frames, Sweep, SweepFormat, save
 from .trigger import Edge, EdgeKind
 from .wire import Identity
@@ -27,6 +28,8 @@ MAGIC = b"PPLPCAP1"
 _RECORD = struct.Struct("<BQI")
 _EDGE = struct.Struct("<QB")
 _KINDS = tuple(EdgeKind)
+_MOST_NS = 1 << 63
+"""Times are int64."""
 _KEPT = re.compile(r"sweep-[0-9]+\.(npy|json)(\.part)?")
 
 
@@ -134,8 +137,8 @@ class Playback:
             )
         begin = len(MAGIC) + 4 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 4], "little")
         try:
-            self.format = SweepFormat(**json.loads(data[len(MAGIC) + 4 : begin]))
-        except (ValueError, TypeError) as e:
+            self.format = typed(SweepFormat, json.loads(data[len(MAGIC) + 4 : begin]))
+        except (ValueError, TypeError, RecursionError) as e:
             raise FormatError(f"{path}: the capture's head cannot be read: {e}; capture again") from e
         self.state = "absent"
         self.trouble: SensorError | None = None
@@ -198,8 +201,18 @@ def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[Kind, int, byte
     while at + _RECORD.size <= len(data):
         kind, t_ns, size = _RECORD.unpack_from(data, at)
         body = data[at + _RECORD.size : at + _RECORD.size + size]
-        if kind >= len(Kind) or (kind == Kind.EDGES and size % _EDGE.size):
+        whole = len(body) == size
+        if kind >= len(Kind) or (whole and not _written(kind, t_ns, body)):
             raise FormatError(f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture again")
-        if len(body) == size:
+        if whole:
             yield Kind(kind), t_ns, body
         at += _RECORD.size + size
+
+
+def _written(kind: int, t_ns: int, body: bytes) -> bool:
+    """Whether a record is one that CaptureWriter writes."""
+    if kind == Kind.EDGES:
+        return not len(body) % _EDGE.size and all(k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body))
+    if kind == Kind.COMMAND:
+        return body.decode("ascii", "replace") in COMMANDS
+    return t_ns < _MOST_NS and (kind == Kind.TRANSFER or body.isalpha())

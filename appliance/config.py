@@ -37,7 +37,7 @@ class SensorConfig:
     serial: str = ""
     link: Literal["vendor", "acm"] = "vendor"
     read_bytes: int = number(4096, 512, 1 << 20, step=512)
-    timeout_ms: int = number(100, 1, 10_000)
+    timeout_ms: int = number(100, 1, 1_000)
     silence_ms: int = number(500, 1, 60_000)
     retry_ms: int = number(250, 1, 60_000)
 
@@ -198,7 +198,7 @@ def _read(path: Path, *, needed: bool) -> dict[str, Any]:
         raise ConfigError(f"{path}: no such file; check the path") from e
     except OSError as e:
         raise ConfigError(f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it") from e
-    except ValueError as e:  # of TOML, with the line, or of UTF-8
+    except (ValueError, RecursionError) as e:  # of TOML, with the line, or of UTF-8; brackets in brackets
         raise ConfigError(f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes") from e
 
 
@@ -206,7 +206,7 @@ def _board_file(folder: Path, board: Any, where: str) -> Path:
     boards = {path.stem.removeprefix("board-"): path for path in sorted(folder.glob("board-*.toml"))}
     if not (isinstance(board, str) and board in boards):
         there = ", ".join(boards) or "none"
-        raise ConfigError(f"{where}: board = {board!r} has no board-NAME.toml in {folder}; boards there: {there}")
+        raise ConfigError(f"{where}: board = {_shown(board)} has no board-NAME.toml in {folder}; boards there: {there}")
     return boards[board]
 
 
@@ -218,7 +218,7 @@ def _parse_set(text: str) -> dict[str, Any]:
         raise ConfigError(f"--set {text}: not understood; use --set section.key=value")
     try:
         (parsed,) = tomllib.loads(f"value = {value}").values()
-    except ValueError:
+    except (ValueError, RecursionError):
         parsed = value.strip()
     return {section: {key: parsed}}
 
@@ -229,14 +229,16 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
         if section not in _SECTIONS:
             raise _unknown(section, [*_SECTIONS, "board"], where)
         if not isinstance(content, dict):
-            raise ConfigError(f"{where}: {section} = {content!r} is not a section; write [{section}], its keys below")
+            raise ConfigError(
+                f"{where}: {section} = {_shown(content)} is not a section; write [{section}], its keys below"
+            )
         for last, value in content.items():
             name = f"{section}.{last}"
             if name not in _KEYS:
                 raise _unknown(name, [*_KEYS], where)
             fitted = _KEYS[name].fit(value)
             if fitted is None:
-                raise ConfigError(f"{where}: {name} = {value!r} is not allowed; use {_KEYS[name].allowed}")
+                raise ConfigError(f"{where}: {name} = {_shown(value)} is not allowed; use {_KEYS[name].allowed}")
             yield name, fitted
 
 
@@ -246,7 +248,16 @@ def _unknown(name: str, known: list[str], where: str) -> ConfigError:
     known = [k for k in known if k != name]
     near = [k for k in _KEYS if k.endswith(f".{last}")] or get_close_matches(name, known, 1, 0.5)
     hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-    return ConfigError(f"{where}: {name} is unknown; {hint}")
+    return ConfigError(f"{where}: {name if name.isprintable() else _shown(name)} is unknown; {hint}")
+
+
+def _shown(value: object) -> str:
+    """A value for a message of one line, cut where it is long."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a number of over 4300 digits; tables in tables
+        return "(too large to show)"
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:

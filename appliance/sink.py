@@ -7,9 +7,12 @@ not read costs dropped and counted sentences, and not one frame.
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import os
 import re
 import sys
+import termios
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,6 +33,8 @@ COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT")
 MAX_LINE = 128
 RETRY_NS = 1_000_000_000
 """How often a port that is gone is tried again."""
+PSEUDO_TERMINALS = range(136, 144)
+"""Their major device numbers."""
 _UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 
 
@@ -87,20 +92,29 @@ def result(v: Verdict, source: str) -> bytes:
     )  # fmt: skip
 
 
-def parse(data: bytes) -> tuple[list[Command], bytes]:
-    """Commands in `data` and the unfinished rest. A checksum may be left out by a person, but not be wrong."""
-    *lines, rest = re.split(rb"[\r\n]+", data)
-    commands = [_command(line) for line in lines if line]
-    if len(rest) > MAX_LINE:
-        return [*commands, Command("", f"line of over {MAX_LINE} characters without an end")], b""
-    return commands, rest
+def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
+    """Commands in `data`, which goes on where `rest` ended, and the new unfinished rest.
+
+    A checksum may be left out by a person, but not be wrong. One Command a line, however it is cut: a line of over
+    MAX_LINE characters is told once; the rest then holds one more than these, so that its end is not taken for a line.
+    """
+    told = len(rest) > MAX_LINE
+    *lines, rest = re.split(rb"[\r\n]+", rest + data)
+    commands = [_command(line) for line in lines[told:] if line]
+    if len(rest) > MAX_LINE and (lines or not told):
+        commands.append(_command(rest))
+    return commands, rest[: MAX_LINE + 1]
 
 
 def _command(line: bytes) -> Command:
-    match = re.fullmatch(r"\$?PPLP,([^*,]*)(?:\*([0-9A-Fa-f]{2}))?", line.decode("ascii", "replace").strip())
+    if len(line) > MAX_LINE:
+        return Command("", f"line of over {MAX_LINE} characters without an end")
+    # a name of letters only: it is sent back, and what noise held in its place could take the answer's fields away
+    # a sentence begins at its $: what noise or a break has left before it is no part of it
+    match = re.fullmatch(rb"(?s:.*\$)?PPLP,([A-Za-z]{0,16})(?:\*([0-9A-Fa-f]{2}))?", line.strip())
     if not match:
         return Command("", f"not a command; send for example $PPLP,ID*{checksum('PPLP,ID')}")
-    name, given = match.groups()
+    name, given = (group.decode("ascii") for group in match.groups(b""))
     if given and given.upper() != checksum(f"{TALKER},{name}"):
         return Command(name, f"checksum {given} should be {checksum(f'{TALKER},{name}')}")
     if name not in COMMANDS:
@@ -170,13 +184,13 @@ class SerialSink:
         if not self._port:
             return []
         try:
-            self._rest += os.read(self._port.fileno(), 4096)
+            data = os.read(self._port.fileno(), 4096)
         except BlockingIOError:
             return []
         except OSError as e:
             self._lose(e)
             return []
-        found, self._rest = parse(self._rest)
+        found, self._rest = parse(data, self._rest)
         return found
 
     def close(self) -> None:
@@ -184,6 +198,9 @@ class SerialSink:
         if self._port:
             port, self._port = self._port, None
             with contextlib.suppress(OSError):  # a port that is gone cannot be closed properly
+                # another program may have it open from before us; then this outlives us, and would keep us out, too
+                fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
+            with contextlib.suppress(OSError):
                 port.close()
 
     def _flush(self) -> None:
@@ -208,12 +225,14 @@ class SerialSink:
             return False
         self._retry_ns = now + RETRY_NS
         try:
-            self._port = self._opener(self._config.port, self._config.baud, timeout=0, write_timeout=0, exclusive=True)
+            port = self._opener(self._config.port, self._config.baud, timeout=0, write_timeout=0, exclusive=True)
+            _keep_others_out(port.fileno())
         except (OSError, ValueError) as e:  # SerialException is an OSError
-            self.trouble = f"serial port {self._config.port} cannot be opened: {e}; check serial.port and group dialout"
+            held = getattr(e, "errno", None) in (errno.EBUSY, errno.EAGAIN)
+            advice = "end the program that has it (fuser tells)" if held else "check serial.port and group dialout"
+            self.trouble = f"serial port {self._config.port} cannot be opened: {e}; {advice}"
             return False
-        self.trouble = ""
-        self._rest = b""
+        self._port, self.trouble, self._rest = port, "", b""
         return True
 
     def _lose(self, e: OSError) -> None:
@@ -221,6 +240,15 @@ class SerialSink:
         self.close()
         self._begun = 0
         self._retry_ns = self._clock.now_ns() + RETRY_NS
+
+
+def _keep_others_out(port: int) -> None:
+    """Nobody but root may open `port` from now on: who reads it takes commands away, and a lock binds only who asks.
+
+    Not a pseudo-terminal: it would stay shut, also for us, if we were killed while its other end is open.
+    """
+    if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
+        fcntl.ioctl(port, termios.TIOCEXCL)
 
 
 class LineSink:

@@ -13,18 +13,24 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import FormatError
+from .keys import typed
 
 DIGITS = ("uint8", "int16", "uint16", "float32")
 """Digit types of a taxel; the position in this tuple is the code on the wire (PROTOCOL.md)."""
 
 EPOCH_BITS = 40
 """An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`: frames of two plug-ins never look adjacent."""
+
+
+UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
+"""What numpy makes of a broken .npy, beside OSError; the last where it names a size that no machine has."""
 
 
 class Status(StrEnum):
@@ -73,8 +79,8 @@ class SweepFormat:
             raise FormatError(f"digit type {self.dtype!r} is unknown; use one of {', '.join(DIGITS)}")
         if not (1 <= self.rows <= 255 and 1 <= self.cols <= 255):
             raise FormatError(f"a grid of {self.rows} x {self.cols} taxels is out of range; use 1 to 255 each way")
-        if not 0 < self.rate_hz <= 1e6:
-            raise FormatError(f"a rate of {self.rate_hz} Hz is out of range; use more than 0, at most 1e6")
+        if not 1e-3 <= self.rate_hz <= 1e6:  # a board tells thousandths
+            raise FormatError(f"a rate of {self.rate_hz} Hz is out of range; use 0.001 to 1e6")
         if self.window < 1:
             raise FormatError(f"a window of {self.window} frames is empty; use at least 1")
 
@@ -213,16 +219,14 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
     try:
         about = json.loads(path.with_suffix(".json").read_text())
         table = np.load(path, allow_pickle=False)
-        fmt = SweepFormat(**about.pop("format"))
+        fmt = typed(SweepFormat, about.pop("format"))
         schema = about.pop("schema")
         status = Status(about.pop("status"))
         if schema != 1:
-            raise FormatError(
-                f"{path}: schema {schema} is unknown to this version, which reads 1; update the appliance"
-            )
+            raise FormatError(f"schema {schema!r} is unknown to this version, which reads 1; update the appliance")
         if table.dtype != _record_dtype(fmt) or table.ndim != 1:
-            raise FormatError(f"{path}: records of {table.dtype} do not fit the format {fmt} of its sidecar")
+            raise FormatError(f"records of {table.dtype} do not fit the format {fmt} of its sidecar")
         frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
-        return Sweep(status=status, frames=frames, **about), fmt
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as e:
+        return typed(Sweep, about | {"status": status, "frames": frames}), fmt
+    except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
         raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e

@@ -99,6 +99,7 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
         ("[trigger]\nmode = 'both'", "trigger.mode = 'both'", 'one of "two-lines", "one-line"'),
         ("[trigger]\nbias = ['pull-up']", "trigger.bias = ['pull-up']", 'one of "pull-down", "pull-up"'),
         ("[trigger]\nstart = 17", "trigger.start = 17", "a string in quotes"),
+        ('[trigger]\nstart = "a\\u0000"', "trigger.start = 'a\\x00'", "without control characters"),
         ("[output]\nclass_bits = 'GPIO16'", "output.class_bits = 'GPIO16'", 'names such as ["GPIO16"]'),
         ("[output]\nclass_bits = ['A', '']", "output.class_bits = ['A', '']", 'names such as ["GPIO16"]'),
         ("[sweep]\nlongest_s = nan", "sweep.longest_s = nan", "a number from 0.1 to 3600.0"),
@@ -145,7 +146,7 @@ def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint:
         ("sweep.longest_s=3", "sweep", "longest_s", 3.0),
         ('output.class_bits=["A", "B"]', "output", "class_bits", ("A", "B")),
         ("serial.port=/dev/ttyS0 # not a comment", "serial", "port", "/dev/ttyS0 # not a comment"),
-        ('serial.port="a"\nx=1', "serial", "port", '"a"\nx=1'),
+        ('serial.port="a" x=1', "serial", "port", '"a" x=1'),
     ],
 )
 def test_set_takes_toml_or_a_bare_string(folder: Path, option: str, section: str, key: str, value: object) -> None:

@@ -1,8 +1,10 @@
 """The sinks: sentences that others can read, a port that is never waited for, class bits that settle first."""
 
+import fcntl
 import itertools
 import os
 import re
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance import sink as sink_room
 from appliance.config import OutputConfig, SerialConfig
 from appliance.errors import ConfigError
 from appliance.lines import Lines
@@ -30,6 +33,8 @@ from appliance.sink import (
 )
 from appliance.sweep import Status, Verdict
 
+TIOCGEXCL = 0x80045440
+"""Asks whether a terminal is shut to others (asm-generic/ioctls.h)."""
 PROTOCOL = (Path(__file__).parent.parent / "firmware_config" / "PROTOCOL.md").read_text()
 
 
@@ -83,11 +88,13 @@ def test_checksums_agree(text: str):
         (b"$PPLP,ID*" + checksum("PPLP,ID").encode(), Command("ID")),
         (b"$PPLP,TARE", Command("TARE")),
         (b"PPLP,NEW", Command("NEW")),
+        (b"\0$PPLP,ID", Command("ID")),
+        (b"$PPLP,TAR\xff$PPLP,ABORT", Command("ABORT")),
         (b"$PPLP,ABORT*" + checksum("PPLP,ABORT").lower().encode(), Command("ABORT")),
     ],
 )
 def test_commands_are_read(line: bytes, want: Command):
-    """With checksum or without, as a program or a person sends it."""
+    """With checksum or without, as a program or a person sends it; what a break or noise left before the $ is nothing."""
     assert parse(line + b"\r\n") == ([want], b"")
 
 
@@ -109,21 +116,22 @@ def test_bad_commands_are_answered(line: bytes, hint: str):
 
 
 def test_a_line_without_end_is_dropped():
-    """Noise without a line end does not pile up."""
-    (command,), rest = parse(b"x" * (MAX_LINE + 1))
+    """Noise without a line end is told once and does not pile up."""
+    (command,), rest = parse(b"x" * 1000)
     assert "without an end" in command.error
-    assert rest == b""
+    assert len(rest) == MAX_LINE + 1
+    assert parse(b"x" * 1000, rest) == ([], rest)
+    # its end is not a line of its own
+    assert parse(b"PPLP,ABORT\nPPLP,ID\n", rest) == ([Command("ID")], b"")
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 300), max_size=5))
 def test_parse_never_raises_and_splits_anywhere(data: bytes, cuts: list[int]):
     """Any bytes, cut anywhere, give the same commands as at once."""
-    if len(data) > MAX_LINE:
-        data = data[:MAX_LINE]
     edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
     rest, got = b"", []
     for a, b in itertools.pairwise(edges):
-        found, rest = parse(rest + data[a:b])
+        found, rest = parse(data[a:b], rest)
         got += found
     assert (got, rest) == parse(data)
 
@@ -207,8 +215,35 @@ def test_a_port_that_another_program_holds():
         first.commands()
         second.commands()
         # root may open a port that is held exclusively (TIOCEXCL), so flock has to tell
-        assert second.trouble
+        assert "end the program that has it" in second.trouble
         first.close()
+
+
+def is_shut(port: int) -> bool:
+    """Whether the kernel refuses a port to all but root."""
+    return bool(struct.unpack("i", fcntl.ioctl(port, TIOCGEXCL, bytes(4)))[0])
+
+
+def test_a_port_is_kept_from_others(monkeypatch: pytest.MonkeyPatch):
+    """While the box has a port the kernel refuses it to others; when it is closed it is free, also if one had it open."""
+    monkeypatch.setattr(sink_room, "PSEUDO_TERMINALS", range(0))
+    with terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
+        sink = sink_on(name)
+        assert not is_shut(other.fileno())
+        sink.commands()
+        assert is_shut(other.fileno())
+        sink.close()
+        assert not is_shut(other.fileno())
+
+
+def test_a_pseudo_terminal_is_not_shut():
+    """It would stay so, also for the box, when the box is killed while the other end is open."""
+    with terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
+        sink = sink_on(name)
+        sink.commands()
+        assert sink.trouble == ""
+        assert not is_shut(other.fileno())
+        sink.close()
 
 
 def test_an_opener_that_refuses():

@@ -24,8 +24,6 @@ HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
 """Rate of the TactMat data, which neither the file nor the page it is published on names: that of the same laboratory's
 skin in the paper (sec. II.A). A `rate_hz` in the file goes before it."""
-NAMED = {"material": str, "position": str, "session": str, "object": int}
-"""What a recording's sidecar says of it, for labels and groups."""
 
 
 def read(path: Path, kind: type[Set]) -> Set:
@@ -144,9 +142,6 @@ def recordings(folder: Path, kind: type[Set]) -> Set:
 def _check(path: Path, sweep: Sweep, fmt: SweepFormat, wanted: SweepFormat) -> None:
     if fmt != wanted or len(sweep.frames) != fmt.window:
         raise FormatError(f"{path}: {len(sweep.frames)} frames of {fmt}; others have {wanted}: give each its folder")
-    for name, kind in NAMED.items():
-        if not isinstance(value := getattr(sweep, name), kind):
-            raise FormatError(f"{path}: its {name} is {value!r}; write {'text' if kind is str else 'a whole number'}")
     if not sweep.material:
         raise FormatError(f'{path}: has no material; write it into {path.with_suffix(".json").name}, "material": "…"')
 

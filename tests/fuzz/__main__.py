@@ -1,0 +1,111 @@
+"""Runs the fuzzing: `python -m fuzz [TARGET ...] --minutes N`. In: targets, CPU minutes for each, a seed. Out: a line
+of figures for each target, the smallest corpus that covers as much, and in crashes/ whatever broke a promise.
+
+What it learns lies in build/fuzz/ and is taken up again by the next run, also by one after an interruption.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import resource
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import rmtree
+
+from fuzz import corpus, seeds
+from fuzz.targets import TARGETS
+
+WORK = seeds.ROOT / "build" / "fuzz"
+LONGEST_INPUT = 5000
+"""Bytes of an input: the largest packet there can be, and something around it."""
+LONGEST_SAVED = 1024
+"""Bytes of an input that is saved: longer ones do the same things more often."""
+OPTIONS = (f"-max_len={LONGEST_INPUT}", "-timeout=10", "-print_final_stats=1", "-reload=0")
+"""An input that takes ten seconds is a crash, too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What one run of libFuzzer said. coverage: places of the instrumented code. features: places with their counts."""
+
+    executions: int
+    coverage: int
+    features: int
+    cpu_s: float
+    crashes: list[Path]
+
+
+def main() -> int:
+    """Fuzz the named targets, or all, one after another; 1 where a promise was broken."""
+    parser = argparse.ArgumentParser(prog="fuzz", description=__doc__.split("\n\n")[0])
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"from {', '.join(TARGETS)}; all by default")
+    parser.add_argument(
+        "--minutes", type=float, default=10, help="processor time for each target, 0 only to merge (%(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of the generator (%(default)s)")
+    given = parser.parse_args()
+    if wrong := set(given.targets) - set(TARGETS):
+        parser.error(f"no target {', '.join(sorted(wrong))}; there are {', '.join(TARGETS)}")
+    return max([fuzz(target, given.minutes, given.seed) for target in given.targets or TARGETS])
+
+
+def fuzz(target: str, minutes: float, seed: int) -> int:
+    """Fuzz one target, save what it learned, and print the figures."""
+    place, inputs = WORK / target, WORK / target / "inputs"
+    inputs.mkdir(parents=True, exist_ok=True)
+    for data in [*corpus.load(target), *seeds.SEEDS[target]()]:
+        (inputs / corpus.name(data)).write_bytes(data)
+    words = ("".join(f"\\x{byte:02x}" for byte in word) for word in seeds.words(target))
+    (place / "words").write_text("".join(f'"{word}"\n' for word in words), "ascii")
+    before = _engine(target, 0, "-runs=0", inputs)
+    run = _engine(
+        target, minutes * 60, f"-runs={-1 if minutes else 0}", f"-seed={seed}", f"-dict={place / 'words'}", inputs
+    )
+    smallest = place / "smallest"
+    rmtree(smallest, ignore_errors=True)
+    smallest.mkdir()
+    _engine(target, 0, "-merge=1", smallest, inputs)
+    kept = [file.read_bytes() for file in smallest.iterdir() if file.stat().st_size <= LONGEST_SAVED]
+    corpus.save(target, kept)
+    print(
+        f"{target}: {run.executions} executions in {run.cpu_s:.0f} s of processor time, {run.executions / run.cpu_s:.0f}/s; "
+        f"coverage {before.coverage} -> {run.coverage}, features {before.features} -> {run.features}; "
+        f"corpus {len(kept)} inputs, {sum(map(len, kept))} bytes; crashes {len(run.crashes)}",
+        flush=True,
+    )
+    for crash in run.crashes:
+        print(f"{target}: a promise was broken by {crash}; mend it, name the file, add it to tests/test_fuzz.py")
+    return 1 if run.crashes else 0
+
+
+def _engine(target: str, seconds: float, *options: object) -> Run:
+    """One fuzzing process, to its end; seconds: of its processor time, 0 for no limit."""
+    found = WORK / target / "found"
+    rmtree(found, ignore_errors=True)
+    found.mkdir()
+    command = [sys.executable, "-m", "fuzz.engine", target, str(seconds), *OPTIONS, f"-artifact_prefix={found}/"]
+    begin = _cpu_s()
+    log = WORK / target / "log"
+    with log.open("wb") as file:
+        done = subprocess.run([*command, *map(str, options)], stdout=file, stderr=file, check=False)
+    text = log.read_text("utf-8", "replace")
+    broke = [corpus.keep_crash(target, file.read_bytes()) for file in sorted(found.iterdir())]
+    if done.returncode and not broke:
+        raise SystemExit(f"{target}: the fuzzer ended with {done.returncode}; see {log}\n{text[-2000:]}")
+    states = re.findall(r"cov: (\d+) ft: (\d+)", text) or [("0", "0")]
+    count = re.findall(r"number_of_executed_units: (\d+)|^#(\d+)", text, re.MULTILINE) or [("0", "0")]
+    executions = max(int(a or b) for a, b in count)
+    return Run(executions, *map(int, states[-1]), _cpu_s() - begin, broke)
+
+
+def _cpu_s() -> float:
+    """Processor seconds of all fuzzing processes so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+if __name__ == "__main__":
+    sys.exit(main())

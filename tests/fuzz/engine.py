@@ -1,0 +1,48 @@
+"""One fuzzing process: Atheris (libFuzzer) drives one target. In: the target's name, CPU seconds, libFuzzer's options.
+
+It is started by the runner, since libFuzzer ends the process that it runs in.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import sys
+import time
+from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+
+import atheris
+
+with atheris.instrument_imports(include=["appliance", "tomllib"]):
+    from fuzz import targets
+from fuzz.mutators import MUTATORS
+
+MEMORY = 1 << 30
+"""Bytes that a process may ask for; an input that makes the box ask for more ends in a MemoryError, which is a crash."""
+
+
+def main(name: str, seconds: float, *options: str) -> None:
+    """Fuzz a target for so much CPU time; libFuzzer prints what it does on standard error."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    target, mutate = targets.TARGETS[name], MUTATORS[name]
+    with TemporaryDirectory(prefix=f"fuzz-{name}-") as folder:
+        place = Path(folder)
+
+        def mutator(data: bytes, most: int, seed: int) -> bytes:
+            return mutate(data, Random(seed), lambda part: atheris.Mutate(part, most))[:most]
+
+        def once(data: bytes) -> None:
+            target(data, place)
+            if 0 < seconds < time.process_time():  # not by the clock: a busy machine takes nothing away
+                os.kill(os.getpid(), signal.SIGUSR1)  # libFuzzer's clean end
+
+        again = f"{sys.executable} -m fuzz.engine {name} {seconds}"  # how libFuzzer starts itself to merge
+        atheris.Setup([again, *options], once, custom_mutator=mutator)
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], float(sys.argv[2]), *sys.argv[3:])

@@ -1,0 +1,174 @@
+"""What must hold of files: a site file, a bundle's manifest, a recorded sweep (.npy with its .json), a capture. In: any
+bytes, and a folder that they are written to. Out: nothing, or an error where a promise is broken, as in `targets`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import tomllib
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from itertools import pairwise
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appliance import bundle, capture, config, sink, sweep
+from appliance.errors import BundleError, ConfigError, FormatError
+
+BOARD = '[trigger]\nstart = "GPIO5"\nstop = "GPIO6"\n'
+NPY = b"\x93NUMPY"
+
+
+def one_line(error: Exception) -> str:
+    """The message, which a person can read as one line of a terminal or a journal."""
+    text = str(error)
+    assert text.isprintable(), f"message is not one printable line: {text!r}"
+    return text
+
+
+def settings(data: bytes, folder: Path) -> None:
+    """config.load: a site file is a Config within its limits that is described and loads again, or a ConfigError."""
+    site = folder / "palpate.toml"
+    (folder / "board-a.toml").write_text(BOARD)
+    site.write_bytes(data)
+    try:
+        got = config.load(None, folder=folder, site=site)
+    except ConfigError as e:
+        _names_the_place(one_line(e), data)
+        return
+    for name, value, field, hint in _values(got):
+        assert got.sources[name] in ("code", site.name, "board-a.toml")
+        least, most = field.metadata.get("least"), field.metadata.get("most")
+        if least is not None:
+            assert type(value) is type(field.default), f"{name} = {value!r}"
+            assert least <= value <= most, f"{name} = {value!r}"
+            assert not value % field.metadata.get("step", 1) or "step" not in field.metadata
+        for text in value if isinstance(value, tuple) else (value,):
+            assert not isinstance(text, str) or text.isprintable(), f"{name} = {value!r} cannot be shown"
+        assert "Literal" not in hint or repr(value) in hint.replace('"', "'"), f"{name} = {value!r}"
+    lines = config.describe(got)
+    assert len(lines.splitlines()) == len(got.sources)
+    site.write_text(lines, "utf-8")
+    assert config.load(None, folder=folder, site=site) == got, "what describe says loads as something else"
+
+
+def _values(got: config.Config) -> Iterator[tuple[str, Any, Any, str]]:
+    """(name, value, field, its type as written) of all settings."""
+    for section in fields(got):
+        group = getattr(got, section.name)
+        if is_dataclass(group):
+            for field in fields(group):
+                yield f"{section.name}.{field.name}", getattr(group, field.name), field, str(field.type)
+
+
+def _names_the_place(message: str, data: bytes) -> None:
+    """A message names the file, and one of the keys in it where it is TOML at all."""
+    assert "palpate.toml" in message, message
+    try:
+        table = tomllib.loads(data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n"))
+    except (ValueError, RecursionError):
+        assert "not TOML" in message, message
+        return
+    assert any(key in message or repr(key)[1:-1] in message for key in table), message
+
+
+def manifest(data: bytes, folder: Path) -> None:
+    """bundle.load: a manifest.json beside the default bundle's other files is a usable Bundle, or a BundleError."""
+    for name in (bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
+        if not (folder / name).exists():
+            (folder / name).symlink_to(bundle.DEFAULT / name)
+    (folder / bundle.MANIFEST).write_bytes(data)
+    try:
+        read = bundle.Manifest.parse(data)
+        _usable(read)
+        got = bundle.load(folder)
+    except BundleError as e:
+        one_line(e)
+        return
+    assert got.manifest == read or read != read, "two readings of one manifest differ"  # NaN among the figures
+    assert re.fullmatch("[0-9a-f]{8}", got.id)
+    assert set(got.enrolled) <= set(read.labels)
+    assert got.golden.shape[1:] == (read.format.window, read.format.rows, read.format.cols)
+
+
+def _usable(read: bundle.Manifest) -> None:
+    """What the rooms behind do with a manifest cannot fail."""
+    f = read.format
+    for value in (f.rows, f.cols, f.window, read.schema, read.thresholds.dead_taxels):
+        assert type(value) is int, f"{value!r} is no whole number"
+        assert abs(value) < 1 << 63
+    limits = [getattr(read.thresholds, field.name) for field in fields(read.thresholds)]
+    for value in (f.rate_hz, *limits):
+        assert type(value) in (int, float), f"{value!r} is no number"
+        assert isfinite(value)
+    for text in (read.name, read.version, read.input, *read.labels):
+        assert isinstance(text, str)
+        assert text.isprintable(), f"{text!r} cannot be shown"
+    for label in read.labels:
+        assert f",{label},".encode("ascii") in sink.sentence("RES", 1, label, "")
+    for entry in read.files.values():
+        assert isinstance(entry, dict)
+    assert isinstance(read.figures, dict)
+    again = read.json()
+    assert json.loads(again).keys() == {field.name for field in fields(read)}
+    assert bundle.Manifest.parse(again).json() == again, "what a manifest writes reads as something else"
+
+
+def recording(data: bytes, folder: Path) -> None:
+    """sweep.load: a sidecar and what begins with numpy's magic are a Sweep that saves and loads again, or a FormatError."""
+    about, magic, table = data.partition(NPY)
+    (folder / "sweep.json").write_bytes(about)
+    (folder / "sweep.npy").write_bytes(magic + table)
+    try:
+        got, fmt = sweep.load(folder / "sweep.npy")
+    except FormatError as e:
+        message = one_line(e)
+        assert "sweep.npy" in message
+        return
+    n = len(got.frames.t_ns)
+    assert got.frames.seq.shape == got.frames.t_ns.shape == (n,)
+    assert got.frames.taxels.shape == (n, fmt.rows, fmt.cols)
+    assert np.zeros((fmt.rows, fmt.cols)).size * fmt.period_ns > 0
+    for number in (got.id, got.start_ns, got.stop_ns, got.lost, got.complete_ns, got.object):
+        assert type(number) is int, f"{number!r} is no whole number"
+    for text in (got.material, got.position, got.session):
+        assert type(text) is str
+        assert text.isprintable(), f"{text!r} cannot be shown"
+    assert isinstance(got.share, (int, float))
+    sweep.save(folder / "again.npy", got, fmt)
+    again, form = sweep.load(folder / "again.npy")
+    assert form == fmt
+    assert again.frames.taxels.tobytes() == got.frames.taxels.tobytes()
+    assert dataclasses.replace(again, frames=got.frames) == got
+
+
+def played(data: bytes, folder: Path) -> None:
+    """capture.Playback: a file plays to its end in as many turns as it has records, or is a FormatError."""
+    file = folder / "capture"
+    file.write_bytes(data)
+    try:
+        play = capture.Playback(file)
+    except FormatError as e:
+        one_line(e)
+        return
+    numbers: list[int] = []
+    for _ in range(len(data)):  # a record takes more than one byte
+        if play.finished:
+            break
+        frames = play.read()
+        numbers += frames.seq.tolist()
+        assert frames.t_ns.dtype == np.int64
+        assert frames.taxels.shape[1:] == (play.format.rows, play.format.cols)
+        for edge in play.edges(play.now_ns()):
+            assert 0 <= edge.t_ns < 1 << 63, f"an edge at {edge.t_ns} ns"
+        for told in play.commands():
+            assert told.name in sink.COMMANDS, f"{told.name!r} is no command"
+        assert play.state.isprintable(), f"{play.state!r} cannot be shown"
+        assert 0 <= play.now_ns() < 1 << 63
+    assert play.finished, "it does not come to an end"
+    assert all(a < b for a, b in pairwise(numbers)), "numbers of frames do not rise"

@@ -1,0 +1,123 @@
+"""Changes that keep a format's form, so that they come past its checksums and brackets. In: an input, a generator, and
+the fuzzer's own mutator. Out: another input.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zlib
+from collections.abc import Callable
+from random import Random
+from typing import Any
+
+from appliance import sink, wire
+
+Plain = Callable[[bytes], bytes]
+Mutator = Callable[[bytes, Random, Plain], bytes]
+
+ODD: tuple[Any, ...] = (
+    None, True, False, 0, 1, -1, 2, 4, 4.0, 1500.0, 10**400, 1e-320, float("nan"), float("inf"), "", "a", "\n", "\ud800",
+    "x" * 300, [], {}, [[]], {"a": {}}, "means.npz", "raw", "L",
+)  # fmt: skip
+
+
+def packets(data: bytes, random: Random, plain: Plain) -> bytes:
+    """Packets left out, repeated or put elsewhere, bytes changed, and then most checksums made right again."""
+    pieces = [p for p in re.split(rb"(?=\x50\xc1)", data) if p]
+    if pieces and random.random() < 0.3:
+        piece = random.choice(pieces)
+        pieces.insert(random.randrange(len(pieces) + 1), piece)
+        if random.random() < 0.5:
+            pieces.remove(random.choice(pieces))
+        data = b"".join(pieces)
+    else:
+        data = plain(data)
+    changed = bytearray(data)
+    for start in [m.start() for m in re.finditer(re.escape(wire.MAGIC), data)]:
+        end = start + wire.HEADER.size + int.from_bytes(changed[start + 4 : start + 6], "little")
+        if end + 4 <= len(changed) and random.random() < 0.9:
+            changed[end : end + 4] = zlib.crc32(changed[start:end]).to_bytes(4, "little")
+    return bytes(changed)
+
+
+def sentences(data: bytes, random: Random, plain: Plain) -> bytes:
+    """Bytes changed, and then most checksums made right again."""
+
+    def seal(match: re.Match[bytes]) -> bytes:
+        right = sink.checksum(match[1].decode("latin-1").encode("ascii", "replace").decode())
+        return match[0] if random.random() < 0.2 else b"$" + match[1] + b"*" + right.encode()
+
+    return re.sub(rb"\$([^*\r\n]*)\*..", seal, plain(data))
+
+
+def tables(data: bytes, random: Random, plain: Plain) -> bytes:
+    """Lines left out, repeated or put elsewhere, or bytes changed."""
+    lines = data.split(b"\n")
+    if random.random() < 0.5:
+        return plain(data)
+    line = lines.pop(random.randrange(len(lines)))
+    line = plain(line) if random.random() < 0.5 else line
+    for _ in range(random.randrange(3)):
+        lines.insert(random.randrange(len(lines) + 1), line)
+    return b"\n".join(lines)
+
+
+def trees(data: bytes, random: Random, plain: Plain) -> bytes:
+    """One place in the JSON gets an odd value, another place's value or another name, or is left out; or bytes change."""
+    try:
+        tree = json.loads(data)
+    except (ValueError, RecursionError):
+        return plain(data)
+    places = list(_places(tree))
+    if not places or random.random() < 0.2:
+        return plain(data)
+    for _ in range(1 + random.randrange(2)):
+        branch, key = random.choice(places)
+        other, name = random.choice(places)
+        if isinstance(branch, dict) and random.random() < 0.2:
+            branch[str(name)] = branch.pop(key, None)
+        elif isinstance(branch, dict) and random.random() < 0.2:
+            branch.pop(key, None)
+        elif isinstance(branch, dict) or key < len(branch):
+            value = random.choice((random.choice(ODD), other.get(name) if isinstance(other, dict) else name))
+            branch[key] = value if value is not branch else None
+    try:
+        return json.dumps(tree).encode()
+    except ValueError:  # a branch that holds itself
+        return plain(data)
+
+
+def headed(data: bytes, random: Random, plain: Plain) -> bytes:
+    """The JSON at the head changed as `trees` does, or the bytes after it; a length before it is made right again."""
+    start, end = data.find(b"{"), data.find(b"}\x93") + 1 or data.find(b"}") + 1
+    if not 0 <= start < end or random.random() < 0.3:
+        return plain(data)
+    head, rest = data[start:end], data[end:]
+    if random.random() < 0.6:
+        head = trees(head, random, plain)
+    else:
+        rest = plain(rest)
+    length = len(head).to_bytes(4, "little") if start >= 4 else b""
+    return data[: start - len(length)] + length + head + rest
+
+
+def _places(tree: Any) -> Any:
+    """(branch, key) of every value, down to the tenth level."""
+    stack = [(tree, 0)]
+    while stack:
+        branch, depth = stack.pop()
+        if isinstance(branch, (dict, list)) and depth < 10:
+            for key in list(branch) if isinstance(branch, dict) else range(len(branch)):
+                yield branch, key
+                stack.append((branch[key], depth + 1))
+
+
+MUTATORS: dict[str, Mutator] = {
+    "unpack": packets,
+    "command": sentences,
+    "settings": tables,
+    "manifest": trees,
+    "recording": headed,
+    "capture": headed,
+}

@@ -1,0 +1,141 @@
+"""Where each target begins, and the words that its format knows. In: the simulator, PROTOCOL.md, the board files and the
+default bundle. Out: inputs and dictionary words, both bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from appliance import bundle, config, sink, wire
+from appliance.capture import MAGIC, CaptureWriter
+from appliance.sim import script, skin
+from appliance.sweep import DIGITS, Frames, Status, Sweep, SweepFormat, save
+from appliance.trigger import Edge, EdgeKind
+from fuzz.files import NPY
+
+ROOT = Path(__file__).parents[2]
+ENDLESS = wire.HEADER.pack(wire.MAGIC, wire.VERSION, wire.Kind.REPLY, wire.MAX_PAYLOAD, 0, 1, 0, 0, 0, 0, 0)
+"""The header of the largest packet there can be; what follows waits for its end."""
+
+
+def unpack() -> list[bytes]:
+    """Packets of a simulated sweep, of other skins, of a board that starts anew, and broken ones."""
+    frames = next(iter(script.tubes(1, 1))).frames[:60]
+    sent = [wire.pack(2**32 - 12 + 6 * i, 2**32 - 16_000 + 8000 * i, frames[6 * i : 6 * i + 6]) for i in range(5)]
+    others = [wire.pack(7, 9, np.arange(12).reshape(2, 2, 3).astype(d), wire.Flag.OVERFLOW) for d in DIGITS]
+    who = wire.pack_identity(wire.Identity(1, (1, 2, 3), "Palpate skin", "0042"))
+    form = wire.pack_format(wire.SkinFormat(4, 4, "uint8", 750, 750, 6))
+    replies = wire.pack_reply(wire.Request.IDENTITY, who) + wire.pack_reply(wire.Request.FORMAT, form)
+    restarted = wire.pack(900_000, 5, frames[:1]) + wire.pack(0, 6, frames[1:2])
+    swapped = sent[0] + sent[2] + sent[1] + sent[1]
+    broken = sent[0][:60] + sent[1] + b"\x50" + sent[2][:-1] + b"\0" + sent[3]
+    newer = wire.pack_reply(wire.Request.IDENTITY, b"\x09", version=9)
+    largest = wire.pack(1, 2, np.zeros((wire.MAX_FRAMES, 4, 4), np.uint8))
+    return [
+        b"".join(sent),
+        largest,
+        swapped,
+        restarted,
+        replies,
+        newer + sent[0],
+        who,
+        form,
+        broken,
+        *others,
+        ENDLESS + sent[0],
+    ]
+
+
+def command() -> list[bytes]:
+    """Each command as a program and as a person sends it, the document's sentences, and lines that are none."""
+    sealed = [sink.sentence(name) for name in sink.COMMANDS]
+    protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
+    written = [s.encode() + b"\r\n" for s in re.findall(r"`(\$PPLP[^`]*)`", protocol)]
+    by_hand = [b"PPLP," + name.encode() + b"\n" for name in sink.COMMANDS]
+    return [b"".join(sealed), b"".join(by_hand), *sealed, *written, b"$PPLP,ID*00\r\n", b"x" * 130 + b"\nPPLP,NEW\n"]
+
+
+def settings() -> list[bytes]:
+    """The files that come with the box without their comments, and all settings as `palpate config` prints them."""
+    files = sorted((ROOT / "firmware_config").glob("*.toml"))
+    values = ["".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files]
+    whole = config.describe(config.load(None, site=Path("/dev/null")))
+    return [text.encode() for text in (*values, whole, 'board = "a"\n[sweep]\nlongest_s = 3\n')]
+
+
+def manifest() -> list[bytes]:
+    """The default bundle's manifest, the least of it, and its older form."""
+    whole = (bundle.DEFAULT / bundle.MANIFEST).read_bytes()
+    least = json.loads(whole) | {"figures": {}, "made": {}}
+    older = {k: v for k, v in least.items() if k not in ("early", "known")} | {"schema": 1}
+    older["files"] = {name: entry for name, entry in least["files"].items() if name != bundle.MEANS}
+    return [whole, *(json.dumps(m).encode() for m in (least, older))]
+
+
+def recording() -> list[bytes]:
+    """Two recordings of four frames, of two skins: each its sidecar, then its records."""
+    found, n = [], np.arange(4)
+    for fmt in (SweepFormat(2, 2, 100.0, 4, "int16"), SweepFormat(1, 1, 35.61, 4, "uint8")):
+        taxels = np.arange(4 * fmt.rows * fmt.cols).reshape(4, fmt.rows, fmt.cols).astype(fmt.digits)
+        sweep = Sweep(1, 0, 40_000_000, Status.OK, Frames(n, n, taxels), material="wood", session="a")
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "sweep.npy"
+            save(path, sweep, fmt)
+            found.append(path.with_suffix(".json").read_bytes() + path.read_bytes())
+    return found
+
+
+def capture() -> list[bytes]:
+    """A capture with a record of each kind, and its head alone."""
+    frames, begin = next(iter(script.tubes(1, 1))).frames, 1_000_000_000
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "capture"
+        writer = CaptureWriter(path, skin.FORMAT)
+        writer.state(begin, "streaming")
+        for i in range(6):
+            now = begin + i * 8_000_000
+            writer.transfer(now, wire.pack(6 * i, 8000 * i, frames[6 * i : 6 * i + 6]))
+            if i in (2, 4):
+                writer.edges(now + 2, [Edge((EdgeKind.START, EdgeKind.STOP)[i // 4], now + 1)])
+        writer.command(begin + 50_000_000, "NEW")
+        writer.state(begin + 60_000_000, "lost")
+        writer.close()
+        data = path.read_bytes()
+    return [data, data[: data.index(b"}") + 1]]
+
+
+SEEDS: dict[str, Callable[[], list[bytes]]] = {
+    f.__name__: f for f in (unpack, command, settings, manifest, recording, capture)
+}  # fmt: skip
+
+
+def words(target: str) -> Sequence[bytes]:
+    """What the target's format is made of."""
+    if target == "unpack":
+        return [wire.MAGIC, ENDLESS, *(b"%c%c" % (wire.VERSION, kind) for kind in wire.Kind)]
+    if target == "command":
+        return [b"$PPLP,", b"*", b"\r\n", b"\xff", *(name.encode() for name in sink.COMMANDS)]
+    if target == "settings":
+        groups = {
+            f.name: type(getattr(config.load(None, site=Path("/dev/null")), f.name)) for f in fields(config.Config)
+        }
+        sections = {name: group for name, group in groups.items() if is_dataclass(group)}
+        keys = [f.name for group in sections.values() for f in fields(group)]
+        odd = ["board = ", " = ", '"', "[", "]", "true", "nan", "-0.0", "1e-9", "0x", '"\\u0000"', "1979-05-27", "'''"]
+        return [text.encode() for text in (*(f"[{name}]" for name in sections), *keys, *odd)]
+    kinds = {
+        "manifest": (bundle.Manifest, bundle.Thresholds),
+        "recording": (SweepFormat, Sweep),
+        "capture": (SweepFormat,),
+    }
+    names = [f.name for kind in kinds[target] for f in fields(kind)]
+    odd = ["NaN", "Infinity", "1e999", "4.0", "-1", "true", "null", '"\\ud800"', '"\\n"', "{}", "[]", "[[[["]
+    magic = {"recording": [NPY, b"'descr': ", b"'shape': ", b"(4,)", b"'|O'"], "capture": [MAGIC]}.get(target, [])
+    return [*magic, *(text.encode() for text in (*(f'"{name}"' for name in names), *odd))]

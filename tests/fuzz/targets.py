@@ -1,0 +1,185 @@
+"""What must hold of whatever comes in. In: any bytes, and a folder for those that are read as a file. Out: nothing, or
+an error where a promise is broken: an AssertionError from here, or one that the box would not have survived.
+
+Each target is a pure function of its bytes; what is in the folder is only what it wrote there itself.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from functools import reduce
+from itertools import pairwise
+from operator import xor
+from pathlib import Path
+from typing import Any
+
+from appliance import sensor, sink, wire
+from appliance.errors import FormatError, SensorMismatch
+from appliance.sweep import SweepFormat
+from fuzz import files
+from fuzz.files import one_line
+
+Target = Callable[[bytes, Path], None]
+
+SKIN = SweepFormat(4, 4, 750.0, 1500, "uint8")
+LONGEST = wire.HEADER.size + wire.MAX_PAYLOAD + wire.CRC.size
+LINE = 128
+"""Characters of a sentence or command by PROTOCOL.md, part 2."""
+ITEM_SIZES = {0: 1, 1: 2, 2: 2, 3: 4}
+
+
+class Scanned(bytes):
+    """Bytes that count how often somebody searches them from some place on."""
+
+    searches = 0
+
+    def find(self, *args: Any) -> int:
+        """As that of bytes."""
+        self.searches += 1
+        return super().find(*args)
+
+
+def cuts(data: bytes) -> set[int]:
+    """Where to cut: in the middle, and where the last byte says."""
+    return {len(data) // 2, data[-1] % len(data)} if data else {0}
+
+
+def by_the_document(data: bytes) -> list[bytes]:
+    """All whole packets in `data`, as PROTOCOL.md's table reads, in few words and without care for speed."""
+    found, at = [], 0
+    while (at := data.find(b"\x50\xc1", at)) >= 0 and len(data) - at >= 20:
+        version, kind, n, _, count, rows, cols, digit = struct.unpack_from("<BBHBBBBB", data, at + 2)
+        end = at + 20 + n + 4
+        frames = version == 1 and digit in ITEM_SIZES and n == count * rows * cols * ITEM_SIZES[digit] > 0
+        if n <= 4096 and (kind == 1 or (kind == 0 and frames)):
+            if end > len(data):
+                break
+            if zlib.crc32(data[at : end - 4]) == int.from_bytes(data[end - 4 : end], "little"):
+                found.append(data[at:end])
+                at = end
+                continue
+        at += 1
+    return found
+
+
+def shown(packets: list[wire.Packet], replies: list[wire.Reply]) -> list[tuple[object, ...]]:
+    """Packets and replies as values that can be compared."""
+    frames = [(p.seq, p.t_us, p.flags, p.taxels.shape, p.taxels.dtype.str, p.taxels.tobytes()) for p in packets]
+    return [*frames, *((r.request, r.payload) for r in replies)]
+
+
+def unpack(data: bytes, folder: Path) -> None:
+    """wire.unpack: exactly the document's packets, each byte accounted for, in parts as at once, in one pass."""
+    scanned = Scanned(data)
+    got = wire.unpack(scanned)
+    assert scanned.searches <= 1 + data.count(wire.MAGIC), f"{scanned.searches} searches in {len(data)} bytes"
+    raw = by_the_document(data)
+    assert len(got.packets) + len(got.replies) == len(raw)
+    assert [p.taxels.tobytes() for p in got.packets] == [r[20:-4] for r in raw if r[3] == 0]
+    assert [p.seq for p in got.packets] == [int.from_bytes(r[12:16], "little") for r in raw if r[3] == 0]
+    assert [r.payload for r in got.replies] == [r[20:-4] for r in raw if r[3] == 1]
+    assert sum(map(len, raw)) + got.garbage + len(got.leftover) == len(data)
+    assert data.endswith(got.leftover)
+    assert len(got.leftover) < LONGEST
+    assert wire.MAGIC.startswith(got.leftover[:2])
+    for cut in cuts(data):
+        first = wire.unpack(data[:cut])
+        then = wire.unpack(first.leftover + data[cut:])
+        parts = shown(first.packets + then.packets, first.replies + then.replies)
+        assert parts == shown(got.packets, got.replies), f"cut at {cut}, other packets come out"
+        assert first.garbage + then.garbage == got.garbage
+        assert then.leftover == got.leftover
+        _stream(data, cut, sum(len(p.taxels) for p in got.packets))
+    _follow(got.packets)
+    _replies(data, got.replies)
+
+
+def _stream(data: bytes, cut: int, sent: int) -> None:
+    """Frames that a sensor makes of it: numbers rise, and each frame that came is out, stale or lost."""
+    tally = sensor.Tally()
+    stream = sensor.Stream(SKIN, tally)
+    stream.restart()
+    numbers = [-1]
+    try:
+        for i, part in enumerate((data[:cut], data[cut:])):
+            frames = stream.feed(part, (i + 1) * 8_000_000)
+            assert len(frames.t_ns) == len(frames.seq) == len(frames.taxels)
+            numbers += frames.seq.tolist()
+        assert tally.frames + tally.stale_frames + tally.lost_frames >= sent, f"{tally} for {sent} frames"
+    except SensorMismatch as e:
+        one_line(e)
+    assert all(a < b for a, b in pairwise(numbers)), f"numbers {numbers} do not rise"
+    assert tally.frames == len(numbers) - 1
+    assert tally.garbage_bytes <= len(data)
+
+
+def _follow(packets: list[wire.Packet]) -> None:
+    """Each frame is fresh or stale, and fresh ones rise."""
+    fresh, place, lost, stale = wire.follow(packets, wire.Place(0))
+    sizes = [len(p.taxels) for p in packets]
+    assert sum(len(p.taxels) for _, p in fresh) + stale == sum(sizes)
+    ends = [0, *(start + len(p.taxels) for start, p in fresh)]
+    assert all(end <= start for end, (start, _) in zip(ends, fresh, strict=False)), "frames overlap"
+    assert lost >= 0
+    assert place.next is None or place.next == ends[-1]
+
+
+def _replies(data: bytes, replies: list[wire.Reply]) -> None:
+    """Identity and format are read, or refused by FormatError."""
+    for payload in (data, *(r.payload for r in replies)):
+        try:
+            who = wire.unpack_identity(payload)
+            assert (who.board + who.serial).isprintable()
+            assert len(wire.pack_identity(who)) == 36
+        except FormatError as e:
+            one_line(e)
+        try:
+            assert wire.pack_format(skin := wire.unpack_format(payload)) == payload[:3] + b"\0" + payload[4:16], skin
+        except FormatError as e:
+            one_line(e)
+
+
+def command(data: bytes, folder: Path) -> None:
+    """sink.parse: one Command a line, in parts as at once, a bounded rest, and an answer that can be sent to each."""
+    got, rest = sink.parse(data)
+    assert len(rest) <= LINE + 1
+    *lines, last = re.split(rb"[\r\n]+", data)
+    lines = [line for line in lines if line]
+    assert len(got) == len(lines) + (len(last) > LINE)
+    for line, told in zip(lines, got, strict=False):
+        assert bool(told.error) != _is_command(line, told.name), f"{line!r} was taken as {told}"
+    for told in got:
+        _answer(told)
+    for cut in cuts(data):
+        first, left = sink.parse(data[:cut])
+        then, left = sink.parse(data[cut:], left)
+        assert (first + then, left) == (got, rest), f"cut at {cut}, other commands come out"
+
+
+def _is_command(line: bytes, name: str) -> bool:
+    """Whether a line is a command by PROTOCOL.md, and this one."""
+    body, star, given = line.strip().removeprefix(b"$").partition(b"*")
+    known = body.startswith(b"PPLP,") and body[5:].decode("ascii", "replace") == name and name in sink.COMMANDS
+    sealed = not star or given.upper() == b"%02X" % reduce(xor, body, 0)
+    return known and sealed and len(line) <= LINE
+
+
+def _answer(told: sink.Command) -> None:
+    """The sentence that answers a command has all its fields, whatever stood in the line."""
+    line = sink.sentence("ANS", told.name, "error" if told.error else "ok", told.error)
+    assert len(line) <= LINE
+    body, given = line.removeprefix(b"$").removesuffix(b"\r\n").split(b"*")
+    assert body.decode("ascii").isprintable()
+    assert given == b"%02X" % reduce(xor, body, 0)
+    kind, name, how, _ = body.decode().split(",", 4)[1:5]
+    assert (kind, how) == ("ANS", "error" if told.error else "ok")
+    assert told.error or name == told.name
+
+
+TARGETS: dict[str, Target] = {
+    "unpack": unpack, "command": command, "settings": files.settings, "manifest": files.manifest,
+    "recording": files.recording, "capture": files.played,
+}  # fmt: skip
