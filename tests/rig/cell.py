@@ -26,6 +26,14 @@ still while this machine did something else.
 """
 IDLE = 75
 """Frames of an empty skin between two sweeps: a tenth of a second."""
+BEHIND_NS = 50_000_000
+"""A touch begins only while the box takes frames no older than this: else its edges, which lie ahead of its frames by the
+clock, would come at once and its sweep be too short.
+"""
+SEEN_S = 20
+"""Longest wait until the box has seen that the skin is gone."""
+BEGUN_S = 120
+"""Longest wait for a touch to begin, while a busy emulator works off what it has not taken yet."""
 ANSWER_S = 30
 """Longest wait for an answer after the stop edge; an emulated processor that is busy takes seconds."""
 
@@ -56,10 +64,9 @@ class Hand:
 
     def next_act(self, first: int, frame_ns: Callable[[int], int]) -> rig.Act:
         """The next touch, its edges scheduled, or an empty skin."""
-        try:
-            touch = self.touches.get_nowait()
-        except queue.Empty:
+        if self.touches.empty() or time.monotonic_ns() - frame_ns(first) > BEHIND_NS:
             return rig.Act(skin.idle(IDLE, self._rng), 0, 0, "")
+        touch = self.touches.get_nowait()
         act = touch.act
         touch.first, touch.start_ns, touch.stop_ns = first, frame_ns(first + act.start), frame_ns(first + act.stop)
         for line, t_ns, wanted in (("START", touch.start_ns, touch.start), ("STOP", touch.stop_ns, touch.stop)):
@@ -73,7 +80,8 @@ class Hand:
 class Cell:
     """A guest with a robot around it; the skin is in the robot's hand, and plugged in when `plug` is called.
 
-    acts: what the robot sweeps over, in order; the simulator's six tubes, drawn from `seed`.
+    acts: what the robot sweeps over, in order; the simulator's six tubes, drawn from `seed`. packet_frames: of its boards;
+    more of them in a packet spare an emulator half of its work.
     """
 
     def __init__(self, machine: Machine, seed: int = 1) -> None:
@@ -81,15 +89,20 @@ class Cell:
         self.clock = SystemClock()
         self.hand = Hand(machine.lines, seed)
         self.acts = script.tubes(seed)
+        self.packet_frames = 6
         self._serials = itertools.count(1)
 
     def board(self, **how: Any) -> rig.Board:
         """A board in the robot's hand: how are the arguments of sim.rig.Board (ppm, latency, serial, …)."""
-        return rig.Board(skin.FORMAT, self.hand, self.clock, **{"fifo_frames": FIFO} | how)
+        usual = {"fifo_frames": FIFO, "packet_frames": self.packet_frames}
+        return rig.Board(skin.FORMAT, self.hand, self.clock, **usual | how)
 
     def plug(self, board: rig.Board | None = None) -> rig.Board:
-        """Plug a board in, a sound one if none is given."""
+        """Plug a board in, a sound one if none is given. An old one goes first, and a box that runs has seen it: FAULT."""
         board = board or self.board()
+        if self.cable.board:
+            self.unplug()
+            self.lines.wait("FAULT", True, SEEN_S)
         self.cable.plug(board)
         return board
 
@@ -99,7 +112,7 @@ class Cell:
 
     def until_ready(self, timeout_s: float = 60) -> None:
         """Wait until the box says READY. Raises AssertionError where it does not."""
-        if not self.lines.wait("READY", True, timeout_s):
+        if not (self.lines.wait("READY", True, timeout_s) and self.lines.wait("FAULT", False, timeout_s)):
             raise AssertionError(f"not READY within {timeout_s} s; the box says: {self.journal()}")
 
     def touch(self, *, start: bool = True, stop: bool = True) -> Touch:
@@ -112,6 +125,8 @@ class Cell:
         """A whole sweep; what was done, and how the box answered it. Raises AssertionError where no answer comes."""
         since = len(self.serial.heard)
         touch = self.touch()
+        if not touch.played.wait(BEGUN_S):
+            raise AssertionError(f"the box is {BEGUN_S} s behind the skin; is this machine busy?")
         return touch, self.answer(since, timeout_s + 6)
 
     def answer(self, since: int, timeout_s: float = ANSWER_S) -> Answer:

@@ -40,7 +40,7 @@ class Descriptors:
         "<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0, 0, 0, MAX_PACKET, VENDOR_ID, PRODUCT_ID, 0x0100, 1, 2, 3, 1
     )
     configuration: bytes = (
-        struct.pack("<BBHBBBBB", 9, 2, 32, 1, 1, 0, 0x80, 50)
+        struct.pack("<BBHBBBBB", 9, 2, 25, 1, 1, 0, 0x80, 50)
         + struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 1, 255, 0, 0, 0)
         + struct.pack("<BBBBHB", 7, 5, IN, 2, MAX_PACKET, 0)
     )
