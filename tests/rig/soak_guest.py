@@ -79,6 +79,7 @@ class VirtualBox:
     def __init__(self) -> None:
         self._stack, self._heard = ExitStack(), 0
         self._sent: deque[tuple[float, int]] = deque(maxlen=SENT)
+        self._thrown, self._anew = 0, False
 
     @staticmethod
     def missing() -> str:
@@ -100,6 +101,7 @@ class VirtualBox:
         self._guest.skin.mangle = self._note
         self._hand = Hand(self._guest.lines, seed)
         self._board = rig.Board(skin.FORMAT, self._hand, SystemClock(), fifo_frames=2250)
+        self._answer, self._board.request = self._board.request, self._request  # type: ignore[method-assign]
         self._guest.skin.plug(self._board)
         if not self._guest.lines.wait("READY", True, READY_S):
             raise Gone(f"the guest was not READY within {READY_S} s")
@@ -126,8 +128,17 @@ class VirtualBox:
     def _note(self, packet: bytes) -> bytes:
         """Take note of the last frame of a packet that goes to the guest; the packet as it is."""
         _, _, _, _, _, count, *_, seq, _ = wire.HEADER.unpack_from(packet)
-        self._sent.append((time.monotonic(), seq + count))
+        if self._anew and self._sent:
+            # what it took from the box's STOP to its START it was asked not to send
+            self._thrown += seq - self._thrown - self._sent[-1][1]
+        self._anew = False
+        self._sent.append((time.monotonic(), seq + count - self._thrown))
         return packet
+
+    def _request(self, request: int) -> bytes | None:
+        """Take note of a START; the board's answer."""
+        self._anew |= request == wire.Request.START and not self._board.running
+        return self._answer(request)
 
     def process(self) -> tuple[int, int, float, int, int]:
         """As BoxUnderTest."""

@@ -1,0 +1,100 @@
+"""What a test that runs inside the guest stands on. In: a Machine. Out: a folder for its second disk, and a bench that does
+outside what such a test asks for (tests/undersides/remote.py).
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterable
+from importlib.metadata import distribution
+from pathlib import Path
+
+from machines import ROOT
+from undersides import Skin, skins
+
+from appliance.clock import SystemClock
+
+from .machine import Machine
+
+RUNNER = ("pytest", "pluggy", "iniconfig", "pygments")
+"""Pure Python, so this machine's installation serves the guest; `packaging` is in the box's lock."""
+SETTLE_S = 0.2
+
+
+def pack(folder: Path, tests: Iterable[str]) -> None:
+    """Put these files and folders of tests/ and what runs them into `folder`."""
+    for name in tests:
+        source = ROOT / "tests" / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, folder)
+    for name in RUNNER:
+        made = distribution(name)
+        for file in made.files or []:
+            if ".." not in file.parts and "__pycache__" not in file.parts:
+                place = folder / "site" / file
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(made.locate_file(file), place)
+
+
+class Bench:
+    """The controls of an Underside, done to a guest from outside."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine, self._clock, self._told = machine, SystemClock(), 0
+
+    def able(self) -> list[str]:
+        """What can be done, as an Underside has it in `can`."""
+        return ["skin", "numbered", "plug", "garble", "silence", "lines", "serial", "stall"]
+
+    def reset(self) -> None:
+        """See Underside; the same below. The cable stays as it is."""
+        self.garble(False)
+        for line in ("START", "STOP"):
+            self.drive(line, False)
+        self.hear()
+
+    def plug(self, what: Skin) -> None:
+        """Another board on the cable."""
+        self._machine.skin.unplug()
+        self._machine.skin.plug(skins.board(what, self._clock))
+
+    def unplug(self) -> None:
+        """None."""
+        self._machine.skin.unplug()
+
+    def garble(self, on: bool) -> None:
+        """On the cable."""
+        self._machine.skin.mangle = skins.garbler() if on else bytes
+
+    def silence(self) -> None:
+        """The board sends nothing until it is started again."""
+        cable = self._machine.skin
+        cable.do(lambda: setattr(cable.board, "running", False))
+
+    def drive(self, line: str, level: bool) -> None:
+        """An input of the box."""
+        self._machine.lines.set(line, level)
+
+    def storm(self, line: str, edges: int) -> None:
+        """As quickly as QEMU takes them."""
+        self._machine.lines.run_through((line, i % 2 == 0) for i in range(edges))
+
+    def level(self, line: str) -> bool:
+        """Of an output, as the robot sees it."""
+        return self._machine.lines.levels[line]
+
+    def say(self, data: bytes) -> None:
+        """To the guest's serial port."""
+        self._machine.serial.say(data)
+
+    def hear(self) -> bytes:
+        """What has come since the last call. Between calls nobody reads, so that a port may fill up."""
+        port = self._machine.serial
+        port.deaf = False
+        time.sleep(SETTLE_S)
+        port.deaf = True
+        lines, self._told = port.heard[self._told :], len(port.heard)
+        return b"".join(line.encode() + b"\r\n" for _, line in lines)

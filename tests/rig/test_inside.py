@@ -1,0 +1,38 @@
+"""The contract of skin, lines and port, run inside the guest over its real kernel; what is outside it asks for."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from undersides import remote
+
+from .image import Image
+from .inside import Bench, pack
+from .machine import Machine
+
+PYTEST = "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider test_contract.py"
+
+
+def test_the_contract_holds_on_a_real_kernel(
+    image: Image, tmp_path: Path, count: Callable[[int, int], int], note: Callable[[str, str, int], None]
+):
+    """test_contract.py with real libusb, libgpiod and termios on xHCI, PL061 and a 16550; a part of it where time is short."""
+    code = tmp_path / "code"
+    code.mkdir()
+    pack(code, ["conftest.py", "no-site.toml", "test_contract.py", "undersides"])
+    some = count(1, 0) * " -k 'without_a_gap or start_and_stop or test_outputs or arrive_whole'"
+    with Machine(image, tmp_path, snapshot=True, code=code) as machine:
+        asking = threading.Thread(
+            target=remote.serve, args=(machine.bench().makefile("rwb"), Bench(machine)), daemon=True
+        )
+        asking.start()
+        machine.run("systemctl stop palpate; mkdir -p /code && mount -o ro /dev/vdb /code", timeout_s=90, check=True)
+        env = "PYTHONDONTWRITEBYTECODE=1 PALPATE_UNDERSIDE=remote PYTHONPATH=/code/site"
+        done = machine.run(f"cd /code && timeout -s INT 500 env {env} {PYTEST}{some}", timeout_s=520)
+    assert done.rc == 0, done.out[-6000:]
+    passed = int(re.search(r"(\d+) passed", done.out)[1])
+    assert passed >= 3
+    note("none (the contract, inside)", "held", passed)
