@@ -7,7 +7,7 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools test-rig test-hw systemd soak fuzz \
+.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz \
   wheel lock clean
 
 help: ## this list
@@ -44,6 +44,9 @@ soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box
 test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/board-checklist.md)
 	$(PIP) install -e '.[board]'
 	PALPATE_UNDERSIDE=wired $(BIN)/python -m pytest -q -rs tests/test_contract.py
+
+rig-ground: rig-tools
+	$(RIG) ground
 
 rig-tools: $(DESKTOP)
 	@lacking=`$(RIG) lacking`; [ -z "$$lacking" ] || { echo "installing $$lacking"; \

@@ -1,5 +1,6 @@
-"""`python -m rig build|show|shell|lacking`: makes the virtual box, shows it at work, opens a shell in it, or tells which
-Debian packages that takes.
+"""`python -m rig build|show|shell`: makes the virtual box, shows it at work, or opens a shell in it.
+
+`ground` makes the part of it that is the same for every commit, `lacking` tells which Debian packages all that takes.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 from machines import Missing
 
 from .cell import Cell
-from .image import image, lacking
+from .image import ground, image, lacking
 from .machine import Machine
 
 
@@ -50,14 +51,21 @@ def shell(cell: Cell) -> None:
 def main() -> int:
     """Read the arguments and do it; the exit code."""
     parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
-    parser.add_argument("what", choices=["build", "show", "shell", "lacking"])
+    parser.add_argument("what", choices=["build", "show", "shell", "ground", "lacking"])
     parser.add_argument("--sweeps", type=int, default=6)
     args = parser.parse_args()
     if args.what == "lacking":
         print(*lacking())
         return 0
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
     try:
-        made = image(lambda line: print(line, flush=True))
+        if args.what == "ground":
+            print(ground(say))
+            return 0
+        made = image(say)
     except Missing as e:
         print(e, file=sys.stderr)
         return 1
