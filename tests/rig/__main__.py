@@ -1,6 +1,7 @@
 """`python -m rig build|show|shell`: makes the virtual box, shows it at work, or opens a shell in it.
 
-`ground` makes the part of it that is the same for every commit, `lacking` tells which Debian packages all that takes.
+`ground` makes the part of it that is the same for every commit, `lacking` tells which Debian packages all that takes,
+`table` what became of the faults that the tests have made.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from machines import Missing
 
+from . import notes
 from .cell import Cell
 from .image import ground, image, lacking
 from .machine import Machine
@@ -51,9 +53,12 @@ def shell(cell: Cell) -> None:
 def main() -> int:
     """Read the arguments and do it; the exit code."""
     parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
-    parser.add_argument("what", choices=["build", "show", "shell", "ground", "lacking"])
+    parser.add_argument("what", choices=["build", "show", "shell", "ground", "lacking", "table"])
     parser.add_argument("--sweeps", type=int, default=6)
     args = parser.parse_args()
+    if args.what == "table":
+        print("\n".join(notes.table()))
+        return 0
     if args.what == "lacking":
         print(*lacking())
         return 0

@@ -4,21 +4,20 @@ skipped. `make test-rig` sets it, and makes the box first.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from machines import ROOT, Missing
+from machines import Missing
 
+from . import notes
 from .cell import Cell
 from .image import Image
 from .image import image as make_image
 from .machine import Machine
 
 HOW = os.environ.get("PALPATE_RIG", "")
-NOTES = ROOT / "build" / "rig" / "faults.jsonl"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -75,15 +74,6 @@ def note(request: pytest.FixtureRequest) -> Callable[[str, str, int], None]:
 
     def write(fault: str, outcome: str, times: int) -> None:
         print(f"{fault}: {outcome}, {times} times")
-        NOTES.parent.mkdir(parents=True, exist_ok=True)
-        with NOTES.open("a") as f:
-            line = {
-                "test": request.node.nodeid,
-                "layer": "virtual box",
-                "fault": fault,
-                "outcome": outcome,
-                "times": times,
-            }
-            f.write(json.dumps(line) + "\n")
+        notes.write(request.node.nodeid, fault, outcome, times)
 
     return write

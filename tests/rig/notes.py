@@ -1,0 +1,34 @@
+"""What became of each fault. In: a line from each test that made one. Out: the table fault x outcome, as Markdown.
+
+Lines gather in build/rig/faults.jsonl over all runs; of one fault the run with the most repetitions counts, and of such
+the last.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from machines import ROOT
+
+FILE = ROOT / "build" / "rig" / "faults.jsonl"
+
+
+def write(test: str, fault: str, outcome: str, times: int, file: Path = FILE) -> None:
+    """Add a line."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("a") as f:
+        f.write(json.dumps({"test": test, "fault": fault, "outcome": outcome, "times": times}) + "\n")
+
+
+def table(file: Path = FILE) -> list[str]:
+    """Lines of a Markdown table, the faults of one test file together. Raises OSError where nothing was noted."""
+    best: dict[tuple[str, str], dict[str, Any]] = {}
+    for line in file.read_text().splitlines():
+        told = json.loads(line)
+        key = told["test"].partition("::")[0], told["fault"]
+        if key not in best or told["times"] >= best[key]["times"]:
+            best[key] = told
+    rows = [f"| {fault} | {told['outcome']} | {told['times']} |" for (_, fault), told in sorted(best.items())]
+    return ["| fault | what the box did | times |", "|---|---|---|", *rows]
