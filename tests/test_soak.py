@@ -182,6 +182,17 @@ def test_a_wrong_number_is_found(number):
     assert ORDER in missed(told)
 
 
+def test_a_number_too_many_makes_no_answer_wrong(clean):
+    """Where a missed edge made two answers of one sweep, the later ones are held against what was touched then."""
+
+    def ahead(line: str) -> list[str]:
+        number = int(line.split(",")[2]) if ",RES," in line else 0
+        return [renumbered(line, number + 1)] if number >= 17 else [line]
+
+    run = soaked(FakeBox(ahead))
+    assert [row[2:] for row in run.answers] == [row[2:] for row in clean.answers]
+
+
 def test_an_answer_that_nobody_asked_for_is_found():
     """A number right in order, but before the robot has given the start edge."""
     run = soaked(FakeBox(on(17, lambda line: [line, renumbered(line, 18), renumbered(line, 19)])))
