@@ -66,31 +66,6 @@ def test_acm_takes_the_board_from_the_kernel():
     assert not world.backend.kernel_driver
 
 
-def test_absent_then_plugged():
-    """No board: state absent, ids named; taken up when it comes."""
-    world = idle_world()
-    world.backend.unplug()
-    sensor = sensor_on(world)
-    assert len(read_for(sensor, world, 1)) == 0
-    assert sensor.state == "absent"
-    assert "1209:7ac7" in str(sensor.trouble)
-    world.backend.plug()
-    assert len(read_for(sensor, world, 1)) > 100
-    assert sensor.state == "streaming"
-
-
-def test_serial_number_chooses_the_board():
-    """A board with another serial number is not taken, and the message says what was looked for."""
-    world = idle_world()
-    sensor = sensor_on(world, serial="0042")
-    read_for(sensor, world, 0.5)
-    assert sensor.state == "absent"
-    assert "0042" in str(sensor.trouble)
-    assert "1 with other numbers" in str(sensor.trouble)
-    sensor = sensor_on(world, serial="SIM0001")
-    assert len(read_for(sensor, world, 0.5)) > 100
-
-
 def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
     """A machine without libusb is told which package to install."""
 
@@ -156,21 +131,6 @@ def test_unplug_and_replug_in_mid_read():
     check_content(frames)
     check_content(later)
     assert sensor.tally.lost_frames == 0
-
-
-def test_silent_board_is_started_again():
-    """A board that is there but sends nothing: state silent, then it is opened and started anew."""
-    world = idle_world()
-    sensor = sensor_on(world)
-    read_for(sensor, world, 1)
-    world.backend.board.running = False
-    states = set()
-    for _ in range(20):
-        sensor.read()
-        states.add(sensor.state)
-    assert "silent" in states
-    assert sensor.state == "streaming"
-    assert len(read_for(sensor, world, 1)) > 700
 
 
 def test_timeouts_with_partial_data():

@@ -141,43 +141,6 @@ def sink_on(name: str, clock=None, **settings) -> SerialSink:
     return SerialSink(SerialConfig(port=name, **settings), clock or rig.VirtualClock(), "sim")
 
 
-def test_sentences_come_out_at_the_other_end():
-    """What is sent is read, byte by byte."""
-    with terminal.pair() as (far, name):
-        sink = sink_on(name)
-        sink.send(verdict())
-        assert os.read(far, 4096) == result(verdict(), "sim")
-        os.write(far, b"$PPLP,ID\r\n$PPLP,STA")
-        assert sink.commands() == [Command("ID")]
-        os.write(far, b"TE\r\n")
-        assert sink.commands() == [Command("STATE")]
-        sink.close()
-
-
-def test_a_peer_that_does_not_read_costs_sentences_only():
-    """The line fills up: sends return at once, the oldest sentences are dropped and counted, what comes out is whole."""
-    with terminal.pair() as (far, name):
-        sink = sink_on(name, queue=8)
-        total = 2000
-        for i in range(total):
-            sink.say(sentence("ANS", i))
-        assert sink.dropped > 0
-        heard = b""
-        for _ in range(100):
-            try:
-                heard += os.read(far, 65536)
-            except BlockingIOError:
-                break
-            sink.commands()
-        lines = heard.decode("ascii").split("\r\n")
-        assert lines.pop() == ""
-        numbers = [int(pynmea2.parse(line, check=True).data[-1]) for line in lines]
-        assert numbers == sorted(numbers)
-        assert len(numbers) + sink.dropped == total
-        assert numbers[-1] == total - 1
-        sink.close()
-
-
 def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
     """A missing port is named with what to do, sentences wait up to the queue's length, and it is opened when it comes."""
     clock = rig.VirtualClock()
