@@ -11,6 +11,8 @@ from itertools import pairwise
 from typing import Protocol
 
 WRAP = 1 << 32
+USB_PPM = 2500
+"""How far the clock of a full-speed device may be off (USB 2.0, 7.1.11)."""
 
 
 class Clock(Protocol):
@@ -46,8 +48,8 @@ class DeviceClock:
     envelope of these points. Until `settle_s` have been seen it is their minimum. Then it is the line below all points
     of the last `span_s` that lies closest to them on average: the edge of their lower convex hull over the mean time,
     with its slope bounded by `max_ppm` (two crystals differ by less). What stays is the shortest delay itself, some
-    0.1 ms, which cannot be told from the offset. A line that lies higher than such crystals can have drifted since the
-    last one is none: frames that all come late, from a full FIFO, were not taken late; the last line goes on.
+    0.1 ms, which cannot be told from the offset. A line that lies higher than the worst clock on USB can have drifted
+    since the last one is none: frames that all come late, from a full FIFO, were not taken late; the last line goes on.
     Make a new one after each enumeration: the device's clock starts anew.
     """
 
@@ -88,7 +90,7 @@ class DeviceClock:
             self._points.append((device_ns, offset))
         line = self._fit()
         settled = device_ns - self._first_ns >= self._settle_ns
-        drift_ns = 2 * self._max_slope * (device_ns - self._fitted_ns)
+        drift_ns = (USB_PPM * 1e-6 + self._max_slope) * (device_ns - self._fitted_ns)
         if not settled or _at(line, device_ns) <= _at(self._line, device_ns) + drift_ns:
             self._line, self._fitted_ns = line, device_ns
 

@@ -77,3 +77,16 @@ def test_frames_that_all_come_late_were_not_taken_late(ppm: float):
         errors_ms.append((clock.to_host_ns(device_ns) - true_ns) / 1e6)
     assert np.abs(errors_ms[5 * 125 : 40 * 125]).max() < 1
     assert np.abs(errors_ms[40 * 125 :]).max() < 25
+
+
+@pytest.mark.parametrize("ppm", [-2000, -500, 500, 2000])
+def test_no_line_is_kept_for_ever(ppm: float):
+    """A board beyond the bound whose first packets all came late: the error is that of the last 20 s, and grows no more."""
+    rng, clock, arrival_ns, error_ms = np.random.default_rng(0), DeviceClock(), 0, []
+    for true_ns in range(0, 150_000_000_000, 16_000_000):
+        late_ns = 20e6 if true_ns < 5e9 else 1e6
+        arrival_ns = max(arrival_ns, int(true_ns + late_ns + rng.exponential(300_000)))
+        device_ns = int(true_ns * (1 + ppm * 1e-6))
+        clock.update(device_ns, arrival_ns)
+        error_ms.append((clock.to_host_ns(device_ns) - true_ns) / 1e6)
+    assert np.abs(error_ms).max() < 22 + (abs(ppm) - 200) * 1e-6 * 20e3
