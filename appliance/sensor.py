@@ -171,20 +171,27 @@ class UsbSensor:
         self._config, self._format, self._clock, self._backend, self._tap = config, fmt, clock, backend, tap
         self._stream = Stream(fmt, self.tally)
         self._link: link.VendorLink | None = None
-        self._retry_ns = self._heard_ns = clock.now_ns()
+        self._retry_ns = clock.now_ns()
+        self._quiet_ns = 0  # spent listening since the last frame
 
     def read(self) -> Frames:
         """Frames that came since the last call; waits `timeout_ms` at most for them."""
         if self._link is None and not self._connect():
             return Frames.empty(self._format)
+        begun = self._clock.now_ns()
         data = self._transfer()
         now = self._clock.now_ns()
+        # a read that took longer than it was told to had no processor: the skin may have sent all the while
+        self._quiet_ns += min(now - begun, self._config.timeout_ms * 1_000_000)
+        frames = Frames.empty(self._format)
         if data:
             if self._tap:
                 self._tap.transfer(now, data)
-            return self._frames(data, now)
-        self._check_silence(now)
-        return Frames.empty(self._format)
+            frames = self._frames(data, now)
+        if len(frames):
+            self._quiet_ns = 0
+        self._check_silence()
+        return frames
 
     def close(self) -> None:
         """Stop the board and let it go."""
@@ -209,7 +216,7 @@ class UsbSensor:
             self._drop(link.explain(e))
             return False
         self._stream.restart()
-        self._heard_ns = self._clock.now_ns()
+        self._quiet_ns = 0
         self._set_state("streaming", None)
         return True
 
@@ -250,19 +257,14 @@ class UsbSensor:
 
     def _frames(self, data: bytes, now_ns: int) -> Frames:
         try:
-            frames = self._stream.feed(data, now_ns)
+            return self._stream.feed(data, now_ns)
         except SensorMismatch as e:
             self._drop(e)
             return Frames.empty(self._format)
-        if len(frames):
-            self._heard_ns = now_ns
-        else:
-            self._check_silence(now_ns)
-        return frames
 
-    def _check_silence(self, now_ns: int) -> None:
-        """Start a board anew that is there but has sent no whole packet for `silence_ms`."""
-        quiet_ms = (now_ns - self._heard_ns) // 1_000_000
+    def _check_silence(self) -> None:
+        """Start a board anew that is there but has sent no whole packet in `silence_ms` of listening."""
+        quiet_ms = self._quiet_ns // 1_000_000
         if self._link and quiet_ms > self._config.silence_ms:
             self._drop(SensorSilent(f"the skin is there but sent no frame for {quiet_ms} ms; starting it again"))
 

@@ -5,10 +5,12 @@ In: a board whose packets are altered on the cable. Out: states, and no frame wh
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+import usb.core
 from conftest import SECOND, idle_world
 
 from appliance import wire
@@ -193,3 +195,26 @@ def test_windows_over_many_offsets(ppm: float):
                     assert sweep.status is Status.NO_START
     assert len(apart) == 120
     assert np.abs(apart).max() <= 1
+
+
+def test_a_box_that_had_no_processor_does_not_call_the_skin_silent():
+    """Pauses of the box, between reads and within one, are no silence; half a second of listening in vain is."""
+    world = idle_world(fifo_frames=6000)
+    sensor = sensor_on(world)
+    read_for(sensor, world, 1)
+    bulk_read = world.backend.bulk_read
+
+    def late(*args) -> int:
+        world.clock.sleep_until(world.clock.now_ns() + 700_000_000)
+        raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
+
+    for _ in range(3):
+        world.clock.sleep_until(world.clock.now_ns() + 700_000_000)
+        world.backend.bulk_read = late
+        sensor.read()
+        world.backend.bulk_read = bulk_read
+        assert len(sensor.read())
+    assert sensor.tally.enumerations == 1
+    assert sensor.tally.lost_frames == 0
+    world.backend.board.running = False
+    assert "silent" in read_for(sensor, world, 1)[1]
