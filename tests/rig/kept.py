@@ -1,0 +1,120 @@
+"""What a box owes that is killed while it keeps its sweeps. In: the sentences a robot heard, the files that were found.
+Out: what is missing. And the ledger of a campaign of kills, which goes on where it was broken off.
+
+A kept sweep is written after its answer, in the same turn of the loop, and state sentences come after that. So one whose
+answer was heard, and after it a state sentence of the same run, must be there whole. One sweep a run may be missing:
+the one in progress, whose answer is the last that was heard.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from machines import ROOT
+
+from appliance.sink import checksum
+from appliance.sweep import Status, Sweep, load
+
+from .machine import Machine
+
+KEPT = "/var/lib/palpate/kept"
+DROP_IN = "/etc/systemd/system/palpate.service.d/arguments.conf"
+RUN = "/opt/palpate/bin/palpate run"
+CLASSIFIED = {str(status) for status in Status if status.classified} | {"unknown"}
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """An answer with a window behind it: its number, and when the box had all that it needed, in s of its clock."""
+
+    sweep: int
+    complete_s: float
+
+    def fits(self, kept: Sweep) -> bool:
+        """True where `kept` is the sweep that was answered."""
+        return kept.id == self.sweep and abs(kept.complete_ns / 1e9 - self.complete_s) < 0.005
+
+
+def runs_with(machine: Machine, arguments: str, more: str = "") -> None:
+    """From the next start on the service runs with these arguments. more: further lines of its drop-in."""
+    folder = DROP_IN.rpartition("/")[0]
+    machine.run(f"mkdir -p {folder}", check=True)
+    machine.put(DROP_IN, f"[Service]\nExecStart=\nExecStart={RUN} {arguments}\n{more}\n".encode())
+    machine.run("systemctl daemon-reload", check=True, timeout_s=60)
+
+
+def found(disk: Path, folder: Path) -> tuple[int, list[Path]]:
+    """Look at a disk that nobody uses, on a copy: e2fsck's exit code once the journal is replayed, and what was kept."""
+    raw, out = folder / "disk.raw", folder / "found"
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    subprocess.run(["qemu-img", "convert", "-O", "raw", disk, raw], check=True)
+    subprocess.run(["e2fsck", "-y", "-E", "journal_only", raw], check=False, capture_output=True)
+    code = subprocess.run(["e2fsck", "-f", "-n", raw], check=False, capture_output=True).returncode
+    subprocess.run(["debugfs", "-R", f"rdump {KEPT} {out}", raw], check=False, capture_output=True)
+    raw.unlink()
+    return code, sorted((out / "kept").glob("*"))
+
+
+def sweeps(files: Iterable[Path]) -> list[Sweep]:
+    """All kept sweeps among these. Raises FormatError where one is not whole."""
+    return [load(path)[0] for path in files if path.suffix == ".npy"]
+
+
+def whole(line: str) -> list[str]:
+    """The fields of a sentence, none where the line is damaged."""
+    body, star, given = line.removeprefix("$").partition("*")
+    return body.split(",") if star and body.isascii() and checksum(body) == given else []
+
+
+def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
+    """What must be there, and what may be missing; `heard` has (host ns, line) of one boot."""
+    must: list[Heard] = []
+    may: list[Heard] = []
+    last: Heard | None = None
+    for _, line in heard:
+        match whole(line):
+            case ["PPLP", "RES", number, t_s, status, *rest] if status in CLASSIFIED:
+                may += [last] if last else []
+                last = Heard(int(number), float(t_s) - float(rest[5]) / 1000)
+            case ["PPLP", "STA", t_s, _, _, answered, *_] if last:
+                (must if int(answered) >= last.sweep else may).append(last)
+                last = None
+    return must, may + ([last] if last else [])
+
+
+def lost(heard: Iterable[tuple[int, str]], kept: list[Sweep]) -> dict[str, int]:
+    """Counts: answers with a window, how many had to be there, how many of these are not, how many others are not."""
+    must, may = owed(heard)
+    gone = [h for h in must if not any(h.fits(k) for k in kept)]
+    unfinished = [h for h in may if not any(h.fits(k) for k in kept)]
+    return {"answered": len(must) + len(may), "owed": len(must), "lost": len(gone), "unfinished": len(unfinished)}
+
+
+class Ledger:
+    """build/rig/NAME.jsonl: one line an event of a campaign on this box."""
+
+    def __init__(self, name: str, box: Path) -> None:
+        self._path, self._box = ROOT / "build" / "rig" / f"{name}.jsonl", box.parent.name
+        self.lines: list[dict[str, Any]] = []
+        with suppress(FileNotFoundError):
+            told = [json.loads(line) for line in self._path.read_text().splitlines()]
+            self.lines = [line for line in told if line["box"] == self._box]
+
+    def add(self, **what: Any) -> None:
+        """Write an event down."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self.lines.append({"box": self._box} | what)
+        with self._path.open("a") as f:
+            f.write(json.dumps(self.lines[-1]) + "\n")
+
+    def sum(self, name: str) -> int:
+        """Sum over all events."""
+        return sum(line.get(name, 0) for line in self.lines)

@@ -1,0 +1,227 @@
+"""Killed at random moments. In: a box that keeps its sweeps, a robot that sweeps. Out: it is there again, nothing is lost.
+
+`make test-rig COUNTS=full` kills the program 200 times and cuts the power 50 times; counts so far are kept in build/rig,
+so that a campaign that was broken off goes on. What was in QEMU's memory is gone with a cut: the disk's tables of newly
+written clusters, which it writes when the guest flushes. So a cut costs what a disk's own memory costs.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from appliance.sim import script, skin
+from appliance.sink import sentence
+from appliance.sweep import Frames, Status, Sweep
+
+from .cell import Cell, Touch
+from .conftest import HOW
+from .image import Image
+from .kept import KEPT, Ledger, found, lost, owed, runs_with, sweeps, whole
+from .machine import Machine
+from .sound import known
+
+START_S = 12
+"""The service takes about so long from a kill to READY, in the emulator."""
+BOOT_S = 40
+"""The same from power-on."""
+WORK_S = 15
+"""Once it is READY it works for so long at most: three or four sweeps."""
+BACK_S = 180
+"""Not READY by then: it has not come back."""
+BATCH = 24
+EVERY = 8
+PACKET = 24
+"""Frames of a packet: fewer packets for an emulator that has to start programs, too."""
+
+
+class Robot:
+    """Sweeps whenever it may, without waiting for anything else."""
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell, self.touches = cell, list[Touch]()
+
+    def for_seconds(self, seconds: float) -> str:
+        """Go on sweeping; what the box was doing at the end."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            if self.cell.lines.levels["READY"] and not self._sweeping():
+                self.touches.append(self.cell.touch())
+            time.sleep(min(0.05, left))
+        if self.touches and 0 < self.touches[-1].start_ns < time.monotonic_ns() and self._sweeping():
+            return "sweeping"
+        return "idle" if self.cell.lines.levels["READY"] else "starting"
+
+    def _sweeping(self) -> bool:
+        """A touch is on its way; its answer may take a while."""
+        if not self.touches:
+            return False
+        touch = self.touches[-1]
+        return not touch.played.is_set() or time.monotonic_ns() < touch.stop_ns + 300_000_000
+
+    def harmed(self, kills: list[int]) -> list[str]:
+        """Answers `ok` to sweeps in which the box was killed, each with its times; kills: host ns."""
+        wrong = []
+        for heard_ns, line in self.cell.serial.heard:
+            touched = [t for t in self.touches if t.played.is_set() and t.stop_ns < heard_ns]
+            if whole(line)[1:2] == ["RES"] and whole(line)[4] == "ok" and touched:
+                last = touched[-1]
+                at = [kill for kill in kills if last.start_ns < kill < last.stop_ns]
+                wrong += (
+                    [f"{line} heard {heard_ns}, sweep {last.start_ns} to {last.stop_ns}, killed {at}"] if at else []
+                )
+        return wrong
+
+
+def statuses(cell: Cell) -> Counter[str]:
+    """How often each status was heard in a whole sentence."""
+    fields = [whole(line) for _, line in cell.serial.heard]
+    return Counter(f[4] for f in fields if f[1:2] == ["RES"])
+
+
+def kill(cell: Cell) -> int:
+    """SIGKILL, as soon as there is a program to kill; host ns. READY falls, although nobody is there to lower it."""
+    cell.machine.run(
+        "until pid=$(systemctl show -P MainPID palpate) && [ $pid != 0 ]; do sleep .05; done; kill -KILL $pid",
+        timeout_s=60,
+        check=True,
+    )
+    killed_ns = time.monotonic_ns()
+    assert cell.lines.wait("READY", False, BACK_S), "READY stays high after the program was killed"
+    return killed_ns
+
+
+def killed(image: Image, folder: Path, ledger: Ledger, n: int, rng: random.Random) -> None:
+    """Kill the program `n` times: mostly at any moment after the last kill, now and then once it is READY."""
+    with Machine(image, folder, snapshot=True) as machine:
+        cell = Cell(machine)
+        cell.acts = known(script.tubes(rng.randrange(1 << 30)))
+        cell.packet_frames = PACKET
+        runs_with(machine, f"--keep {KEPT}", "RestartSec=100ms")
+        machine.run("systemctl restart --no-block palpate", check=True)
+        cell.plug()
+        cell.until_ready(BACK_S)
+        robot, kills = Robot(cell), list[int]()
+        for i in range(n):
+            if i % EVERY:
+                doing = robot.for_seconds(rng.uniform(0, START_S))
+            else:
+                cell.until_ready(BACK_S)
+                doing = robot.for_seconds(rng.uniform(0, WORK_S))
+            kills.append(kill(cell))
+            ledger.add(doing=doing, back=0, at=len(ledger.lines))
+        cell.until_ready(BACK_S)
+        robot.touches.append(cell.sweep(BACK_S)[0])
+        cell.state()  # what is owed has been written by now
+        machine.cut()
+    code, files = found(machine.disk, folder)
+    parts = sum(path.suffix == ".part" for path in files)
+    told = lost(cell.serial.heard, sweeps(files)) | {"parts": parts, "fsck": code}
+    harmed = robot.harmed(kills)
+    ledger.add(doing="end", back=n, statuses=statuses(cell), harmed=harmed, **told)
+    assert {told[name] for name in ("lost", "parts", "fsck")} == {0}
+    assert not harmed
+
+
+def test_killed(image: Image, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]):
+    """SIGKILL at random moments, while starting, idle and sweeping: READY again each time, no kept sweep is lost."""
+    ledger, rng = Ledger("kills", image.disk), random.Random()
+    wanted = count(ledger.sum("back") + 1, 200)
+    while (left := wanted - ledger.sum("back")) > 0:
+        killed(image, tmp_path, ledger, min(left, BATCH), rng)
+    kinds = [line["doing"] for line in ledger.lines if line["doing"] != "end"]
+    where = ", ".join(f"{kinds.count(kind)} {kind}" for kind in ("starting", "idle", "sweeping"))
+    assert ledger.sum("lost") == ledger.sum("parts") == ledger.sum("fsck") == 0
+    assert not any(line.get("harmed") for line in ledger.lines)
+    note(
+        "SIGKILL at a random moment",
+        f"READY again each time ({where}); {ledger.sum('owed')} of {ledger.sum('answered')} answered sweeps had to be "
+        f"kept, {ledger.sum('lost')} of these lost; {ledger.sum('unfinished')} in progress not kept",
+        ledger.sum("back"),
+    )
+
+
+@pytest.fixture
+def disk(image: Image, tmp_path: Path) -> Path:
+    """A disk on top of the image's, on which the service keeps its sweeps."""
+    made = tmp_path / "disk.qcow2"
+    shutil.copy(image.disk, made)
+    with Machine(image, tmp_path, snapshot=True, disk=made) as machine:
+        runs_with(machine, f"--keep {KEPT}")
+        machine.run("systemctl stop --no-block palpate; sync; sync", check=True)
+    subprocess.run(["qemu-img", "snapshot", "-d", "ready", made], check=True)
+    return made
+
+
+def cut(
+    image: Image, disk: Path, folder: Path, ledger: Ledger, rng: random.Random, *, booting: bool, had: int = 0
+) -> int:
+    """One life of a box: power on, READY, sweeps, power off at a random moment; or off already while it boots.
+
+    had: sweeps that earlier lives have kept on this disk. What is there now.
+    """
+    with Machine(image, folder, disk=disk) as machine:
+        cell = Cell(machine)
+        cell.acts = known(script.tubes(rng.randrange(1 << 30)))
+        cell.packet_frames = PACKET
+        cell.plug()
+        robot, begun, ready_s, parts = Robot(cell), time.monotonic(), None, 0
+        if not booting:
+            cell.until_ready(BACK_S)
+            ready_s = round(time.monotonic() - begun, 1)
+            parts = int(machine.run(f"ls {KEPT} | grep -c part").out)
+        doing = robot.for_seconds(rng.uniform(0, BOOT_S if booting else WORK_S))
+        machine.cut()
+    code, files = found(disk, folder)
+    kept = sweeps(files)
+    told = lost(cell.serial.heard, kept) | {"parts": parts, "fsck": code}
+    told["lost"] += max(0, had - len(kept))
+    ledger.add(doing=doing, back=int(not booting), cut=1, ready_s=ready_s, statuses=statuses(cell), **told)
+    assert {told[name] for name in ("lost", "parts", "fsck")} == {0}
+    return len(kept)
+
+
+@pytest.mark.skipif(HOW != "full", reason="boots for each cut; make test-rig COUNTS=full")
+def test_power_cut(image: Image, disk: Path, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]):
+    """The power goes at random moments, while booting, idle and sweeping: it boots again, the file system is sound, no
+    kept sweep is lost."""
+    ledger, rng = Ledger("cuts", image.disk), random.Random()
+    wanted, kept = count(ledger.sum("cut") + 1, 50), 0
+    while (n := ledger.sum("cut")) < wanted:
+        # twice while it boots, then a life that has to get to READY; such a one is the last, too
+        kept = cut(image, disk, tmp_path, ledger, rng, booting=n % 3 < 2 and n < wanted - 1, had=kept)
+    kinds = [line["doing"] for line in ledger.lines]
+    where = ", ".join(f"{kinds.count(kind)} {kind}" for kind in ("starting", "idle", "sweeping"))
+    assert ledger.sum("lost") == ledger.sum("fsck") == ledger.sum("parts") == 0
+    note(
+        "power cut at a random moment",
+        f"it boots again each time ({where}), file system clean; {ledger.sum('owed')} of {ledger.sum('answered')} answered "
+        f"sweeps had to be kept, {ledger.sum('lost')} of these lost; {ledger.sum('unfinished')} in progress not kept",
+        ledger.sum("cut"),
+    )
+
+
+def test_what_is_owed():
+    """An answer before a state sentence of the same run is owed; the last of a run, and damaged lines, are not."""
+    heard = [
+        sentence("RES", 1, "5.021", "ok", "felt", "0.9", "0.8", 1, 0, "21.00", "9f", "usb", "1.00", ""),
+        sentence("STA", "6.0", "streaming", 0, 1, 1, 0, 0, 1, 0, "9f", "usb"),
+        sentence("RES", 2, "9.021", "ok", "felt", "0.9", "0.8", 1, 0, "21.00", "9f", "usb", "1.00", ""),
+        b"$PPLP,ST",
+        sentence("STA", "12.0", "streaming", 0, 0, 1, 0, 0, 1, 0, "9f", "usb"),
+        sentence("RES", 1, "15.0", "gap", "", "0.0", "0.0", 0, 9, "1.00", "9f", "usb", "1.00", ""),
+        sentence("STA", "16.0", "streaming", 0, 1, 1, 0, 0, 1, 0, "9f", "usb"),
+    ]
+    lines = [(0, line.decode().strip()) for line in heard]
+    assert [[h.sweep for h in part] for part in owed(lines)] == [[1], [2]]
+    kept = Sweep(1, 0, 0, Status.OK, Frames.empty(skin.FORMAT), complete_ns=5_000_000_000)
+    assert lost(lines, [kept]) == {"answered": 2, "owed": 1, "lost": 0, "unfinished": 1}
+    assert lost(lines, [replace(kept, complete_ns=7_000_000_000)])["lost"] == 1

@@ -1,0 +1,299 @@
+"""The system around the box fails: disk, clock, processor, memory, settings, bundle, permissions. In: a guest whose
+service keeps its sweeps on small file systems. Out: answers as ever, what is lacking told once, recovery by itself.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from appliance.capture import Playback
+from appliance.sim import script
+from appliance.sim.score import Answer
+
+from .cell import Cell
+from .conftest import HOW
+from .image import GUEST_PYTHON
+from .kept import KEPT, runs_with
+from .sound import TRIES, begin, known, not_wrong, state, until_state
+
+CAPTURE = "/run/capture"
+ROOM = "mount -t tmpfs -o remount,size={},nr_inodes={} none {}"
+START_S = 240
+"""Longest wait for a service that has to start, also where the emulator shares its processor."""
+ANSWER_S = 60
+RULES = "/etc/udev/rules.d/70-palpate.rules"
+BUNDLE = f"/opt/palpate/lib/python{GUEST_PYTHON}/site-packages/appliance/default_bundle"
+SITE = "/etc/palpate/palpate.toml"
+needs_time = pytest.mark.skipif(HOW != "full", reason="starts the service again; make test-rig COUNTS=full")
+DAMAGE = """
+import pathlib, shutil
+from appliance import bundle, errors
+whole, broken = pathlib.Path(bundle.DEFAULT), pathlib.Path("/run/broken")
+for name in sorted(p.name for p in whole.iterdir()):
+    data = (whole / name).read_bytes()
+    for how, bad in (("cut", data[: len(data) // 2]), ("empty", b""), ("gone", None),
+                     ("changed", data[:9] + bytes([data[9] ^ 1]) + data[10:])):
+        shutil.rmtree(broken, ignore_errors=True)
+        shutil.copytree(whole, broken)
+        (broken / name).unlink() if bad is None else (broken / name).write_bytes(bad)
+        try:
+            print(name, how, "loads", bundle.load(broken).id)
+        except errors.BundleError as e:
+            print(name, how, "BundleError", e)
+"""
+"""Run in the guest: each file of a bundle cut short, empty, missing, and with one bit turned."""
+
+
+@pytest.fixture(scope="module")
+def keeping(shared: Cell) -> Cell:
+    """The guest's service keeps sweeps and captures, each on a file system of its own that can be made as small as a
+    test wants."""
+    guest = shared.machine
+    shared.acts, shared.packet_frames = known(script.tubes(2)), 48
+    for place in (KEPT, CAPTURE):
+        guest.run(f"mkdir -p {place} && mount -t tmpfs -o size=96k,uid=palpate,mode=755 none {place}", check=True)
+    runs_with(guest, f"--keep {KEPT} --capture {CAPTURE}/all", f"ReadWritePaths={CAPTURE}")
+    guest.run("systemctl restart --no-block palpate", check=True)
+    shared.plug()
+    shared.until_ready(START_S)
+    return shared
+
+
+@pytest.fixture
+def box(keeping: Cell, cell: Cell) -> Cell:
+    """That guest, READY, with room for a few sweeps."""
+    cell.machine.run(ROOM.format("1m", 1000, KEPT), check=True)
+    return cell
+
+
+def sound(cell: Cell) -> Answer:
+    """A sweep that is answered `ok`, when all that follows an answer in its turn has been done too."""
+    answers = []
+    for _ in range(TRIES):
+        touch, answer = cell.sweep(ANSWER_S)
+        answers.append(not_wrong(touch, answer))
+        state(cell)
+        if answer.status == "ok":
+            return answer
+    raise AssertionError(f"no sweep is ok: {answers}")
+
+
+def said(cell: Cell, text: str) -> int:
+    """How many lines of the journal hold a text."""
+    return int(cell.machine.run(f"journalctl -u palpate -o cat | grep -cF '{text}'", timeout_s=60).out)
+
+
+def until_said(cell: Cell, text: str, since: int = 0, timeout_s: float = START_S) -> None:
+    """Wait until more than `since` lines hold it."""
+    end = time.monotonic() + timeout_s
+    while said(cell, text) <= since:
+        assert time.monotonic() < end, f"the box has not said {text!r}, but: {cell.journal()}"
+        time.sleep(1)
+
+
+def files(cell: Cell) -> dict[str, str]:
+    """Name and digest of each file of kept sweeps."""
+    lines = cell.machine.run(f"cd {KEPT} && find . -type f -exec md5sum {{}} +", check=True).out.splitlines()
+    return {line.split()[1]: line.split()[0] for line in lines}
+
+
+def used_k(cell: Cell) -> int:
+    """KiB of kept sweeps."""
+    return int(cell.machine.run(f"df --output=used -k {KEPT} | tail -1", check=True).out)
+
+
+def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
+    """Room for n pages, or for no file: every sweep is answered, told once, nothing stays but what was whole."""
+    empty = used_k(box)
+    sound(box)
+    before, used = files(box), used_k(box)
+    pages = (used - empty) // 4  # of a whole sweep; with one less it does not fit
+    rooms = [*(range(pages) if HOW == "full" else [pages - 1]), -1]
+    for n in rooms:
+        room = (f"{used + 4 * n}k", 1000) if n >= 0 else ("1m", 1 + len(before))
+        box.machine.run(ROOM.format(*room, KEPT), check=True)
+        answer = sound(box)
+        assert said(box, f"keep: sweep {answer.sweep} cannot be saved: No space left on device; see that {KEPT}") == 1
+        assert files(box) == before
+    box.machine.run(ROOM.format("1m", 1000, KEPT), check=True)
+    sound(box)
+    assert files(box).items() > before.items()
+    note("disk full while a sweep is kept (ENOSPC at each page, no inode)", "answered; told; nothing half", len(rooms))
+
+
+def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., None]):
+    """The capture's disk is full: told once, it ends, sweeps go on, and what it holds can be played."""
+    until_said(box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here")
+    sound(box)
+    assert said(box, "capture:") == said(box, "it ends here") == 1
+    pieces = [box.machine.run(f"dd if={CAPTURE}/all bs=12k skip={n} count=1 2>/dev/null | base64") for n in range(8)]
+    (tmp_path / "all").write_bytes(b"".join(base64.b64decode(piece.out) for piece in pieces))
+    play, frames = Playback(tmp_path / "all"), 0
+    while not play.finished:
+        frames += len(play.read())
+        play.edges(play.now_ns())
+        play.commands()
+    assert frames > 750
+    note("disk full while a capture is written", "ends there, told once; what was written plays", 1)
+
+
+@needs_time
+def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
+    """No room for the journal nor anywhere else: sweeps and plugs go on; it is written again when there is room."""
+    fill = "fallocate -l $(df --output=avail -B1 {0} | tail -1) {0}/fill; dd if=/dev/zero of={0}/fill2 2>/dev/null;"
+    try:
+        box.machine.run(fill.format("/run") + fill.format("/var"), timeout_s=200)
+        box.unplug()
+        assert box.lines.wait("FAULT", True, 30)
+        box.plug()
+        box.until_ready()
+        sound(box)
+    finally:
+        box.machine.run("rm -f /run/fill* /var/fill*")
+    told = said(box, "skin: ")
+    box.unplug()
+    until_said(box, "skin: ", told)
+    box.plug()
+    box.until_ready()
+    note("no room on any disk, journal included", "answered; replugged skin taken; journal goes on", 1)
+
+
+def test_clock_set(box: Cell, note: Callable[..., None]):
+    """An hour back and a year forward in the middle of sweeps: answers, times and files know nothing of it."""
+    for change in ("-1 hour", "+1 year"):
+        since = len(box.serial.heard)
+        touch = begin(box)
+        box.machine.run(f"date -s \"$(date -d '{change}')\"", check=True)
+        assert not_wrong(touch, box.answer(since, ANSWER_S)) in ("ok", "gap")
+        times = [float(line.split(",")[2]) for _, line in box.serial.heard[since:] if line.startswith("$PPLP,STA,")]
+        assert times == sorted(times)
+    sound(box)
+    box.machine.run(f"hwclock -s || date -s @{int(time.time())}")
+    texts = box.machine.run(f"cd {KEPT} && for f in *.json; do tr -d '\\n' < $f; echo; done", check=True).out
+    about = [json.loads(text) for text in texts.splitlines()]
+    assert [a["start_ns"] for a in about] == sorted(a["start_ns"] for a in about)
+    assert all(0 < a["stop_ns"] - a["start_ns"] < 6e9 for a in about)
+    assert all(name[2:8] == "sweep-" for name in files(box))
+    note("clock set back an hour, forward a year, during a sweep", "answered; times and files unmoved", 2)
+
+
+def by_hand(cell: Cell) -> str:
+    """The status of a sweep over an empty skin, or none: edges three seconds apart."""
+    since = len(cell.serial.heard)
+    for name in ("START", "STOP"):
+        for level in (True, False):
+            cell.lines.set(name, level)
+            time.sleep(0.3)
+        time.sleep(2.5)
+    return cell.answer(since, ANSWER_S).status
+
+
+def swept(cell: Cell) -> str:
+    """The status of a sweep; by hand where the board cannot tell when its frames reach a box that is behind."""
+    since = len(cell.serial.heard)
+    touch = cell.touch()
+    if touch.played.wait(10):
+        return not_wrong(touch, cell.answer(since, ANSWER_S))
+    cell.hand.touches.get_nowait()
+    return by_hand(cell)
+
+
+def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[..., None]):
+    """Four programs that want all of both cores: each sweep is answered, what was lost is counted, none is wrong."""
+    silent = "skin: the skin is there but sent no frame for"
+    lost, told = int(state(box)["lost"]), said(box, silent)
+    box.machine.run("for n in 1 2 3 4; do systemd-run -q --unit hog$n sh -c 'while :; do :; done'; done", check=True)
+    try:
+        answers = Counter(swept(box) for _ in range(count(1, 8)))
+    finally:
+        box.machine.run("systemctl stop 'hog*'", timeout_s=120, check=True)
+    # without a turn for half a second it takes the skin for silent, and starts it again
+    assert answers.keys() <= {"ok", "no-contact", "gap", "sensor-lost"}, box.journal(40)
+    assert answers["sensor-lost"] <= said(box, silent) - told
+    sound(box)
+    more = int(state(box)["lost"]) - lost
+    note("four busy loops on two cores", f"answered {dict(answers)}, {more} frames lost", answers.total())
+
+
+def test_permission_lost(box: Cell, note: Callable[..., None]):
+    """The skin's node and the folder are taken away from the service: named, sweeps `not-ready` or not kept; given back,
+    both are used again."""
+    guest = box.machine
+    guest.run("chmod 000 /dev/bus/usb/*/*", check=True)
+    sound(box)  # what is open stays open
+    guest.run(f"mv {RULES} /root/rules && udevadm control --reload", check=True)
+    try:
+        box.unplug()
+        box.plug()
+        until_state(box, "denied")
+        assert box.lines.wait("FAULT", True, 10)
+        assert by_hand(box) == "not-ready"
+        until_said(box, "skin may not be opened by this user (errno 13); install the udev rule, join group plugdev")
+    finally:
+        guest.run(f"mv /root/rules {RULES} && udevadm control --reload && udevadm trigger -c add -s usb", check=True)
+    box.until_ready()
+    before = files(box)
+    guest.run(f"chown root {KEPT}", check=True)
+    answer = sound(box)
+    assert said(box, f"keep: sweep {answer.sweep} cannot be saved: Permission denied; see that {KEPT} has room") == 1
+    assert files(box) == before
+    guest.run(f"chown palpate {KEPT}", check=True)
+    sound(box)
+    assert files(box).items() > before.items()
+    note("permission lost: device node, folder", "denied and not-ready, or told; used again when given back", 3)
+
+
+@needs_time
+def test_memory_limit(box: Cell, note: Callable[..., None]):
+    """The unit's memory is cut to nothing: the program is killed, started again, and READY once it has its memory."""
+    restarts = "systemctl show -P NRestarts palpate"
+    before, streamed = int(box.machine.run(restarts).out), said(box, "skin: streaming")
+    limit = "systemctl set-property --runtime palpate MemoryMax="
+    box.machine.run(limit + "4M", timeout_s=120)
+    until_said(box, "oom-kill")
+    box.machine.run(limit + "128M", timeout_s=120, check=True)
+    until_said(box, "skin: streaming", streamed)
+    box.until_ready()
+    sound(box)
+    assert int(box.machine.run(restarts).out) > before
+    note("memory limit reached", "killed, started again, READY", 1)
+
+
+@needs_time
+def test_settings_and_bundle_broken(box: Cell, note: Callable[..., None]):
+    """A misspelt key, then a bundle that was cut short: each is named with what to do, READY stays low, the service keeps
+    trying; mended, it comes up by itself."""
+    guest = box.machine
+    settings = guest.get(SITE)
+    guest.run(f"cp -r {BUNDLE} /run/bundle && truncate -s 1000 /run/bundle/model.onnx", check=True)
+    guest.put(SITE, settings + b'\n[classifier]\nbundel = "/run/bundle"\n')
+    guest.run("systemctl restart --no-block palpate", check=True)
+    assert box.lines.wait("READY", False, 60)
+    until_said(box, f"{SITE}: classifier.bundel is unknown; did you mean classifier.bundle?")
+    guest.put(SITE, settings + b'\n[classifier]\nbundle = "/run/bundle"\n')
+    until_said(box, "/run/bundle: model.onnx was altered")
+    assert not box.lines.levels["READY"]
+    guest.run(f"cp {BUNDLE}/model.onnx /run/bundle", check=True)
+    box.until_ready(START_S)
+    sound(box)
+    guest.put(SITE, settings)
+    note("settings with a misspelt key; bundle cut short", "named; tried again for ever; READY once mended", 2)
+
+
+def test_bundle_files_broken(box: Cell, note: Callable[..., None]):
+    """Each file of a bundle cut short, empty, missing, altered by one bit: each is refused as a BundleError that names it."""
+    told = box.machine.run("cd / && /opt/palpate/bin/python -I -", stdin=DAMAGE.encode(), timeout_s=200, check=True).out
+    lines = told.splitlines()
+    assert len(lines) >= 12
+    for line in lines:
+        name, _, what, why = line.split(" ", 3)
+        assert what == "BundleError", line
+        assert name.removesuffix(".json") in why or "no bundle at" in why, line
+    note("each file of a bundle cut, empty, missing, altered", "BundleError that names it", len(lines))
