@@ -59,7 +59,7 @@ class Peer:
 
     mangle: what the cable does to a transfer; more than was asked for is a babble. silent: transfers never end.
     deaf: requests are never answered. slow_s: they are answered so late. halted: the endpoint stalls until it is cleared.
-    sent: transfers that the guest took. opened: how often the guest's kernel has set up a device.
+    sent: transfers that the guest took. asked: requests that it made. opened: how often the guest's kernel has set up a device.
     """
 
     def __init__(self, connection: socket.socket) -> None:
@@ -68,7 +68,7 @@ class Peer:
         self.silent = self.deaf = self.halted = False
         self.slow_s = 0.0
         self.descriptors = Descriptors()
-        self.sent = self.opened = 0
+        self.sent = self.asked = self.opened = 0
         self._socket, self._wide = connection, False
         self._waiting: deque[tuple[int, int]] = deque()  # (id, length) of bulk transfers that the guest has asked for
         self._replied: dict[int, bytes] = {}
@@ -206,6 +206,7 @@ class Peer:
 
     def _control(self, ident: int, body: bytes) -> None:
         ep, request, kind, _, value, index, length = struct.unpack_from("<BBBBHHH", body)
+        self.asked += 1
         if self.deaf or not self.board:
             return
         reply: bytes | None = b""

@@ -1,0 +1,122 @@
+"""What a robot checks around a fault: that the box came back by itself, and that no answer names what was not touched.
+
+In: a cell. Out: right sweeps, state fields, or AssertionError with what the box says.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from appliance import bundle
+from appliance.classifier import Classifier
+from appliance.clock import SystemClock
+from appliance.sim import rig, skin
+from appliance.sim.score import Answer
+from appliance.sweep import Frames, Status, Sweep
+
+from .cell import BEGUN_S, Cell, Touch
+
+FIELDS = (
+    "time", "state", "sweeping", "answered", "received", "lost", "garbage", "enumerations", "dropped", "bundle",
+    "source",
+)  # fmt: skip
+"""Of a state sentence (PROTOCOL.md, part 2)."""
+LATE = {"gap", "short", "edges-lost", "sensor-lost", "not-ready", "unsure", "unknown"}
+"""Answers to sound sweeps while the emulator stands still: frames or edges come to its kernel half a second late, and the
+window lies beside its place.
+"""
+OPEN_NS = 1_000_000_000
+"""A sweep is open so long after its start edge, at most."""
+SHIFTS = -4, 0, 4
+TRIES = 6
+
+
+def known(acts: Iterable[rig.Act]) -> Iterator[rig.Act]:
+    """Those that the default bundle names right by itself, also a few frames beside the middle: what else comes is a fault."""
+    model, window = bundle.load(bundle.DEFAULT), skin.FORMAT.window
+    alone = Classifier(model, SystemClock())
+    for act in acts:
+        first = (act.start + act.stop - window) // 2
+        verdicts = []
+        for shift in SHIFTS:
+            taxels = act.frames[first + shift :][:window]
+            frames = Frames(np.arange(window), np.arange(window), taxels)
+            verdicts.append(alone(Sweep(1, 0, 1, Status.OK, frames)))
+        if all((v.status, v.label) == (Status.OK, act.label) for v in verdicts):
+            yield act
+
+
+def not_wrong(touch: Touch, answer: Answer) -> str:
+    """The status of an answer. Raises AssertionError where it names another material than was touched."""
+    assert answer.label in ("", touch.act.label), f"{touch.act.label} was answered {answer}"
+    return answer.status
+
+
+def comes_back(cell: Cell) -> None:
+    """READY by itself, then a right sweep. Raises AssertionError where that does not come."""
+    said = []
+    for _ in range(TRIES):
+        cell.until_ready()
+        touch, answer = cell.sweep()
+        said.append(not_wrong(touch, answer))
+        if answer.status == "ok":
+            return
+        assert answer.status in LATE, f"a sound sweep was answered {answer}"
+    raise AssertionError(f"{TRIES} sound sweeps were answered {said}; the box says: {cell.journal()}")
+
+
+def state(cell: Cell) -> dict[str, str]:
+    """The fields of a state sentence, as of now."""
+    said = cell.serial.ask("$PPLP,STATE", 30).split("*")[0].split(",")[4:]
+    return dict(zip(FIELDS, said, strict=True))
+
+
+def until_state(cell: Cell, wanted: str, timeout_s: float = 30) -> None:
+    """Wait until the skin is in a state. Raises AssertionError where it does not come to it."""
+    end, seen = time.monotonic() + timeout_s, Counter[str]()
+    while (now := state(cell)["state"]) != wanted:
+        seen[now] += 1
+        assert time.monotonic() < end, f"never {wanted}, but {dict(seen)}; the box says: {cell.journal()}"
+        time.sleep(0.02)
+
+
+def begin(cell: Cell) -> tuple[Touch, int]:
+    """A sweep that the box says is open, and the number of lines heard before it. Tried again where the emulator stood
+    still while the start edge came and went. Raises AssertionError where none opens."""
+    for _ in range(TRIES):
+        since = len(cell.serial.heard)
+        touch = cell.touch()
+        assert touch.played.wait(BEGUN_S), "the board did not come to it"
+        until(touch.start_ns)
+        while time.monotonic_ns() < touch.start_ns + OPEN_NS:
+            if state(cell)["sweeping"] == "1":
+                return touch, since
+        let_go(cell)
+        cell.until_ready()
+    raise AssertionError(f"{TRIES} start edges opened no sweep; the box says: {cell.journal()}")
+
+
+def until(host_ns: int) -> None:
+    """Wait until that time."""
+    time.sleep(max(0.0, (host_ns - time.monotonic_ns()) / 1e9))
+
+
+def let_go(cell: Cell) -> None:
+    """The robot ends a sweep that was answered early: its edges do not come any more."""
+    for name in ("START", "STOP"):
+        cell.lines.forget(name, 0)
+        cell.lines.set(name, False)
+
+
+def only_answer(cell: Cell, since: int, seconds: float = 0.3) -> Answer:
+    """The one answer since line number `since`. Raises AssertionError where a second comes within `seconds`."""
+    first = cell.answer(since)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        assert len(cell.answers(since)) == 1, cell.answers(since)
+        time.sleep(0.02)
+    return first

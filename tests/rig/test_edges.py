@@ -1,0 +1,277 @@
+"""What the trigger lines can do to the box, on a real kernel. In: edges that no sound robot makes. Out: one answer each.
+
+Seen from the robot: statuses, READY, FAULT and the other lines, and a right sweep afterwards.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from appliance.sim import script
+from appliance.sim.score import Answer
+
+from .cell import Cell, Touch
+from .sound import comes_back, known, let_go, not_wrong, until
+
+Count = Callable[[int, int], int]
+Note = Callable[[str, str, int], None]
+
+OTHER_WIRING = """
+[trigger]
+mode = "one-line"
+start = "START"
+new_object = "STOP"
+glitch_us = 20000
+storm_edges = 200
+[output]
+ready = "READY"
+fault = "FAULT"
+result_valid = "RESULT-VALID"
+busy = "CLASS-0"
+decided = "CLASS-1"
+[classifier]
+early = true
+[sweep]
+longest_s = 4.0
+[serial]
+port = "/dev/palpate-robot"
+"""
+BUSY, DECIDED = "CLASS-0", "CLASS-1"
+PULSE_NS = 500_000_000
+"""After so long the robot's own pulse is over: both edges of a glitch within it would be an end of it."""
+MANY = 10_000
+"""Of so many interrupts more than the kernel's 1024 events stay, however many are joined."""
+HALT_S = 6
+"""Less than the watchdog's time on a robot, ten seconds."""
+WIDTHS_S = (0.0005, 0.001, 0.002, 0.005)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def robot(shared: Cell) -> None:
+    """Sweeps whose answer is known, and large packets: what is asked here is not how fast it goes."""
+    shared.acts, shared.packet_frames = known(script.tubes(3)), 18
+
+
+def pulse(cell: Cell, name: str, width_s: float = 0.1) -> None:
+    """A pulse that the host ends `width_s` after it began, or later where it is busy; then as long a pause."""
+    for level in (True, False):
+        cell.lines.set(name, level)
+        time.sleep(width_s)
+
+
+def glitch(cell: Cell, name: str) -> None:
+    """The shortest pulse there is: both edges before the guest can look."""
+    cell.lines.run_through([(name, True), (name, False)])
+
+
+def answers(cell: Cell, since: int, n: int) -> list[Answer]:
+    """The first `n` answers of the lines from number `since` on, when they are there."""
+    end = time.monotonic() + 30
+    while len(found := cell.answers(since)) < n and time.monotonic() < end:
+        time.sleep(0.01)
+    assert len(found) >= n, f"{len(found)} answers instead of {n}; the box says: {cell.journal()}"
+    return found[:n]
+
+
+def statuses(cell: Cell, since: int, n: int) -> list[str]:
+    """What they say."""
+    return [answer.status for answer in answers(cell, since, n)]
+
+
+def interrupts(cell: Cell) -> int:
+    """Edges that the guest's kernel has noticed on all inputs."""
+    return int(cell.machine.run("awk '/palpate/ {n += $2 + $3} END {print n}' /proc/interrupts", check=True).out)
+
+
+@contextmanager
+def halted(cell: Cell) -> Iterator[None]:
+    """The program stands still meanwhile; the kernel does not."""
+    pid = cell.machine.run("systemctl show --property MainPID --value palpate", check=True).out.strip()
+    cell.machine.run(f"kill -STOP {pid}", check=True)
+    try:
+        yield
+    finally:
+        cell.machine.run(f"kill -CONT {pid}", check=True)
+
+
+def toggle(cell: Cell, name: str, edges: int) -> None:
+    """So many edges, as fast as they go one by one."""
+    for i in range(edges):
+        cell.lines.set(name, i % 2 == 0)
+
+
+def test_glitches(cell: Cell, count: Count, note: Note) -> None:
+    """Pulses that are over before the kernel can look are nothing, on both lines; longer ones are an edge or nothing."""
+    since, times = len(cell.serial.heard), count(20, 500)
+    for _ in range(times):
+        for name in ("START", "STOP"):
+            glitch(cell, name)
+            time.sleep(0.01)
+    cell.wait(0.2)
+    assert cell.answers(since) == []
+    note("glitch, both edges in one interrupt", "nothing", 2 * times)
+    for width_s in WIDTHS_S:
+        since = len(cell.serial.heard)
+        for _ in range(times):
+            pulse(cell, "START", width_s)
+        pulse(cell, "STOP")
+        cell.serial.wait_for("$PPLP,STA,", 5, len(cell.serial.heard))
+        seen = Counter(answer.status for answer in cell.answers(since))
+        assert seen.keys() <= {"no-stop", "short", "no-start"}, seen
+        starts = seen["no-stop"] + seen["short"]
+        assert starts <= times
+        note(f"pulse of {1000 * width_s:g} ms", f"{starts} starts, {times - starts} times nothing", times)
+
+
+def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: Note) -> None:
+    """A start edge while a sweep is open: `no-stop`, and the new sweep is right, though glitches come all the time."""
+    said: Counter[str] = Counter()
+    for _ in range(count(1, 10)):
+        cell.until_ready()
+        since = len(cell.serial.heard)
+        pulse(cell, "START")
+        assert cell.lines.wait("READY", False, 5)
+        touch = cell.touch()
+        first = cell.answer(since)
+        assert first.status == "no-stop"
+        until(touch.start_ns + PULSE_NS)
+        glitches = 0
+        while time.monotonic_ns() < touch.stop_ns - PULSE_NS:
+            glitch(cell, "START")
+            glitch(cell, "STOP")
+            glitches += 2
+            cell.wait(0.05)
+        _, second = answers(cell, since, 2)
+        said[not_wrong(touch, second)] += 1
+    assert said["ok"], said
+    note("start edge while a sweep is open, glitches in the next", f"no-stop, then {dict(said)}", said.total())
+
+
+def test_stop_without_start(cell: Cell, note: Note) -> None:
+    """A stop edge alone is `no-start`; so it is for each sweep while START is stuck, low or high."""
+    since = len(cell.serial.heard)
+    pulse(cell, "STOP")
+    assert statuses(cell, since, 1) == ["no-start"]
+    cell.lines.set("START", True)
+    assert cell.lines.wait("READY", False, 5)
+    for _ in range(3):
+        pulse(cell, "STOP")
+    assert statuses(cell, since, 4)[1:] == ["short", "no-start", "no-start"]
+    cell.lines.set("START", False)
+    cell.wait(0.1)
+    assert len(cell.answers(since)) == 4
+    note("stop without start, START stuck low or high", "no-start", 3)
+
+
+def test_stop_is_stuck(cell: Cell, count: Count, note: Note) -> None:
+    """With STOP stuck, low or high, a sweep is answered `long` after sweep.longest_s; the next is right by itself."""
+    levels = [False, True][: count(0, 2)]
+    if not levels:
+        pytest.skip("twelve seconds each; in the full run")
+    for level in levels:
+        let_go(cell)
+        cell.wait(0.1)
+        since = len(cell.serial.heard)
+        cell.lines.set("STOP", level)
+        answers(cell, since, int(level))
+        pulse(cell, "START")
+        assert statuses(cell, since, level + 1)[level:] == ["long"]
+        assert cell.lines.wait("READY", True, 5)
+        cell.lines.set("STOP", False)
+        comes_back(cell)
+    note("STOP stuck, low and high", "long, then right", len(levels))
+
+
+def test_storm(cell: Cell, note: Note) -> None:
+    """10,000 edges on START: each is a start or is joined with others; no verdict, and a right sweep when it is quiet."""
+    since = len(cell.serial.heard)
+    toggle(cell, "START", 10_000)
+    cell.wait(0.1)
+    pulse(cell, "STOP")
+    cell.until_ready(15)
+    cell.serial.wait_for("$PPLP,STA,", 5, len(cell.serial.heard))
+    seen = Counter(answer.status for answer in cell.answers(since))
+    assert seen.keys() <= {"no-stop", "short", "no-start", "edges-lost", "not-ready"}, seen
+    comes_back(cell)
+    told = ", ".join(f"{n} {status}" for status, n in seen.most_common())
+    note("storm of 10,000 edges", f"{told or 'nothing'}; then a right verdict", 1)
+
+
+def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
+    """Start and stop in one turn are told in order; of more than the kernel holds, `edges-lost`; then all is well."""
+    since = len(cell.serial.heard)
+    with halted(cell):
+        pulse(cell, "START")
+        pulse(cell, "STOP")
+    assert statuses(cell, since, 1) == ["short"]
+    note("start and stop in one turn", "short", 1)
+    since = len(cell.serial.heard)
+    with halted(cell):
+        pulse(cell, "START")
+        begun, end = interrupts(cell), time.monotonic() + HALT_S
+        while interrupts(cell) < begun + MANY and time.monotonic() < end:
+            toggle(cell, "STOP", 1000)
+    cell.until_ready(20)
+    cell.state()
+    said = [answer.status for answer in cell.answers(since)]
+    assert said in (["edges-lost"], ["not-ready", "edges-lost"])
+    comes_back(cell)
+    note("event queue overrun", f"{', '.join(said)}; then a right verdict", 1)
+
+
+def one_line_sweep(cell: Cell) -> tuple[Touch, int]:
+    """A whole sweep of a robot with one line, and the number of the line that was heard before it."""
+    since = len(cell.serial.heard)
+    touch = cell.touch(start=False, stop=False)
+    assert touch.played.wait(60)
+    cell.lines.drive("START", True, touch.start_ns)
+    cell.lines.drive("START", False, touch.stop_ns)
+    return touch, since
+
+
+def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
+    """One-line mode, NEW OBJECT, BUSY and DECIDED on the same chip; a line that is high at start-up makes no sweep.
+
+    A storm, here of bursts, raises FAULT until it is over, and a line that stays high is `long`. The last test of this
+    guest: the wiring stays.
+    """
+    cell.lines.set("START", True)
+    cell.machine.put("/etc/palpate/palpate.toml", OTHER_WIRING.encode())
+    cell.machine.run("systemctl restart --no-block palpate", check=True)
+    assert cell.lines.wait("READY", False, 20)
+    since = len(cell.serial.heard)
+    cell.until_ready()
+    cell.lines.set("START", False)
+    assert statuses(cell, since, 1) == ["no-start"]
+    pulse(cell, "STOP")  # NEW OBJECT
+    told = []
+    for _ in range(2):
+        begun = len(cell.lines.log)
+        touch, since = one_line_sweep(cell)
+        told += [(touch, *answers(cell, since, 1))]
+        assert cell.lines.wait("READY", True, 10)
+        cell.wait(max(0.0, (touch.stop_ns - time.monotonic_ns()) / 1e9) + 0.3)
+        seen = [(name, level) for _, name, level in cell.lines.log[begun:]]
+        assert seen.index((BUSY, True)) < seen.index((DECIDED, True)) if told[-1][1].share < 1 else (BUSY, True) in seen
+        assert seen.index((BUSY, False)) > seen.index((BUSY, True))
+    assert [answer.fused for _, answer in told] == [1, 2]
+    assert not_wrong(*told[0]) == "ok"
+    note("one-line mode, NEW OBJECT, BUSY, DECIDED, high at start-up", "work; no-start for the fall", 2)
+
+    since, begun = len(cell.serial.heard), len(cell.lines.log)
+    toggle(cell, "START", count(2000, 10_000))
+    assert statuses(cell, since, 1) == ["edges-lost"]
+    assert ("FAULT", True) in [(name, level) for _, name, level in cell.lines.log[begun:]]
+    assert cell.lines.wait("FAULT", False, 10)
+    cell.until_ready()
+    note(f"storm of {count(2000, 10_000)} edges in one burst", "FAULT and edges-lost; READY by itself", 1)
+    since = len(cell.serial.heard)
+    cell.lines.set("START", True)
+    assert statuses(cell, since, 1) == ["long"]
+    cell.lines.set("START", False)
+    note("START stuck high in one-line mode", "long", 1)

@@ -1,0 +1,188 @@
+"""What the serial line can do to the box, on a real kernel. In: a robot that is deaf, noisy or gone, a port that goes,
+another program. Out: sentences again by themselves, and meanwhile sweeps that are answered on the lines.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance import bundle
+from appliance.sim import script
+from appliance.sim.score import Answer
+from appliance.sink import MAX_LINE, checksum
+
+from .cell import Cell, Touch
+from .far_end import FarEnd
+from .sound import known, not_wrong
+
+Count = Callable[[int, int], int]
+Note = Callable[[str, str, int], None]
+
+PORT = "/dev/palpate-robot"
+ADAPTER = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_R1-if00-port0"
+DROPPED, LOST_FRAMES = 8, 5
+"""Fields of STA, counted from 0."""
+AS_NOBODY = "setpriv --reuid nobody --regid dialout --clear-groups"
+HOLD = "import fcntl, sys, termios, time; f = open(sys.argv[1]); fcntl.ioctl(f, termios.TIOCEXCL); time.sleep(600)"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def robot(shared: Cell) -> None:
+    """Sweeps whose answer is known, and large packets: what is asked here is not how fast it goes."""
+    shared.acts, shared.packet_frames = known(script.tubes(4)), 18
+
+
+def shown(cell: Cell) -> Touch:
+    """A sweep that is answered on the lines at least: RESULT VALID rises over the code of what was touched, or of nothing."""
+    cell.until_ready()
+    before, touch = len(cell.lines.log), cell.touch()
+    end = time.monotonic() + 60
+    while ("RESULT-VALID", True) not in [(name, level) for _, name, level in cell.lines.log[before:]]:
+        assert time.monotonic() < end, f"the sweep was not answered; the box says: {cell.journal()}"
+        cell.wait(0.02)
+    assert cell.lines.code() in (0, 1 + bundle.load(bundle.DEFAULT).manifest.labels.index(touch.act.label))
+    return touch
+
+
+def test_cable_out(cell: Cell, note: Note) -> None:
+    """Without a robot at the other end sweeps are shown on the lines; when it is back, it hears the next sentence."""
+    answered = int(cell.state()[3])
+    cell.serial.close()
+    try:
+        shown(cell)
+    finally:
+        cell.serial.open()
+    assert cell.state()[3] == str(answered + 1)
+    assert cell.serial.ask("$PPLP,ID").startswith("$PPLP,ANS,ID,ok")
+    note("cable of the serial line out", "lines go on; sentences again when it is in", 1)
+
+
+def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
+    """Sentences pile up, the oldest are dropped and counted, no frame is lost; when it reads the newest come, whole."""
+    begun, before = time.monotonic(), cell.state()
+    cell.serial.deaf = True
+    since = len(cell.serial.heard)
+    for _ in range(200):  # the line alone holds some: QEMU's, the port's and the kernel's
+        cell.serial.say(b"$PPLP,STATE\r\n")
+        time.sleep(0.01)
+    touch = shown(cell)
+    cell.wait(begun + count(8, 60) - time.monotonic())
+    assert len(cell.serial.heard) <= since + 1
+    cell.serial.deaf = False
+    cell.serial.say(b"$PPLP,ID\r\n")
+    cell.serial.wait_for("$PPLP,ANS,ID,ok", 30, since)  # all that waited is out before this
+    after = cell.state()
+    heard = [line for _, line in cell.serial.heard[since:]]
+    dropped = int(after[DROPPED]) - int(before[DROPPED])
+    assert dropped > 0
+    assert after[LOST_FRAMES] == before[LOST_FRAMES]
+    (result,) = [line for line in heard if ",RES," in line]
+    answer = Answer.read(result)
+    assert answer
+    not_wrong(touch, answer)
+    assert all(sound(line) for line in heard[1:])  # the first may be the one that was being read
+    # 200 answers, a result and a state each second were said; what was not dropped came out
+    assert 200 + 1 - dropped < len(heard) < 200 + 1 - dropped + 2 * count(8, 60)
+    note(
+        f"robot does not read for {count(8, 60)} s", "sweep shown on the lines, sentences dropped and counted", dropped
+    )
+
+
+def sound(line: str) -> bool:
+    """Whether a line is a whole sentence."""
+    body, _, given = line.removeprefix("$").partition("*")
+    return line.startswith("$PPLP,") and given == checksum(body)
+
+
+def test_break_and_noise(cell: Cell, count: Count, note: Note) -> None:
+    """After a break, noise, half sentences and a line without end, each whole command is answered, and not twice."""
+    for _ in range(count(3, 100)):
+        cell.machine.qmp("chardev-send-break", id="robot")
+        assert cell.serial.ask("$PPLP,ID").startswith("$PPLP,ANS,ID,ok")
+    note("break", "the next command is obeyed", count(3, 100))
+    rng = np.random.default_rng(1)
+    times = count(10, 300)
+    for _ in range(times):
+        junk = rng.bytes(int(rng.integers(1, MAX_LINE - 16))).translate(None, b"\r\n$")
+        since = len(cell.serial.heard)
+        cell.serial.say(junk + b"$PPLP,ID\r\n" + junk[:20] + b"\r\n$PPLP,STA" + junk[20:40] + b"$PPLP,NEW\r\n$PPLP,TES")
+        cell.serial.wait_for("$PPLP,ANS,NEW,ok", 10, since)
+        answers = [line.split("*")[0].split(",")[2:4] for _, line in cell.serial.heard[since:] if ",ANS," in line]
+        assert [a for a in answers if a[1] == "ok"] == [["ID", "ok"], ["NEW", "ok"]]
+        assert len(answers) <= 4
+        cell.serial.say(b"\n")
+    note("commands amid noise", "each answered", 2 * times)
+    size = count(10_000, 100_000)
+    for junk in (b"x" * size, rng.bytes(size)):
+        since = len(cell.serial.heard)
+        cell.serial.say(junk + b"\r\n")
+        cell.state()  # by then noise has been told from commands, and answered; a robot waits so long at least
+        cell.serial.say(b"$PPLP,ID\r\n")
+        cell.serial.wait_for("$PPLP,ANS,ID,ok", 60, since)
+    assert len(cell.state()) == 11
+    note(f"{size} bytes of noise, with line ends and without", "the next command is obeyed", 2)
+
+
+def tries(cell: Cell, port: str) -> str:
+    """What a user of group dialout hears who wants to open a port."""
+    return cell.machine.run(f"{AS_NOBODY} sh -c ': < {port}'").out
+
+
+def test_another_program_and_an_adapter(cell: Cell, tmp_path: Path, count: Count, note: Note) -> None:
+    """The kernel keeps other users off the port, but not root, until the box is killed; a port that another program holds
+    is taken when it is free; an adapter is pulled and put in again. The last test of this guest: the settings stay.
+    """
+    assert "busy" in tries(cell, PORT)
+    assert cell.machine.run(f": < {PORT}").rc == 0
+    settings = cell.machine.get("/etc/palpate/palpate.toml").decode().replace(PORT, ADAPTER)
+    cell.machine.put("/etc/palpate/palpate.toml", settings.encode())
+    far = plug(cell, tmp_path / "robot", first=True)
+    assert cell.machine.run(f"until test -e {ADAPTER}; do sleep .1; done", timeout_s=20).rc == 0
+    hold = f"{AS_NOBODY} python3 -c '{HOLD}' {ADAPTER}"
+    cell.machine.run(f"{hold} > /dev/null 2>&1 & echo $! > /run/holder", check=True)
+    cell.machine.run("systemctl kill -s KILL palpate", check=True)
+    assert cell.lines.wait("READY", False, 20)
+    assert tries(cell, PORT) == ""
+    cell.until_ready()
+    end = time.monotonic() + 20
+    while "end the program that has it" not in cell.journal() and time.monotonic() < end:
+        cell.wait(0.2)
+    assert "end the program that has it" in cell.journal()
+    assert far.heard == []
+    cell.machine.run("kill $(cat /run/holder)", check=True)
+    far.wait_for("$PPLP,STA,", 10)
+    note("port held by another program", "told, taken when it is free; it is refused to others", 1)
+    assert "busy" in tries(cell, ADAPTER)
+    times = count(2, 30)
+    for i in range(times):
+        cell.machine.qmp("device_del", id="adapter")
+        cell.machine.run(f"while test -e {ADAPTER}; do sleep .05; done", check=True)
+        far.close()
+        far = plug(cell, tmp_path / f"robot{i}")
+        far.wait_for("$PPLP,STA,", 20)
+        assert far.ask("$PPLP,ID").startswith("$PPLP,ANS,ID,ok")
+    cell.restore()  # an emulator that was busy with all this has a board with seconds of frames in hand
+    shown(cell)
+    far.wait_for("$PPLP,RES,", 5)
+    assert "it is opened again when it is back" in cell.journal()
+    note("serial adapter pulled and put in again", "sentences come again", times)
+
+
+def plug(cell: Cell, path: Path, *, first: bool = False) -> FarEnd:
+    """Plug an FTDI adapter in; the robot's end of it."""
+    if not first:
+        cell.machine.qmp("chardev-remove", id="adapter")
+    address = {"type": "unix", "data": {"path": str(path)}}
+    backend = {"type": "socket", "data": {"addr": address, "server": True, "wait": False}}
+    cell.machine.qmp("chardev-add", id="adapter", backend=backend)
+    far = FarEnd(path)
+    cell.machine.qmp(
+        "device_add", driver="usb-serial", id="adapter", chardev="adapter", bus="xhci.0", serial="R1",
+        **{"always-plugged": True},
+    )  # fmt: skip
+    return far

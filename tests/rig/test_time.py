@@ -1,0 +1,159 @@
+"""Trigger and frames on one time line, on a real kernel: is the middle of a window what was taken between the edges?
+
+In: a guest that keeps its sweeps. Out: how far each window's middle lies from the truth, which the board outside knows.
+The guest's clock is put to the host's by the shortest of many round trips, so that edges as the guest's kernel stamped
+them can be held against the moments at which the board took its frames.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.sim import rig, script, skin
+from appliance.sweep import EPOCH_BITS, Sweep, load
+
+from .cell import Cell
+from .conftest import HOW
+from .kept import KEPT, runs_with
+from .machine import Machine
+from .sound import LATE, known, not_wrong
+
+Note = Callable[[str, str, int], None]
+
+pytestmark = pytest.mark.skipif(HOW != "full", reason="one of the full run's: the service is started anew")
+FRAME_NS = skin.FORMAT.period_ns
+TRIPS, SWEEPS, ATTEMPTS = 400, 5, 3
+"""More than one attempt, since the shortest way through an emulator that is busy changes by milliseconds in as many
+seconds, which looks as if the board's clock drifted.
+"""
+SLOPE_PPM, SPAN_S = 200, 20
+"""What appliance.clock.DeviceClock takes for possible, and how far it looks back."""
+LONGEST_WAY_NS = 5_000_000
+"""From a frame to the program by the shortest way, in an emulator: the box cannot tell it from the clock's offset."""
+CASES = {
+    "80 ppm fast, latency spikes": 80,
+    "80 ppm slow, latency spikes": -80,
+    "500 ppm fast, latency spikes": 500,
+    "500 ppm slow, latency spikes": -500,
+}
+TELL = """
+import os, struct, time
+port = os.open("/dev/virtio-ports/palpate.bench", os.O_RDWR)
+while True:
+    if os.read(port, 1):
+        os.write(port, struct.pack("<q", time.monotonic_ns()))
+    else:
+        time.sleep(0.05)
+"""
+"""In the guest: its monotonic clock, for each byte that comes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """Host time minus guest time in ns, and by how much it may be wrong."""
+
+    ns: int
+    within_ns: int
+
+
+class GuestClock:
+    """Asks the guest for its time. Each trip's answer was read between its two ends, so the offset lies in all of them."""
+
+    def __init__(self, machine: Machine) -> None:
+        machine.put("/run/tell.py", TELL.encode())
+        machine.run("python3 /run/tell.py < /dev/null > /dev/null 2>&1 &", check=True)
+        self._port = machine.bench()
+        self._port.settimeout(60)
+
+    def offset(self) -> Offset:
+        """Raises AssertionError where trips contradict each other: the clocks do not go alike."""
+        low, high = -(1 << 63), 1 << 63
+        for _ in range(TRIPS):
+            sent_ns = time.monotonic_ns()
+            self._port.sendall(b".")
+            (guest_ns,) = struct.unpack("<q", self._port.recv(8))
+            low, high = max(low, sent_ns - guest_ns), min(high, time.monotonic_ns() - guest_ns)
+        assert low <= high, f"the guest's clock went {(low - high) / 1e6:.3f} ms away during {TRIPS} trips"
+        return Offset((low + high) // 2, (high - low) // 2)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def clock(shared: Cell) -> GuestClock:
+    """The service keeps its sweeps; sweeps whose answer is known."""
+    shared.acts, shared.packet_frames = known(script.tubes(2)), 12
+    runs_with(shared.machine, f"--keep {KEPT}")
+    shared.machine.run("systemctl stop palpate; systemctl start --no-block palpate", check=True, timeout_s=60)
+    shared.serial.wait_for("$PPLP,STA,", 120, len(shared.serial.heard))
+    return GuestClock(shared.machine)
+
+
+def kept(cell: Cell, number: int, folder: Path) -> Sweep:
+    """A sweep that was answered; its file comes after its answer."""
+    name = f"sweep-{number:06d}"
+    there = f"for i in $(seq 300); do [ -e {KEPT}/{name}.npy ] && exit 0; sleep 0.1; done; exit 1"
+    cell.machine.run(there, timeout_s=60, check=True)
+    for file in (f"{name}.npy", f"{name}.json"):
+        (folder / file).write_bytes(cell.machine.get(f"{KEPT}/{file}"))
+    return load(folder / f"{name}.npy")[0]
+
+
+def errors(sweep: Sweep, board: rig.Board, offset: Offset) -> tuple[float, float]:
+    """(ns by which the box's stamp of the window's middle frame is later than the truth, ns by which that frame was truly
+    taken after the middle of the edges)."""
+    half = len(sweep.frames) // 2
+    taken_ns = board.frame_ns(int(sweep.frames.seq[half]) & ((1 << EPOCH_BITS) - 1))
+    middle_ns = (sweep.start_ns + sweep.stop_ns) / 2 + offset.ns
+    return int(sweep.frames.t_ns[half]) + offset.ns - taken_ns, taken_ns - middle_ns
+
+
+def spikes(seed: int) -> Callable[[], int]:
+    """0.15 ms as a rule; one packet in a hundred comes 50 to 200 ms late, and those behind it wait."""
+    rng = np.random.default_rng(seed)
+    return lambda: 150_000 + int(rng.integers(50_000_000, 200_000_000)) * (rng.random() < 0.01)
+
+
+def windows(cell: Cell, folder: Path, n: int) -> Iterator[Sweep]:
+    """The windows of `n` sweeps, none of which was answered wrong. Raises AssertionError where they do not come."""
+    for _ in range(3 * n):
+        touch, answer = cell.sweep()
+        if not_wrong(touch, answer) not in LATE - {"unsure", "unknown"}:
+            yield kept(cell, answer.sweep, folder)
+            n -= 1
+        if not n:
+            return
+    raise AssertionError(f"too few windows; the box says: {cell.journal()}")
+
+
+@pytest.mark.parametrize("what", CASES)
+def test_windows_lie_in_the_middle(cell: Cell, clock: GuestClock, note: Note, tmp_path: Path, what: str):
+    """The window's middle is the frame taken half-way between the edges: within one frame at 80 ppm, and beyond what the
+    box takes for possible within what it then cannot know. All stamps are late alike, by a transfer's shortest way."""
+    ppm, seen = CASES[what], []
+    for _ in range(ATTEMPTS):
+        board = cell.plug(cell.board(ppm=ppm, latency=spikes(abs(ppm))))
+        cell.until_ready()
+        cell.wait(SPAN_S)
+        offset = clock.offset()
+        found = [errors(sweep, board, offset) for sweep in windows(cell, tmp_path, SWEEPS)]
+        later = clock.offset()
+        assert abs(later.ns - offset.ns) <= offset.within_ns + later.within_ns, "the clocks do not go alike"
+        way_ns, worst_ns = min(stamp for stamp, _ in found), max((apart for _, apart in found), key=abs)
+        seen.append(
+            f"at most {worst_ns / FRAME_NS:+.2f} frames beside the middle, {way_ns / 1e6:.2f} ms of them a transfer's way, "
+            f"known to {offset.within_ns / 1e6:.2f} ms"
+        )
+        unsure_ns = offset.within_ns + max(0, abs(ppm) - SLOPE_PPM) * 1e-6 * SPAN_S * 1e9
+        if -unsure_ns <= way_ns <= LONGEST_WAY_NS + unsure_ns and all(
+            stamp - way_ns <= FRAME_NS + unsure_ns and abs(apart + way_ns) <= FRAME_NS + unsure_ns
+            for stamp, apart in found
+        ):
+            note(what, "; before that: ".join(seen[::-1]), SWEEPS)
+            return
+    raise AssertionError(seen)

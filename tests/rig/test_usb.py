@@ -1,0 +1,177 @@
+"""The skin's cable, pulled and put back at any moment; other boards on it; resets. In: a guest. Out: what it answered.
+
+Nothing may hang, no answer may name what was not touched, and a sound skin is taken up by itself.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from appliance.sim import script
+
+from .cell import Cell
+from .conftest import HOW
+from .sound import begin, comes_back, known, let_go, not_wrong, only_answer, state, until, until_state
+from .usbredir import Peer
+
+Count = Callable[[int, int], int]
+Note = Callable[[str, str, int], None]
+
+SECOND = 1_000_000_000
+HUB = "0409:55aa"
+RESETS = {
+    "reset of the device": "usbreset 1209:7ac7",
+    "root hub turned off and on": "cd /sys/bus/usb/devices/usb1; echo 0 > authorized; echo 1 > authorized",
+    "driver taken from the device and given back": "cd /sys/bus/usb/drivers/usb; echo 1-1 > unbind; echo 1-1 > bind",
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def robot(shared: Cell) -> None:
+    """Sweeps whose answer is known, and large packets: what is asked here is not how fast it goes."""
+    shared.acts, shared.packet_frames = known(script.tubes(2)), 18
+
+
+def before(cell: Cell, i: int) -> str:
+    """Pulled before a sweep: READY falls, FAULT rises; a start edge is answered at once, its stop edge is not."""
+    cell.unplug()
+    assert cell.lines.wait("FAULT", True, 20)
+    assert cell.lines.wait("READY", False, 20)
+    since = len(cell.serial.heard)
+    cell.lines.set("START", True)
+    cell.answer(since)
+    for name, level in (("START", False), ("STOP", True), ("STOP", False)):
+        cell.lines.set(name, level)
+        cell.wait(0.2)
+    return only_answer(cell, since).status
+
+
+def during(cell: Cell, i: int) -> str:
+    """Pulled while the finger slides: answered at once."""
+    touch, since = begin(cell)
+    until(touch.start_ns + (i * 37 % 25) * SECOND // 10)
+    cell.unplug()
+    let_go(cell)  # no stop edge comes to bring the answer about
+    return not_wrong(touch, only_answer(cell, since))
+
+
+def after(cell: Cell, i: int) -> str:
+    """Pulled within 30 ms of the stop edge: the answer is out, or it is that the skin was lost."""
+    touch, since = begin(cell)
+    until(touch.stop_ns + i % 4 * SECOND // 100)
+    cell.unplug()
+    return not_wrong(touch, only_answer(cell, since))
+
+
+@pytest.mark.parametrize("when", [before, during, after])
+def test_pulled_and_put_back(cell: Cell, count: Count, note: Note, when: Callable[[Cell, int], str]):
+    """Unplugged at any moment of a sweep: one answer that says so, READY by itself, each time another enumeration."""
+    wanted = {before: {"not-ready"}, during: {"sensor-lost"}, after: {"sensor-lost", "ok", "gap", "unsure"}}[when]
+    n = count(1, 35 if when is during else 33)  # 101 in all
+    said = Counter[str]()
+    for i in range(n):
+        had = int(state(cell)["enumerations"])
+        said[when(cell, i)] += 1
+        assert set(said) <= wanted
+        cell.plug()
+        cell.until_ready()
+        assert int(state(cell)["enumerations"]) > had
+        if i % 5 == 4:
+            comes_back(cell)
+    note(f"skin unplugged and replugged {when.__name__} a sweep", f"{dict(said)}; back each time", n)
+
+
+def test_other_boards(cell: Cell, count: Count, note: Note):
+    """Another serial number streams and is told by ID; another format or protocol is refused, until a fitting one comes."""
+    cell.plug(cell.board(serial="SIM0002"))
+    cell.until_ready()
+    assert " SIM0002 " in cell.serial.ask("$PPLP,ID")
+    unfit = {
+        "3x4": ("skin", {"rows": 3}),
+        "protocol 0": ("identity", {"protocol": 0}),
+        "int16": ("skin", {"dtype": "int16"}),
+        "765 Hz": ("skin", {"rate_hz": 765.0}),
+        "protocol 2": ("identity", {"protocol": 2}),
+    }
+    for hint, (part, change) in list(unfit.items())[: count(2, len(unfit))]:
+        cell.unplug()
+        until_state(cell, "absent")
+        board = cell.board()
+        setattr(board, part, replace(getattr(board, part), **change))
+        cell.plug(board)
+        until_state(cell, "mismatch")
+        assert not cell.lines.levels["READY"]
+        assert cell.lines.levels["FAULT"]
+        assert hint in cell.journal(2)
+    cell.plug()
+    comes_back(cell)
+    note("skin of another serial number", "streams, ID tells it", 1)
+    note(
+        "skin of another format or protocol version", "mismatch; the next fitting one is taken up", count(2, len(unfit))
+    )
+
+
+@pytest.mark.parametrize("what", RESETS if HOW == "full" else list(RESETS)[:1])
+def test_resets(cell: Cell, count: Count, note: Note, what: str):
+    """The kernel takes the skin away for a moment, in mid sweep: the sweep is lost, the skin is taken up again."""
+    n, said = count(1, 3), Counter[str]()
+    for _ in range(n):
+        touch, since = begin(cell)
+        cell.machine.run(RESETS[what], check=True, timeout_s=60)
+        landed = time.monotonic_ns() < touch.stop_ns
+        status = not_wrong(touch, cell.answer(since))
+        assert status == "sensor-lost" or not landed, status
+        until(touch.stop_ns + SECOND // 2)
+        assert len(cell.answers(since)) == 1
+        said[status] += 1
+        comes_back(cell)
+    note(what, f"{dict(said)}; back each time", n)
+
+
+@pytest.fixture
+def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[Peer]:
+    """Another cable, behind a hub on another port; nothing hangs on the first one."""
+    cell.unplug()
+    assert cell.lines.wait("FAULT", True, 20)
+    listener, qmp = socket.socket(socket.AF_UNIX), cell.machine.qmp
+    listener.bind(str(tmp_path / "hub"))
+    listener.listen(1)
+    address = {"type": "unix", "data": {"path": str(tmp_path / "hub")}}
+    qmp("device_add", driver="usb-hub", id="hub", bus="xhci.0", port="2")
+    qmp("chardev-add", id="far", backend={"type": "socket", "data": {"addr": address, "server": False}})
+    qmp("device_add", driver="usb-redir", id="behind", chardev="far", bus="xhci.0", port="2.1")
+    listener.settimeout(20)
+    peer = Peer(listener.accept()[0])
+    yield peer
+    peer.close()
+
+
+@pytest.mark.skipif(HOW != "full", reason="one of the full run's")
+def test_behind_a_hub(cell: Cell, behind_a_hub: Peer, count: Count, note: Note):
+    """The hub that the skin hangs on is reset, or pulled out with it, in mid sweep: the sweep is lost, no more than that."""
+    behind_a_hub.plug(cell.board())
+    comes_back(cell)
+    n = count(1, 3)
+    for _ in range(n):
+        touch, since = begin(cell)
+        cell.machine.run(f"usbreset {HUB}", check=True, timeout_s=60)
+        status = not_wrong(touch, only_answer(cell, since))
+        assert status == "sensor-lost" or time.monotonic_ns() > touch.stop_ns, status
+        let_go(cell)
+        cell.until_ready()
+    note("reset of the hub", "sensor-lost; back each time", n)
+    touch, since = begin(cell)
+    cell.machine.qmp("device_del", id="hub")
+    assert not_wrong(touch, only_answer(cell, since)) == "sensor-lost"
+    let_go(cell)
+    assert cell.lines.wait("FAULT", True, 20)
+    cell.cable.plug(cell.board())
+    comes_back(cell)
+    note("hub pulled out, skin plugged in elsewhere", "sensor-lost; taken up at the other port", 1)
