@@ -161,7 +161,7 @@ def command(data: bytes, folder: Path) -> None:
 
 def _is_command(line: bytes, name: str) -> bool:
     """Whether a line is a command by PROTOCOL.md, and this one."""
-    body, star, given = line.strip().removeprefix(b"$").partition(b"*")
+    body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
     known = body.startswith(b"PPLP,") and body[5:].decode("ascii", "replace") == name and name in sink.COMMANDS
     sealed = not star or given.upper() == b"%02X" % reduce(xor, body, 0)
     return known and sealed and len(line) <= LINE

@@ -32,7 +32,7 @@ clock, would come at once and its sweep be too short.
 """
 SEEN_S = 20
 """Longest wait until the box has seen that the skin is gone."""
-BEGUN_S = 120
+BEGUN_S = 300
 """Longest wait for a touch to begin, while a busy emulator works off what it has not taken yet."""
 ANSWER_S = 30
 """Longest wait for an answer after the stop edge; an emulated processor that is busy takes seconds."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -64,12 +65,13 @@ def drawn(told: Json, picture: str) -> str:
 def figures(told: Json) -> str:
     """All sums."""
     sums = [box["sums"] for box in told["boxes"].values()]
+    statuses = dict.fromkeys(status for s in sums for status in s["statuses"])
     lines: list[tuple[str, Any]] = [
         ("hours", lambda s: f"{s['hours']:.2f}"),
         ("sweeps, answered of begun", lambda s: f"{s['due'] - s['unanswered']:,} of {s['due']:,}"),
         ("aborted by the end of the soak", lambda s: f"{s['cut']}"),
         *((name, lambda s, n=name: _share(s[n])) for name in ("right", "wrong", "unsure", "refused")),
-        ("answers by status", lambda s: ", ".join(f"{n:,} {status}" for status, n in s["statuses"].items())),
+        *((f"answered {name}", lambda s, n=name: f"{s['statuses'].get(n, 0):,}") for name in statuses),
         ("other than the network by itself", lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}"),
         ("frames received", lambda s: f"{s['received']:,}"),
         ("frames lost, told by the box", lambda s: f"{s['lost']:,}"),
@@ -133,7 +135,8 @@ def charts(told: Json) -> str:
     for i, ((name, _), look) in enumerate(zip(boxes, LOOKS, strict=False)):
         mark = "╍" if "linestyle" in look else "—"
         figure.text(0.075 + 0.25 * i, 0.985, f"{mark} {name}", color=look["color"], size=SMALL + 0.5, va="center")
-    return svg(figure, "memory, latency, loss and wrong verdicts of a soak over time")
+    with matplotlib.rc_context({"path.simplify": False}):  # it would leave out strokes without length
+        return svg(figure, "memory, latency, loss and wrong verdicts of a soak over time")
 
 
 def _memory(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
@@ -158,8 +161,7 @@ def _latency(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
     # dots as strokes without length: one path of them all, and not an element each
     x, y = (np.repeat(v, 3).astype(float) for v in (s / unit_s, ms))
     x[2::3] = np.nan
-    (line,) = axes.plot(x, y, color=look["color"], linewidth=2.2, alpha=0.7, solid_capstyle="round")
-    line.get_path().should_simplify = False
+    axes.plot(x, y, color=look["color"], linewidth=2.2, alpha=0.7, solid_capstyle="round")
     axes.set_yscale("log")
     low, high = axes.get_ylim() if axes.lines[1:] else (1.0, 10.0)
     axes.set_ylim(min(low, 0.8 * float(ms.min(initial=1))), max(high, 1.5 * float(ms.max(initial=1))))

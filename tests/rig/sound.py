@@ -25,9 +25,11 @@ FIELDS = (
     "source",
 )  # fmt: skip
 """Of a state sentence (PROTOCOL.md, part 2)."""
-LATE = {"gap", "short", "edges-lost", "sensor-lost", "not-ready", "unsure", "unknown"}
-"""Answers to sound sweeps while the emulator stands still: frames or edges come to its kernel half a second late, and the
-window lies beside its place.
+LATE = {
+    "gap", "short", "long", "no-start", "no-stop", "edges-lost", "sensor-lost", "not-ready", "unsure", "unknown",
+}  # fmt: skip
+"""Answers to sound sweeps while the emulator stands still: frames or edges come to its kernel late or not at all, and the
+window lies beside its place. None names a wrong material.
 """
 OPEN_NS = 1_000_000_000
 """A sweep is open so long after its start edge, at most."""
