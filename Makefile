@@ -29,8 +29,8 @@ rig: rig-tools ## the virtual box: an arm64 Debian with skin, lines and serial p
 rig-shell: rig-tools ## a shell in the virtual box
 	$(RIG) shell
 
-test-rig: rig-tools ## the tests on the virtual box; COUNTS=full does each fault as often as the report says (an hour)
-	PALPATE_RIG=$(or $(COUNTS),quick) $(BIN)/python -m pytest -q tests/rig
+test-rig: rig-tools ## the tests on the virtual box; COUNTS=full: as often as the report says (hours), ONLY=FILE: a part
+	PALPATE_RIG=$(or $(COUNTS),quick) $(BIN)/python -m pytest -q $(or $(ONLY),tests/rig)
 
 systemd: $(DESKTOP) ## the unit under a real systemd, in a container (as root; gets a Debian of 370 MB, once)
 	@{ command -v systemd-nspawn && command -v mmdebstrap; } >/dev/null || \
