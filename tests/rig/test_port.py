@@ -72,7 +72,7 @@ def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
         time.sleep(0.01)
     touch = shown(cell)
     cell.wait(begun + count(8, 60) - time.monotonic())
-    assert len(cell.serial.heard) <= since + 1
+    assert len(cell.serial.heard) <= since + 9  # a last look had begun, and may have brought several lines
     cell.serial.deaf = False
     cell.serial.say(b"$PPLP,ID\r\n")
     cell.serial.wait_for("$PPLP,ANS,ID,ok", 30, since)  # all that waited is out before this
@@ -85,7 +85,7 @@ def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
     answer = Answer.read(result)
     assert answer
     not_wrong(touch, answer)
-    assert all(sound(line) for line in heard[1:])  # the first may be the one that was being read
+    assert all(sound(line) for line in heard[1:])  # the first may have been cut
     # 200 answers, a result and a state each second were said; what was not dropped came out
     assert 200 + 1 - dropped < len(heard) < 200 + 1 - dropped + 2 * count(8, 60)
     note(

@@ -168,8 +168,7 @@ def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
 def test_clock_set(box: Cell, note: Callable[..., None]):
     """An hour back and a year forward in the middle of sweeps: answers, times and files know nothing of it."""
     for change in ("-1 hour", "+1 year"):
-        since = len(box.serial.heard)
-        touch = begin(box)
+        touch, since = begin(box)
         box.machine.run(f"date -s \"$(date -d '{change}')\"", check=True)
         assert not_wrong(touch, box.answer(since, ANSWER_S)) in ("ok", "gap")
         times = [float(line.split(",")[2]) for _, line in box.serial.heard[since:] if line.startswith("$PPLP,STA,")]
