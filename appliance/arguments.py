@@ -16,12 +16,18 @@ MOST_SWEEPS = 10
 """What a person may be asked to take for an enrolment; a mean of more would hardly be better."""
 
 
-def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argparse.ArgumentParser]:
-    """What several commands take: the settings, the world, the number of answers."""
+def settings() -> argparse.ArgumentParser:
+    """What every command that has settings takes."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--board", help="board file to use: firmware_config/board-NAME.toml")
     common.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one value")
     common.add_argument("--config-dir", type=Path, metavar="DIR", help="where sensor.toml and the board files are")
+    return common
+
+
+def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argparse.ArgumentParser]:
+    """What several commands take: the settings, the world, the number of answers."""
+    common = settings()
     world = argparse.ArgumentParser(add_help=False)
     world.add_argument(
         "--sim", metavar="skin|replay:FILE", help="simulated tubes, or a sweep set, instead of the devices"

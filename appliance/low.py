@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 import gpiod
 
 from . import config
+from .arguments import settings
 from .clock import SystemClock
 from .errors import ApplianceError
 from .lines import Lines
@@ -22,14 +22,11 @@ from .lines import Lines
 
 def main(argv: list[str] | None = None, gpio: Any = gpiod) -> int:
     """Drive all configured outputs low and let them go; the exit code, as `palpate` has them."""
-    parser = argparse.ArgumentParser("python -m appliance.low", description="Takes all output lines low.")
-    parser.add_argument("--board", help="as for palpate run")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="as for palpate run")
-    parser.add_argument("--config-dir", type=Path, metavar="DIR", help="as for palpate run")
-    args = parser.parse_args(argv)
+    about = "Takes all output lines low. Options as for palpate run."
+    args = argparse.ArgumentParser("python -m appliance.low", description=about, parents=[settings()]).parse_args(argv)
     try:
-        settings = config.load(args.board, args.set, folder=args.config_dir)
-        Lines(settings.output, gpio, SystemClock()).close()  # requested low, then given back
+        loaded = config.load(args.board, args.set, folder=args.config_dir)
+        Lines(loaded.output, gpio, SystemClock()).close()  # requested low, then given back
     except ApplianceError as e:
         print(f"palpate: outputs may not be low: {e}", file=sys.stderr)
         return e.exit_code

@@ -144,6 +144,16 @@ def _install(site: Path) -> None:
     run(*PIP, "install", *ARM_WHEELS, "--require-hashes", "-r", LOCK, "--target", site)
 
 
+def wheel(out: Path, source: Path) -> None:
+    """Build the box's wheel into `out`, in the empty folder `source`: setuptools would put what an older build left
+    behind into the wheel, and leaves its own behind.
+    """
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    shutil.copytree(ROOT / "appliance", source / "appliance", ignore=shutil.ignore_patterns("__pycache__"))
+    run(*PIP, "wheel", "--no-deps", "-w", out, source)
+
+
 def run(*args: str | Path) -> str:
     """A command's output; its errors go into the exception."""
     return subprocess.run(args, check=True, capture_output=True, text=True).stdout

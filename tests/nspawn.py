@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
-from machines import HOME, LOCK, PIP, ROOT, Missing, run
+from machines import HOME, LOCK, PIP, ROOT, Missing, run, wheel
 
 CACHE = HOME.parent / "nspawn"
 SUITE, PYTHON = "bookworm", "3.11"
@@ -176,10 +176,7 @@ class Machine:
 
 def pack(parcel: Path, source: Path) -> None:
     """Fill a parcel with the wheel of this checkout and systemd/. source: an empty folder to build in."""
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    shutil.copytree(ROOT / "appliance", source / "appliance", ignore=shutil.ignore_patterns("__pycache__"))
-    run(*PIP, "wheel", "--no-deps", "-w", parcel, source)
+    wheel(parcel, source)
     for name in PLACES:
         shutil.copy(ROOT / "systemd" / name, parcel)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import ast
 import os
 import re
-import shutil
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
+import machines
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -112,11 +112,7 @@ def test_every_test_says_what_it_holds(path: Path):
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel of the box, built from the project."""
     out = tmp_path_factory.mktemp("wheel")
-    source = tmp_path_factory.mktemp("source")  # setuptools would put what an older build left behind into the wheel
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    shutil.copytree(ROOT / "appliance", source / "appliance")
-    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", out, source, cwd=out)
+    machines.wheel(out, tmp_path_factory.mktemp("source"))
     (built,) = out.glob("palpate-*.whl")
     return built
 

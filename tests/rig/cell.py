@@ -4,7 +4,6 @@ would. In: a Machine. Out: answers, beside what was really touched and when.
 
 from __future__ import annotations
 
-import itertools
 import queue
 import threading
 import time
@@ -90,7 +89,6 @@ class Cell:
         self.hand = Hand(machine.lines, seed)
         self.acts = script.tubes(seed)
         self.packet_frames = 6
-        self._serials = itertools.count(1)
 
     def board(self, **how: Any) -> rig.Board:
         """A board in the robot's hand: how are the arguments of sim.rig.Board (ppm, latency, serial, …)."""

@@ -30,8 +30,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def image() -> Image:
     """The box of this checkout."""
-    if disk := os.environ.get("PALPATE_RIG_DISK"):
-        return Image(Path(os.environ["PALPATE_RIG_GROUND"]), Path(disk))
     try:
         return make_image()
     except Missing as e:

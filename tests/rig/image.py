@@ -237,14 +237,10 @@ def _make_tree(path: Path) -> None:
 def _make_box(part: Path, on: Path) -> None:
     from .machine import Machine
 
-    code = part / "code"
+    code, source = part / "code", part / "source"
     code.mkdir()
-    # out of the tree: setuptools leaves its build folder beside what it builds
-    source = part / "source"
-    shutil.copytree(ROOT / "appliance", source / "appliance", ignore=shutil.ignore_patterns("__pycache__"))
-    for file in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / file, source)
-    run(*machines.PIP, "wheel", "--no-deps", "-w", code, source)
+    source.mkdir()
+    machines.wheel(code, source)
     for room in ("systemd", "firmware_config"):
         shutil.copytree(ROOT / room, code / room)
     for file in ("install.sh", "palpate.toml"):

@@ -27,13 +27,10 @@ from appliance.clock import SystemClock
 from appliance.sim import rig, script, skin
 
 from . import image
+from .cell import IDLE
 from .machine import Failed, Machine
 from .soak_boxes import Gone, Script, process
 
-IDLE = 75
-"""Frames of an empty skin at a time, until the box is ready: a tenth of a second."""
-PULSE_NS = 250_000_000
-"""Length of the robot's pulses; an emulated processor that is busy misses shorter ones."""
 READY_S = 180
 LOCKED = re.compile(r"^onnxruntime==(\S+)", re.M)
 SENT = 4096
@@ -66,7 +63,7 @@ class Hand:
         for line, frame, edges in zip(("START", "STOP"), (act.start, act.stop), self.edges_ns, strict=True):
             at_ns = frame_ns(first + frame)
             self._lines.drive(line, True, at_ns)
-            self._lines.drive(line, False, at_ns + PULSE_NS)
+            self._lines.drive(line, False, at_ns + rig.PULSE_NS)
             edges.append(at_ns)
         return act
 
