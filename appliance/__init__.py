@@ -6,4 +6,4 @@ import os
 # device id to disk, and `disable_telemetry_events()` comes too late for both (microsoft/onnxruntime, pull 27379).
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

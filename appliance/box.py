@@ -5,8 +5,9 @@ Which parts these are is decided elsewhere (`__main__`); nothing here knows whet
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +18,7 @@ from .clock import Clock
 from .config import Config
 from .early import Decider
 from .errors import ApplianceError
+from .health import Health, Pulse
 from .recorder import Recorder
 from .sensor import Sensor, Tally
 from .sink import Command, Port, ResultSink, sentence
@@ -47,16 +49,9 @@ class Tap(Protocol):
         ...
 
 
-class Pulse(Protocol):
-    """Whoever watches over the program: a turn that does not end is noticed by its silence."""
-
-    def turn(self, ready: bool, status: str) -> None:
-        """A turn of the loop is over. ready: the skin streams. status: how the box is, in words."""
-        ...
-
-    def stopping(self) -> None:
-        """The loop has ended; what is open is being answered."""
-        ...
+Keeper = Callable[[Sweep, Verdict], None]
+"""Takes a sweep with its verdict, after all answers of the turn are out. Must not raise: a full disk costs the record,
+never the classifying."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +80,9 @@ class Box:
 
     early: answers sweeps that still go on, or None. panel: READY, BUSY, FAULT, DECIDED, or None.
     port: where commands come from and state sentences go, or None.
-    tap: takes note of edges and commands, for captures. keep: called with each sweep, for recordings.
-    pulse: told at the end of each turn, or None.
+    tap: takes note of edges and commands, for captures. keepers: given each sweep with its verdict, for recordings.
+    pulses: told at the end of each turn. obey: further commands, from their text to the fields of their answer; what
+    they raise as ApplianceError is the answer.
     """
 
     def __init__(
@@ -94,14 +90,15 @@ class Box:
         early: Decider | None = None,
         sinks: Sequence[ResultSink] = (), port: Port | None = None, panel: Panel | None = None,
         state_s: float = 1.0, source: str = "usb", log: Callable[[str], None] = lambda line: None,
-        tap: Tap | None = None, keep: Callable[[Sweep], None] | None = None, pulse: Pulse | None = None,
+        tap: Tap | None = None, keepers: Sequence[Keeper] = (), pulses: Sequence[Pulse] = (),
+        obey: Mapping[str, Callable[[str], list[object]]] = MappingProxyType({}),
     ) -> None:  # fmt: skip
         self.answered = 0
         self._sensor, self._trigger, self._recorder, self._classifier = sensor, trigger, recorder, classifier
         self._early, self._clock, self._sinks, self._port, self._panel = early, clock, sinks, port, panel
         self._decided = False
         self._state_ns, self._source, self._log = round(state_s * 1e9), source, log
-        self._tap, self._keep, self._pulse = tap, keep or (lambda sweep: None), pulse
+        self._tap, self._keepers, self._pulses, self._more = tap, keepers, pulses, obey
         self._next_state_ns = clock.now_ns()
         self._troubles: dict[str, str] = {}
 
@@ -124,8 +121,8 @@ class Box:
         """Take turns until `stopped()`; what is open then is answered `aborted`."""
         while not stopped():
             self.step()
-        if self._pulse:
-            self._pulse.stopping()
+        for pulse in self._pulses:
+            pulse.stopping()
         self._recorder.interrupt(Status.ABORTED, self._clock.now_ns())
         self._answer(self._recorder.finished(self._clock.now_ns()))
 
@@ -145,7 +142,10 @@ class Box:
         self._show()
         verdicts += self._answer(self._recorder.finished(now))
         self._report(now)
-        self._beat()
+        if self._pulses:
+            health = self.health
+            for pulse in self._pulses:
+                pulse.turn(health)
         return verdicts
 
     @property
@@ -169,7 +169,7 @@ class Box:
                 self._send(verdict)
                 self._decided = True
                 self._show()
-                self._keep(sweep)
+                self._keep(sweep, verdict)
                 return [verdict]
         return []
 
@@ -177,9 +177,13 @@ class Box:
         verdicts = [self._classifier(sweep) for sweep in sweeps]
         for verdict in verdicts:
             self._send(verdict)
-        for sweep in sweeps:  # a disk takes its time, so after all answers
-            self._keep(sweep)
+        for sweep, verdict in zip(sweeps, verdicts, strict=True):  # a disk takes its time, so after all answers
+            self._keep(sweep, verdict)
         return verdicts
+
+    def _keep(self, sweep: Sweep, verdict: Verdict) -> None:
+        for keep in self._keepers:
+            keep(sweep, verdict)
 
     def _send(self, verdict: Verdict) -> None:
         for sink in self._sinks:
@@ -193,33 +197,52 @@ class Box:
             return
         for command in self._port.commands():
             if self._tap and not command.error:
-                self._tap.command(now_ns, command.name)
+                self._tap.command(now_ns, command.line)
             self._port.say(self._obey(command))
         self._note("serial", self._port.trouble, "open")
         if now_ns >= self._next_state_ns:
             self._next_state_ns = now_ns + self._state_ns
             self._port.say(sentence("STA", *self._state()))
 
-    def _beat(self) -> None:
-        """The turn is over: frames came in or the skin's absence was told, edges were polled, answers are out."""
-        if self._pulse:
-            sensor = self._sensor
-            skin = f"skin {sensor.state}: {sensor.trouble}" if sensor.trouble else f"skin {sensor.state}"
-            streams = sensor.state == "streaming" and sensor.tally.frames > 0
-            self._pulse.turn(streams, f"{skin}. Sweeps answered: {self.answered}")
-
     def _note(self, what: str, trouble: str, fine: str) -> None:
         if self._troubles.get(what) != trouble:
             self._troubles[what] = trouble
             self._log(f"{what}: {trouble or fine}")
 
+    @property
+    def health(self) -> Health:
+        """How it is now."""
+        sensor, tally = self._sensor, self._sensor.tally
+        return Health(
+            time_ns=self._clock.now_ns(), skin=sensor.state, trouble=str(sensor.trouble or ""),
+            streams=sensor.state == "streaming" and tally.frames > 0, sweeping=self._recorder.sweeping,
+            answered=self.answered, frames=tally.frames, lost_frames=tally.lost_frames,
+            garbage_bytes=tally.garbage_bytes, enumerations=tally.enumerations,
+            dropped=self._port.dropped if self._port else 0, bundle=self._classifier.bundle.id, source=self._source,
+        )  # fmt: skip
+
+    def circumstances(self) -> dict[str, Any]:
+        """What a recorded sweep should tell beside its frames, as it is now: for JSON.
+
+        device: the board's name, serial number and firmware, None before it was asked. clock: see DeviceClock.quality.
+        tare: [R, C] digits.
+        """
+        who = self._sensor.identity
+        return {
+            "device": asdict(who) if who else None,
+            "clock": self._sensor.clock,
+            "tare": self._classifier.tare.tolist(),
+            "bundle": self._classifier.bundle.id,
+            "rule": self._classifier.rule,
+            "source": self._source,
+        }
+
     def _state(self) -> list[object]:
         """Fields of the STA sentence (PROTOCOL.md, part 2)."""
-        tally = self._sensor.tally
+        h = self.health
         return [
-            f"{self._clock.now_ns() / 1e9:.3f}", self._sensor.state, int(self._recorder.sweeping), self.answered,
-            tally.frames, tally.lost_frames, tally.garbage_bytes, tally.enumerations,
-            self._port.dropped if self._port else 0, self._classifier.bundle.id, self._source,
+            f"{h.time_ns / 1e9:.3f}", h.skin, int(h.sweeping), h.answered, h.frames, h.lost_frames, h.garbage_bytes,
+            h.enumerations, h.dropped, h.bundle, h.source,
         ]  # fmt: skip
 
     def _obey(self, command: Command) -> bytes:
@@ -227,9 +250,16 @@ class Box:
         if command.error:
             return sentence("ANS", command.name, "error", command.error)
         try:
-            return sentence("ANS", command.name, "ok", *_OBEY[command.name](self))
+            return sentence("ANS", command.name, "ok", *self._carried_out(command))
         except ApplianceError as e:
             return sentence("ANS", command.name, "error", e)
+
+    def _carried_out(self, command: Command) -> list[object]:
+        if command.name in self._more:
+            return self._more[command.name](command.text)
+        if command.name not in _OBEY:
+            raise ApplianceError("nothing is recorded now; use palpate record")
+        return _OBEY[command.name](self)
 
     def _identity(self) -> list[object]:
         m, who = self._classifier.bundle.manifest, self._sensor.identity

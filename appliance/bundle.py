@@ -13,152 +13,50 @@ Golden sweeps come with the logits that export, or the box at enrolment, saw.
 
 from __future__ import annotations
 
+import errno
 import io
-import json
-import re
-import sys
+import os
+import stat
 import zipfile
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import features
-from .errors import BundleError, FormatError
-from .keys import typed
-from .sweep import SweepFormat
+from .errors import BundleError
+from .manifest import (
+    GOLDEN,
+    INPUTS,
+    LABEL,
+    MANIFEST,
+    MEANS,
+    MODEL,
+    MOST_BYTES,
+    Early,
+    Known,
+    Manifest,
+    Thresholds,
+)
+from .sweep import UNREADABLE, SweepFormat
 
 try:  # not from hashlib: that loads OpenSSL, 4 MB for a function which Python has by itself
     from _sha2 import sha256  # type: ignore[import-not-found,unused-ignore]
 except ImportError:  # Python 3.11
     from _sha256 import sha256  # type: ignore[import-not-found,unused-ignore]
 
-SCHEMA = 2
-"""What is written. Schema 1, the same without `early` and `known`, is still read."""
+__all__ = [
+    "DEFAULT", "GOLDEN", "GOLDEN_TOLERANCE", "INPUTS", "LABEL", "MANIFEST", "MEANS", "MODEL", "SIGNATURE",
+    "Bundle", "Classes", "Early", "Known", "Manifest", "Thresholds", "file_entry", "files", "identity", "load", "made",
+]  # fmt: skip
 DEFAULT = Path(__file__).with_name("default_bundle")
-MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
-INPUTS = ("raw", *features.KINDS)
-LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
-"""What a label may look like: it travels in a sentence, so no comma, star or dollar, and at most 24 characters."""
+SIGNATURE = MANIFEST + ".sig"
+MOST_SMALL = 1 << 20
+"""Bytes of a manifest or a signature at most: read before anything is known of them."""
 GOLDEN_TOLERANCE = 0.02
 """Largest allowed difference of a probability between export and this machine; the label must be the same."""
-
-
-@dataclass(frozen=True, slots=True)
-class Thresholds:
-    """What is checked before the network is asked, in digits above the tare, and what its answer must reach.
-
-    contact: least temporal mean of a loaded taxel. full_scale: the highest digit the sensor gives.
-    saturated: share of full-scale digits in a window that is still accepted. dead_taxels: how many the model bears.
-    unsure: least probability for status ok.
-    """
-
-    contact: float
-    full_scale: float
-    saturated: float = 0.01
-    dead_taxels: int = 0
-    unsure: float = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Early:
-    """When the answer goes out before the sweep has ended. Raises BundleError where a number makes no sense.
-
-    least: [D], the probability that a label must reach at each step; above 1: never there. agree: so many steps, the
-    newest included, must name the same label.
-    """
-
-    least: tuple[float, ...]
-    agree: int
-
-    def __post_init__(self) -> None:
-        if not self.least or not all(_positive(p) for p in self.least):
-            raise BundleError(f"early.least {list(self.least)} must be numbers above 0, one for each step")
-        if type(self.agree) is not int or self.agree < 1:
-            raise BundleError(f"early.agree {self.agree!r} must be a whole number from 1 on")
-
-
-@dataclass(frozen=True, slots=True)
-class Known:
-    """What a trained material looks like. Raises BundleError where a number makes no sense.
-
-    limit: largest squared distance of a sweep's embedding to the nearest class mean; beyond it the material is unknown.
-    temperature: what logits from class means are divided by.
-    """
-
-    limit: float
-    temperature: float
-
-    def __post_init__(self) -> None:
-        for name, value in (("limit", self.limit), ("temperature", self.temperature)):
-            if not _positive(value):
-                raise BundleError(f"known.{name} {value!r} must be a number above 0")
-
-
-def _positive(value: object) -> bool:
-    return type(value) in (int, float) and 0 < value <= sys.float_info.max  # type: ignore[operator]
-
-
-@dataclass(frozen=True, slots=True)
-class Manifest:
-    """What a bundle says of itself. `files` maps each name to its sha256 and size, `figures` each protocol to numbers,
-    `made` names commit, seed and machine. early, known: None where the bundle cannot do it."""
-
-    name: str
-    version: str
-    format: SweepFormat
-    input: str
-    labels: tuple[str, ...]
-    thresholds: Thresholds
-    files: dict[str, dict[str, Any]]
-    figures: dict[str, Any] = field(default_factory=dict)
-    made: dict[str, Any] = field(default_factory=dict)
-    early: Early | None = None
-    known: Known | None = None
-    schema: int = SCHEMA
-
-    def __post_init__(self) -> None:
-        if self.schema not in (1, SCHEMA):
-            raise BundleError(
-                f"manifest schema {self.schema} is unknown; this version reads 1 and {SCHEMA}: update one of them"
-            )
-        if self.input not in INPUTS:
-            raise BundleError(f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}")
-        if self.schema == 1 and (self.early or self.known):
-            raise BundleError("manifest schema 1 has no `early` and no `known`; export the bundle again")
-        if (self.known is not None) != (MEANS in self.files):
-            raise BundleError(f"manifest must have both `known` and {MEANS}, or neither; export the bundle again")
-        if self.early and self.input != "raw":
-            raise BundleError(
-                f"manifest has `early`, but input {self.input!r} needs the whole window; export it without"
-            )
-        if len(self.labels) < 2 or len(set(self.labels)) < len(self.labels):
-            raise BundleError(f"manifest labels {list(self.labels)} must be at least two different names")
-        for label in self.labels:
-            if not isinstance(label, str) or not LABEL.fullmatch(label):
-                raise BundleError(
-                    f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'"
-                )
-
-    def json(self) -> bytes:
-        """The manifest as it is written: one text for one content."""
-        return (json.dumps(asdict(self), indent=1, sort_keys=True) + "\n").encode()
-
-    @classmethod
-    def parse(cls, text: bytes) -> Manifest:
-        """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong type."""
-        try:
-            raw = json.loads(text)
-            for name, kind in (("format", SweepFormat), ("thresholds", Thresholds), ("early", Early), ("known", Known)):
-                if raw.get(name) is not None:
-                    raw[name] = typed(kind, raw[name])
-            made = typed(cls, raw)
-            made.json()  # nested so deeply that it could not be written again after enrolment
-            return made
-        except (ValueError, TypeError, AttributeError, RecursionError, FormatError) as e:
-            raise BundleError(f"manifest cannot be read: {e}; export the bundle again") from e
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,38 +114,78 @@ def identity(manifest: bytes) -> str:
 
 def load(folder: Path) -> Bundle:
     """Read and check the bundle in `folder`. Raises BundleError where a file is missing, altered or of another form."""
+    return made(files(folder), str(folder))
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """The files of the bundle in `folder` by name: the manifest, those that it names, the signature where there is one.
+
+    Whatever else lies there is not looked at. Nothing is followed out of the folder, and of each file no more is read
+    than the manifest says. Raises BundleError where one cannot be read or is larger.
+    """
     try:
-        text = (folder / MANIFEST).read_bytes()
+        held = {MANIFEST: _read(folder / MANIFEST, MOST_SMALL)}
     except OSError as e:
         raise BundleError(f"no bundle at {folder}: {e.strerror}; name its folder with classifier.bundle") from e
-    manifest = Manifest.parse(text)
-    model, golden = (_checked(folder, manifest, name) for name in (MODEL, GOLDEN))
-    samples, logits = _golden(golden, manifest)
-    classes = _classes(_checked(folder, manifest, MEANS), manifest) if manifest.known else None
-    return Bundle(manifest, identity(text), model, samples, logits, classes)
+    for name, size in _named(held[MANIFEST]).items():
+        try:
+            held[name] = _read(folder / name, size)
+        except OSError as e:
+            if name == SIGNATURE and e.errno == errno.ENOENT:
+                continue
+            what = "was altered" if e.errno == errno.EFBIG else "cannot be read"
+            raise BundleError(f"{folder}: {name} {what}: {e.strerror}; copy the bundle again") from e
+    return held
 
 
-def _checked(folder: Path, manifest: Manifest, name: str) -> bytes:
-    """The bytes of one file, compared with its entry in the manifest."""
-    if name not in manifest.files:
-        raise BundleError(f"{folder}: the manifest does not name {name}; export the bundle again")
-    try:
-        data = (folder / name).read_bytes()
-    except OSError as e:
-        raise BundleError(f"{folder}: {name} cannot be read: {e.strerror}; copy the bundle again") from e
-    want, have = manifest.files[name], file_entry(data)
-    if want != have:
-        raise BundleError(f"{folder}: {name} was altered: {have} instead of {want}; copy the bundle again")
+def _named(manifest: bytes) -> dict[str, int]:
+    """What else is to be read, with the most bytes of each."""
+    return {SIGNATURE: MOST_SMALL} | {name: entry["bytes"] for name, entry in Manifest.parse(manifest).files.items()}
+
+
+def _read(path: Path, most: int) -> bytes:
+    """A plain file's bytes, at most one more than `most`: never a link, a device, or a pipe that would wait."""
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as f:
+        if not stat.S_ISREG(os.fstat(f.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is no plain file", str(path))
+        data = f.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most} bytes", str(path))
     return data
+
+
+def made(files: Mapping[str, bytes], where: str) -> Bundle:
+    """The bundle that `files` are, checked; `where` they come from. Raises BundleError as `load`."""
+    manifest = Manifest.parse(files[MANIFEST])
+    model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
+    samples, logits = _golden(golden, manifest)
+    classes = _classes(_checked(files, manifest, MEANS, where), manifest) if manifest.known else None
+    return Bundle(manifest, identity(files[MANIFEST]), model, samples, logits, classes)
+
+
+def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: str) -> bytes:
+    """The bytes of one file, compared with its entry in the manifest."""
+    if name not in manifest.files or name not in files:
+        raise BundleError(f"{where}: the manifest does not name {name}; export the bundle again")
+    want, have = manifest.files[name], file_entry(files[name])
+    if want != have:
+        raise BundleError(f"{where}: {name} was altered: {have} instead of {want}; copy the bundle again")
+    return files[name]
 
 
 def _arrays(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
     """Arrays of an .npz by name, `names` among them; never unpickled."""
     try:
+        with zipfile.ZipFile(io.BytesIO(data)) as packed:
+            size = sum(entry.file_size for entry in packed.infolist())
+        if size > MOST_BYTES:
+            raise BundleError(
+                f"{file} unpacks to {size} bytes, {MOST_BYTES} are allowed; export the bundle with fewer sweeps"
+            )
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
             held = dict(z.items())
         return {name: held[name] for name in names} | held
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as e:
+    except (*UNREADABLE, OSError, KeyError, zipfile.BadZipFile) as e:
         raise BundleError(f"{file} cannot be read: {e}; export the bundle again") from e
 
 

@@ -19,8 +19,8 @@ from typing import IO
 from .errors import ConfigError, FormatError, SensorError, SensorMismatch
 from .keys import typed
 from .sensor import Stream, Tally
-from .sink import COMMANDS, Command
-from .sweep import Frames, Sweep, SweepFormat, save
+from .sink import Command, command
+from .sweep import Frames, Sweep, SweepFormat, Verdict, save
 from .trigger import Edge, EdgeKind
 from .wire import Identity
 
@@ -70,9 +70,9 @@ class CaptureWriter:
         """Note edges that the trigger gave out at `t_ns`."""
         self._write(Kind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
 
-    def command(self, t_ns: int, name: str) -> None:
-        """Note a command that was carried out."""
-        self._write(Kind.COMMAND, t_ns, name.encode())
+    def command(self, t_ns: int, line: str) -> None:
+        """Note a command that was carried out, as it stands in a sentence."""
+        self._write(Kind.COMMAND, t_ns, line.encode())
 
     def close(self) -> None:
         """Finish the file."""
@@ -91,7 +91,7 @@ class CaptureWriter:
             self._ended = True
 
 
-def keeper(folder: Path, fmt: SweepFormat, log: Callable[[str], None]) -> Callable[[Sweep], None]:
+def keeper(folder: Path, fmt: SweepFormat, log: Callable[[str], None]) -> Callable[[Sweep, Verdict], None]:
     """Saves the sweeps that have a window to `folder`. A full disk costs the recording, never the classifying.
 
     A file's number is the sweep's, counted on from what an earlier run has left there: nothing is written over. What a
@@ -107,7 +107,7 @@ def keeper(folder: Path, fmt: SweepFormat, log: Callable[[str], None]) -> Callab
             part.unlink()
     last = max((int(path.name[6:].partition(".")[0]) for path in there), default=0)
 
-    def keep(sweep: Sweep) -> None:
+    def keep(sweep: Sweep, verdict: Verdict) -> None:
         if len(sweep.frames):
             try:
                 save(folder / f"sweep-{last + sweep.id:06d}.npy", sweep, fmt)
@@ -153,6 +153,11 @@ class Playback:
         """True when everything was played."""
         return not self._records
 
+    @property
+    def clock(self) -> dict[str, float] | None:
+        """Sensor: how well the board's time is known."""
+        return self._stream.clock
+
     def now_ns(self) -> int:
         """Clock: the time of the record that was played last."""
         return self._now_ns
@@ -192,7 +197,7 @@ class Playback:
         """Port: the commands that were carried out at this moment."""
         found = []
         while self._records and self._records[0][0] == Kind.COMMAND and self._records[0][1] <= self._now_ns:
-            found.append(Command(self._records.popleft()[2].decode()))
+            found.append(_command(self._records.popleft()[2]))
         return found
 
 
@@ -214,5 +219,11 @@ def _written(kind: int, t_ns: int, body: bytes) -> bool:
     if kind == Kind.EDGES:
         return not len(body) % _EDGE.size and all(k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body))
     if kind == Kind.COMMAND:
-        return body.decode("ascii", "replace") in COMMANDS
+        return not _command(body).error
     return t_ns < _MOST_NS and (kind == Kind.TRANSFER or body.isalpha())
+
+
+def _command(line: bytes) -> Command:
+    """The command that a record holds."""
+    name, comma, text = line.decode("ascii", "replace").partition(",")
+    return command(name, text if comma else None)

@@ -15,9 +15,11 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from . import features
-from .bundle import GOLDEN_TOLERANCE, MEANS, Bundle, Thresholds
+from .bundle import GOLDEN_TOLERANCE, Bundle
 from .errors import BundleError
 from .known import Means
+from .manifest import MEANS, Thresholds
+from .place import moved
 from .sweep import Status, Sweep, Verdict
 
 if TYPE_CHECKING:
@@ -122,6 +124,11 @@ class Classifier:
         # onnxruntime computes them all, but makes arrays only of those that are asked for
         self._asked = ["logits"] * (not bundle.enrolled) + ["embedding"] * (self._means is not None)
 
+    @property
+    def rule(self) -> dict[str, Any]:
+        """What the constructor was told, so that a recorded sweep is judged by it again."""
+        return {"how": self._how, "sure": self.sure, "most_sweeps": self._most}
+
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window [T, R, C] of digits."""
         return self._look(taxels)[0]
@@ -183,14 +190,14 @@ class Classifier:
             return self._verdict(sweep, Finding(Status.UNKNOWN, "the model gives no number"))
         if sweep.object == 0 or sweep.object != self._object or self._how == "none":
             self._object, self._scores = sweep.object, []
-        self._scores = [*self._scores, scores]
+        own, self._scores = scores, [*self._scores, scores]
         fused = len(self._scores)
         if fused > 1:
             scores = fuse(self._scores, self._how)
         status = Status.OK
         if scores.max() < self.sure:
             status = Status.UNDECIDED if 0 < self._most <= fused else Status.UNSURE
-        return self._verdict(sweep, Finding(status), scores, fused)
+        return self._verdict(sweep, Finding(status), scores, fused, own)
 
     def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
         """As `conclude` where that gives ok; else None, and the sweep does not count: it goes on."""
@@ -215,8 +222,17 @@ class Classifier:
         logits = self._means.logits(distances) if len(self._asked) == 1 else gives[0]
         return logits, self._means.strange(distances)
 
-    def _verdict(self, sweep: Sweep, finding: Finding, scores: NDArray[np.float64] = _NONE, fused: int = 0) -> Verdict:
+    def _moved(self, sweep: Sweep) -> str:
+        """How far the contact lies from where training had it."""
+        m = self.bundle.manifest
+        return moved(sweep.frames.taxels, self.tare, m.thresholds.contact, m.place) if m.place else ""
+
+    def _verdict(
+        self, sweep: Sweep, finding: Finding, scores: NDArray[np.float64] = _NONE, fused: int = 0,
+        own: NDArray[np.float64] = _NONE,
+    ) -> Verdict:  # fmt: skip
         label, best, second = "", 0.0, 0.0
+        moved = self._moved(sweep) if len(own) or finding.status is Status.UNKNOWN else ""
         if len(scores):
             order = np.argsort(-scores, kind="stable")  # of equals the first, as argmax has it
             label, best, second = self.bundle.manifest.labels[order[0]], scores[order[0]], scores[order[1]]
@@ -224,7 +240,8 @@ class Classifier:
         return Verdict(
             sweep=sweep.id, time_ns=now, status=finding.status, label=label, probability=float(best),
             margin=float(best - second), scores=scores, fused=fused, lost=sweep.lost,
-            latency_ns=now - sweep.complete_ns, bundle=self.bundle.id, detail=finding.detail, share=sweep.share,
+            latency_ns=now - sweep.complete_ns, bundle=self.bundle.id,
+            detail="; ".join(filter(None, (moved, finding.detail))), share=sweep.share, own=own, moved=moved,
         )  # fmt: skip
 
 

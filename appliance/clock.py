@@ -98,6 +98,18 @@ class DeviceClock:
         """Host time of `device_ns`; needs one `update` before."""
         return round(device_ns + _at(self._line, device_ns))
 
+    def quality(self) -> dict[str, float] | None:
+        """How well device time is known, or None before the first packet: for the record of a sweep.
+
+        seconds: how much of the past the line rests on. drift_ppm: how much faster host time runs than the device's.
+        late_ms: how late the promptest packet of a quarter of a second was at worst, beside the promptest of all.
+        """
+        if not self._points:
+            return None
+        late = max(offset - _at(self._line, at) for at, offset in self._points)
+        seconds = (self._points[-1][0] - self._points[0][0]) / 1e9
+        return {"seconds": seconds, "drift_ppm": self._line[2] * 1e6, "late_ms": late / 1e6}
+
     def _fit(self) -> tuple[int, float, float]:
         points = self._points
         low = min(points, key=lambda p: p[1])

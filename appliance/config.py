@@ -106,7 +106,7 @@ class SerialConfig:
 
 @dataclass(frozen=True, slots=True)
 class ClassifierConfig:
-    """The network. bundle: a bundle's path, "" for the packaged one.
+    """The network. bundle: a bundle's path; "" for the one that was deployed last, or else the packaged one.
 
     fuse: how the sweeps of one object become one answer; "none": they do not. early: answer while the finger still
     slides, as soon as the bundle is sure. sure: least probability for status ok; 0 takes the bundle's own threshold.
@@ -118,6 +118,23 @@ class ClassifierConfig:
     early: bool = False
     sure: float = number(0.0, 0.0, 1.0)
     most_sweeps: int = number(0, 0, 1000)
+
+
+@dataclass(frozen=True, slots=True)
+class StoreConfig:
+    """What the box keeps. folder: bundles, recordings, the black box (store.py says what lies where).
+
+    signers: whose bundles are taken, in the form of ssh-keygen's ALLOWED SIGNERS. status: the file that `palpate status`
+    reads, "" for none. probation_sweeps, probation_s: a new bundle stays once it has named so many sweeps, or the skin has
+    streamed for so long. black_box: so many of the latest sweeps are kept, 0 for none.
+    """
+
+    folder: str = "/var/lib/palpate"
+    signers: str = "/etc/palpate/allowed_signers"
+    status: str = "/run/palpate/status.json"
+    probation_sweeps: int = number(20, 1, 100_000)
+    probation_s: float = number(600.0, 1.0, 1e6)
+    black_box: int = number(0, 0, 100_000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +151,7 @@ class Config:
     sweep: SweepConfig
     serial: SerialConfig
     classifier: ClassifierConfig
+    store: StoreConfig
     sources: Mapping[str, str] = field(compare=False)
 
 

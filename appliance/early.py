@@ -15,7 +15,7 @@ from .errors import BundleError
 from .sweep import Status, Sweep, Verdict
 
 if TYPE_CHECKING:
-    from .bundle import Early
+    from .manifest import Early
 
 
 def decides(scores: NDArray[np.float64], rule: Early) -> bool:
@@ -53,8 +53,13 @@ class Decider:
         taxels = sweep.frames.taxels
         if inspect(taxels, self._classifier.tare, self._manifest.thresholds).status is not Status.OK:
             return None
+        scores = self.scores(sweep)
+        return self._classifier.conclude_if_ok(sweep, scores[-1]) if decides(scores, self._rule) else None
+
+    def scores(self, sweep: Sweep) -> NDArray[np.float64]:
+        """Probabilities [d, K] at the steps up to that of a sweep with share < 1."""
+        taxels = sweep.frames.taxels
         rest = self._manifest.format.window - len(taxels)
         step = round(sweep.share * (self.steps + 1))  # counted from 1
         logits = self._classifier.early(np.concatenate([taxels, taxels[-1:].repeat(rest, axis=0)]))
-        scores = softmax(logits[:step])
-        return self._classifier.conclude_if_ok(sweep, scores[-1]) if decides(scores, self._rule) else None
+        return softmax(logits[:step])

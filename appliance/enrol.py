@@ -6,7 +6,6 @@ further material is no more than a further mean: that of its sweeps. What was tr
 
 from __future__ import annotations
 
-import ctypes
 import io
 import os
 import tempfile
@@ -18,16 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import bundle
+from . import bundle, disk
 from .bundle import Bundle, Classes, Manifest
 from .classifier import Classifier, softmax
 from .clock import SystemClock
 from .errors import ApplianceError, BundleError, FormatError
 from .known import Means
 from .sweep import Status, Sweep, Verdict
-
-AT_FDCWD, RENAME_EXCHANGE = -100, 2
-"""Of the Linux call renameat2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +162,10 @@ def _doubts(means: Means, label: str, z: NDArray[np.float64]) -> Iterator[str]:
 
 
 class Taken:
-    """Takes the good sweeps of a running box: a sink of its verdicts and keeper of its sweeps; `say` tells of each."""
+    """Takes the good sweeps of a running box: one of its keepers; `say` tells of each."""
 
     def __init__(self, wanted: int, say: Callable[[str], None]) -> None:
         self._wanted, self._say = wanted, say
-        self._verdicts: dict[int, Verdict] = {}
         self._windows: list[NDArray[Any]] = []
 
     @property
@@ -178,13 +173,8 @@ class Taken:
         """True once all that are wanted were taken."""
         return len(self._windows) >= self._wanted
 
-    def send(self, verdict: Verdict) -> None:
-        """Note what the box made of a sweep."""
-        self._verdicts[verdict.sweep] = verdict
-
-    def keep(self, sweep: Sweep) -> None:
+    def keep(self, sweep: Sweep, verdict: Verdict) -> None:
         """Take the sweep's window where the box found nothing wrong with it."""
-        verdict = self._verdicts.pop(sweep.id)
         if self.enough:
             return
         if verdict.status.classified or verdict.status is Status.UNKNOWN:
@@ -229,33 +219,14 @@ def write(files: Mapping[str, bytes], target: Path, swap: bool) -> None:
             new = Path(aside) / "new"
             new.mkdir()
             for name, data in files.items():
-                with (new / name).open("wb") as f:
-                    f.write(data)
-                    f.flush()
-                    os.fsync(f.fileno())
-            _sync(new)
+                disk.write(new / name, data)
+            disk.sync(new)
             Classifier(bundle.load(new), SystemClock()).self_test()
             if target.exists():
-                _exchange(new, target)
+                disk.exchange(new, target)
             else:
                 new.rename(target)
-            _sync(target.parent)
+            disk.sync(target.parent)
     except OSError as e:
         why = e.strerror or e
         raise BundleError(f"the bundle cannot be written to {target}: {why}; name another folder with --out") from e
-
-
-def _sync(folder: Path) -> None:
-    """Have the names in `folder` on the disk."""
-    at = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(at)
-    finally:
-        os.close(at)
-
-
-def _exchange(one: Path, other: Path) -> None:
-    """Swap two names in one step; Python's os has no such call."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE):
-        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(other))

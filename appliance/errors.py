@@ -1,7 +1,9 @@
 """The error tree of the box. Nothing comes in; each class is one kind of trouble and what a caller may do about it.
 
-Messages are lower case, name the value that was wrong and say what to try.
+Messages are lower case, name the value that was wrong and say what to try. Exit codes are those of sysexits.h.
 """
+
+from os import EX_CONFIG, EX_DATAERR, EX_UNAVAILABLE
 
 
 class ApplianceError(Exception):
@@ -13,18 +15,19 @@ class ApplianceError(Exception):
 class ConfigError(ApplianceError):
     """A configuration file, key or value that cannot be used."""
 
-    exit_code = 3
+    exit_code = EX_CONFIG
 
 
 class BundleError(ApplianceError):
     """A model bundle that is incomplete, altered, or does not do what its manifest says."""
 
-    exit_code = 4
+    exit_code = EX_CONFIG
 
 
 class SensorError(ApplianceError):
     """The skin cannot be read. `state` names the trouble as the state sentence does (PROTOCOL.md, sensor states)."""
 
+    exit_code = EX_UNAVAILABLE
     state = "error"
 
 
@@ -67,14 +70,16 @@ class SensorSilent(SensorError):
 class LineError(ApplianceError):
     """A GPIO line that cannot be found or requested, or an unusable libgpiod binding."""
 
-    exit_code = 6
+    exit_code = EX_UNAVAILABLE
 
 
 class PortError(ApplianceError):
     """The serial port cannot be opened."""
 
+    exit_code = EX_UNAVAILABLE
+
 
 class FormatError(ApplianceError):
     """An array, file or sentence that does not have the form it should have."""
 
-    exit_code = 8
+    exit_code = EX_DATAERR

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .bundle import Classes, Known
+from .bundle import Classes
+from .manifest import Known
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,13 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from .clock import Clock
 from .errors import ConfigError
+
+if TYPE_CHECKING:
+    from .health import Health
 
 FEEDS = 10
 """How often the watchdog is fed within its time: so nearly all of it is left for one turn of the loop."""
@@ -32,8 +36,9 @@ class Manager:
         self._next_ns = clock.now_ns()
         self._ready, self._status = False, ""
 
-    def turn(self, ready: bool, status: str) -> None:
+    def turn(self, health: Health) -> None:
         """A turn of the loop is over: feed the watchdog, and say what is new. Once READY, always READY."""
+        ready, status = health.streams, health.text
         now_ns = self._clock.now_ns()
         due = self._watchdog_us > 0 and now_ns >= self._next_ns
         ready = ready or self._ready

@@ -58,6 +58,11 @@ class Sensor(Protocol):
         ...
 
     @property
+    def clock(self) -> dict[str, float] | None:
+        """How well the board's time is known: DeviceClock.quality."""
+        ...
+
+    @property
     def tally(self) -> Tally:
         """What was counted since the start."""
         ...
@@ -97,6 +102,11 @@ class Stream:
         self._place = wire.Place(self._place.epoch + 1)
         self._device, self._mark = DeviceClock(), None
         self._leftover = b""
+
+    @property
+    def clock(self) -> dict[str, float] | None:
+        """How well the board's time is known: DeviceClock.quality."""
+        return self._device.quality()
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
         """Frames of a transfer that ended at `arrival_ns`.
@@ -173,6 +183,11 @@ class UsbSensor:
         self._link: link.VendorLink | None = None
         self._retry_ns = clock.now_ns()
         self._quiet_ns = 0  # spent listening since the last frame
+
+    @property
+    def clock(self) -> dict[str, float] | None:
+        """How well the board's time is known: DeviceClock.quality."""
+        return self._stream.clock
 
     def read(self) -> Frames:
         """Frames that came since the last call; waits `timeout_ms` at most for them."""

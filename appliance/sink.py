@@ -29,7 +29,9 @@ from .lines import Lines
 from .sweep import Status, Verdict
 
 TALKER = "PPLP"
-COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT")
+COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD")
+TOLD = ("MATERIAL", "POSITION", "SESSION")
+"""Those that have a text after a comma."""
 MAX_LINE = 128
 RETRY_NS = 1_000_000_000
 """How often a port that is gone is tried again."""
@@ -67,10 +69,16 @@ class Port(ResultSink, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A line from the robot controller: one of COMMANDS, or `error` saying why it is none."""
+    """A line from the robot controller: one of COMMANDS, with its text where it has one; or `error`: why it is none."""
 
     name: str
+    text: str = ""
     error: str = ""
+
+    @property
+    def line(self) -> str:
+        """As it stands in a sentence or a capture."""
+        return f"{self.name},{self.text}" if self.name in TOLD else self.name
 
 
 def checksum(body: str) -> str:
@@ -108,18 +116,28 @@ def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
 
 def _command(line: bytes) -> Command:
     if len(line) > MAX_LINE:
-        return Command("", f"line of over {MAX_LINE} characters without an end")
+        return Command("", error=f"line of over {MAX_LINE} characters without an end")
     # a name of letters only: it is sent back, and what noise held in its place could take the answer's fields away
     # a sentence begins at its $: what noise or a break has left before it is no part of it
-    match = re.fullmatch(rb"(?s:.*\$)?PPLP,([A-Za-z]{0,16})(?:\*([0-9A-Fa-f]{2}))?", line.strip())
+    match = re.fullmatch(rb"(?s:.*\$)?PPLP,([A-Za-z]{0,16})(?:,([ -#%-)+-~]*))?(?:\*([0-9A-Fa-f]{2}))?", line.strip())
     if not match:
-        return Command("", f"not a command; send for example $PPLP,ID*{checksum('PPLP,ID')}")
-    name, given = (group.decode("ascii") for group in match.groups(b""))
-    if given and given.upper() != checksum(f"{TALKER},{name}"):
-        return Command(name, f"checksum {given} should be {checksum(f'{TALKER},{name}')}")
-    if name not in COMMANDS:
-        return Command(name, f"unknown command; known are {' '.join(COMMANDS)}")
-    return Command(name)
+        return Command("", error=f"not a command; send for example $PPLP,ID*{checksum('PPLP,ID')}")
+    name = match[1].decode()
+    text, given = (None if group is None else group.decode() for group in match.group(2, 3))
+    said = f"{TALKER},{name}" + ("" if text is None else f",{text}")
+    if given and given.upper() != checksum(said):
+        return Command(name, error=f"checksum {given} should be {checksum(said)}")
+    return command(name, text)
+
+
+def command(name: str, text: str | None = None) -> Command:
+    """The command `name` with its text, or one that says why there is none."""
+    if name not in COMMANDS or _UNSAFE.search(text or ""):
+        return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
+    if (name in TOLD) != (text is not None):
+        want = f"{TALKER},{name}" + (",TEXT" if name in TOLD else "")
+        return Command(name, error=f"send it as ${want}")
+    return Command(name, text or "")
 
 
 class StdoutPort:

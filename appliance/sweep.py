@@ -7,18 +7,19 @@ from __future__ import annotations
 
 import io
 import json
-import os
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from tokenize import TokenError
+from types import MappingProxyType
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import disk
 from .errors import FormatError
 from .keys import typed
 
@@ -29,6 +30,8 @@ EPOCH_BITS = 40
 """An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`: frames of two plug-ins never look adjacent."""
 
 
+SCHEMA = 2
+"""Of a recorded sweep's sidecar. Schema 1 holds the sweep alone, and is still read."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
 """What numpy makes of a broken .npy, beside OSError; the last where it names a size that no machine has."""
 
@@ -159,7 +162,9 @@ class Verdict:
     scores: float64 [C] probabilities of this sweep, or of all fused sweeps; empty where nothing was classified.
     margin: probability of the label minus that of the next one. detail: what the status is about ("taxel 2,3").
     latency_ns: from `Sweep.complete_ns` to the verdict. share: how much of the window was used: less
-    than 1 in an early answer.
+    than 1 in an early answer. own: float64 [C] probabilities of this sweep alone; empty where nothing was classified.
+    moved: how far the contact lies from where training had it ("moved 2.1 mm too far towards row 4"), "" where it does
+    not, or the bundle cannot tell.
     """
 
     sweep: int
@@ -175,58 +180,59 @@ class Verdict:
     bundle: str
     detail: str = ""
     share: float = 1.0
+    own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    moved: str = ""
 
 
 def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
     return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.digits, (fmt.rows, fmt.cols))])
 
 
-def save(path: Path, sweep: Sweep, fmt: SweepFormat) -> None:
+def save(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})) -> None:
     """Write `sweep` as `path` (.npy, one record a frame) and a JSON sidecar beside it, whole or not at all.
 
-    Both are written aside and synced, then renamed; the sidecar comes first, so an .npy never lacks its description.
-    Raises OSError where that fails, and then leaves nothing behind.
+    The sidecar takes its name first, so an .npy never lacks its description. about: what else it shall hold, under names
+    that a Sweep does not have. Raises OSError where writing fails, and then leaves nothing behind.
     """
     table = np.zeros(len(sweep.frames), _record_dtype(fmt))
     table["t_ns"], table["seq"], table["taxels"] = sweep.frames.t_ns, sweep.frames.seq, sweep.frames.taxels
-    about = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"} | {"format": asdict(fmt), "schema": 1}
+    own = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"}
     packed = io.BytesIO()  # into a file np.save writes past Python, and a full disk has no errno then
     np.save(packed, table, allow_pickle=False)
-    held = {path.with_suffix(".json"): json.dumps(about, indent=1).encode(), path: packed.getvalue()}
-    asides = {target: target.with_name(target.name + ".part") for target in held}
+    told = {**about, **own, "format": asdict(fmt), "crc32": crc32(packed.getvalue()), "schema": SCHEMA}
+    disk.put_all({path.with_suffix(".json"): json.dumps(told, indent=1).encode(), path: packed.getvalue()})
+
+
+def sidecar(path: Path) -> dict[str, Any]:
+    """All that the sidecar of the .npy at `path` holds. Raises FormatError where it is missing or broken."""
     try:
-        for target, data in held.items():
-            with asides[target].open("wb") as f:
-                f.write(data)
-                f.flush()
-                os.fsync(f.fileno())
-        for target, aside in asides.items():
-            aside.replace(target)
-    except OSError:
-        for left in (*asides.values(), *(target for target in held if not path.is_file())):
-            with suppress(OSError):
-                left.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+        told = json.loads(path.with_suffix(".json").read_text("utf-8"))
+        if not isinstance(told, dict):
+            raise TypeError(f"{type(told).__name__} instead of an object")
+        return told
+    except (ValueError, OSError, TypeError, RecursionError) as e:
+        raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e
 
 
 def load(path: Path) -> tuple[Sweep, SweepFormat]:
     """Read a sweep that `save` wrote. Raises FormatError where a file is missing, broken or of another form."""
+    told = sidecar(path)
     try:
-        about = json.loads(path.with_suffix(".json").read_text())
-        table = np.load(path, allow_pickle=False)
-        fmt = typed(SweepFormat, about.pop("format"))
-        schema = about.pop("schema")
-        status = Status(about.pop("status"))
-        if schema != 1:
-            raise FormatError(f"schema {schema!r} is unknown to this version, which reads 1; update the appliance")
+        data = path.read_bytes()
+        if told.get("crc32", crc32(data)) != crc32(data):
+            raise FormatError("its bytes are not those that were recorded: the file was altered")
+        table = np.load(io.BytesIO(data), allow_pickle=False)
+        fmt = typed(SweepFormat, told.pop("format"))
+        schema = told.pop("schema")
+        status = Status(told.pop("status"))
+        if type(schema) is not int or not 1 <= schema <= SCHEMA:
+            raise FormatError(
+                f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update one of them"
+            )
         if table.dtype != _record_dtype(fmt) or table.ndim != 1:
             raise FormatError(f"records of {table.dtype} do not fit the format {fmt} of its sidecar")
         frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
-        return typed(Sweep, about | {"status": status, "frames": frames}), fmt
+        own = told if schema == 1 else {name: told[name] for name in Sweep.__slots__ if name in told}
+        return typed(Sweep, own | {"status": status, "frames": frames}), fmt
     except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
         raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e

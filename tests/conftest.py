@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appliance import bundle, config
-from appliance.__main__ import build
+from appliance import build, bundle, config
 from appliance.box import Box
 from appliance.sim import rig, script, skin, stage, terminal
 from appliance.sink import SerialSink
@@ -108,7 +107,8 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             far_end, name = stack.enter_context(terminal.pair())
             port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
             kept: list[Sweep] = []
-            box = build(settings, model, world, port, stack, keep=kept.append, **more)
+            keepers = [lambda sweep, verdict: kept.append(sweep)]
+            box = build.box(settings, model, world, port, stack, keepers=keepers, **more)
             return Rigged(box, world, far_end, port, kept=kept)
 
         yield make

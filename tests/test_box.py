@@ -12,8 +12,7 @@ import pynmea2
 import pytest
 from conftest import SECOND, SETTLE_S, Rigged
 
-from appliance import bundle, config
-from appliance.__main__ import build
+from appliance import build, bundle, config
 from appliance.sim import rig, script, skin, stage
 from appliance.sim.score import Answer
 from appliance.sink import StdoutPort
@@ -99,7 +98,7 @@ def test_lines_follow_the_sweep(rigged: Callable[..., Rigged]):
 def test_dead_process_is_not_ready(default_bundle: bundle.Bundle):
     """A killed process closes nothing: the kernel takes its lines back, and READY reads low."""
     world = quiet()
-    box = build(config.load(None), default_bundle, world, StdoutPort("sim"), ExitStack())
+    box = build.box(config.load(None), default_bundle, world, StdoutPort("sim"), ExitStack())
     for _ in range(5):
         box.step()
     assert [v for _, n, v in world.gpio.written if n == stage.READY] == [True]

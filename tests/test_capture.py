@@ -32,7 +32,7 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     verdicts: list[Verdict] = []
     port = StdoutPort("replay", play.commands)
     recorder, classifier = Recorder(play.format, SweepConfig()), Classifier(model, play)
-    box = Box(play, play, recorder, classifier, play, port=port, keep=sweeps.append)
+    box = Box(play, play, recorder, classifier, play, port=port, keepers=[lambda sweep, verdict: sweeps.append(sweep)])
     while not play.finished:
         verdicts += box.step()
     return verdicts, sweeps
@@ -182,7 +182,7 @@ def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_p
         (lambda d: (d / "s.json").unlink(), "not a recorded sweep"),
         (lambda d: (d / "s.json").write_text("{}"), "not a recorded sweep"),
         (
-            lambda d: (d / "s.json").write_text((d / "s.json").read_text().replace('"schema": 1', '"schema": 7')),
+            lambda d: (d / "s.json").write_text((d / "s.json").read_text().replace('"schema": 2', '"schema": 7')),
             "schema 7",
         ),
         (
@@ -206,6 +206,9 @@ def test_broken_recordings_are_named(rigged: Callable[..., Rigged], tmp_path: Pa
         load(tmp_path / "s.npy")
 
 
+VERDICT = Verdict(1, 0, Status.OK, "wood", 1.0, 1.0, np.ones(1), 1, 0, 0, "")
+
+
 def kept(n: int) -> Sweep:
     """Sweep number `n` of 40 frames."""
     frames = Frames(np.arange(40), np.arange(40), np.full((40, 4, 4), n, np.uint8))
@@ -214,12 +217,12 @@ def kept(n: int) -> Sweep:
 
 def test_a_later_run_writes_nothing_over(tmp_path: Path):
     """A program that was started again counts on from what it finds; half a file of the killed one goes, no other."""
-    keeper(tmp_path, skin.FORMAT, print)(kept(1))
+    keeper(tmp_path, skin.FORMAT, print)(kept(1), VERDICT)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     (tmp_path / "sweep-000002.json").write_text("{}")
     for left in ("sweep-000003.json.part", "sweep-000003.npy.part", "mine.part"):
         (tmp_path / left).write_bytes(b"half")
-    keeper(tmp_path, skin.FORMAT, print)(kept(1))
+    keeper(tmp_path, skin.FORMAT, print)(kept(1), VERDICT)
     after = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     assert before.items() <= after.items()
     assert sorted(after.keys() - before.keys()) == [
@@ -232,20 +235,20 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path):
     """The disk ends after n bytes, for n across both files: it is said why, nothing stays, what was there is whole."""
     said: list[str] = []
     keep = keeper(tmp_path, skin.FORMAT, said.append)
-    keep(kept(1))
+    keep(kept(1), VERDICT)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     sizes = range(0, len(before["sweep-000001.npy"]), 100)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     for size in sizes:
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
         try:
-            keep(kept(2))
+            keep(kept(2), VERDICT)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
     why = f"keep: sweep 2 cannot be saved: File too large; see that {tmp_path} has room and may be written; "
     assert said == [why + "classifying goes on"] * len(sizes)
-    keep(kept(3))
+    keep(kept(3), VERDICT)
     assert load(tmp_path / "sweep-000003.npy")[0].id == 3
 
 

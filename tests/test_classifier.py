@@ -17,6 +17,7 @@ from appliance import bundle
 from appliance.bundle import Bundle, Early, Thresholds
 from appliance.classifier import Classifier, fuse, inspect, softmax
 from appliance.errors import BundleError
+from appliance.manifest import SCHEMA
 from appliance.sim import skin
 from appliance.sim.rig import VirtualClock
 from appliance.sweep import Frames, Status, Sweep
@@ -292,7 +293,7 @@ def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **chang
 
 
 def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bundle):
-    """Without the new fields; what schema 2 writes is read again as it was."""
+    """Without the new fields; what is written now is read again as it was."""
     folder = copy(tmp_path)
     old = json.loads((folder / bundle.MANIFEST).read_text())
     (folder / bundle.MANIFEST).write_text(
@@ -304,7 +305,7 @@ def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bund
     read = bundle.load(folder)
     assert (read.manifest.early, read.manifest.known, read.classes, read.enrolled) == (None, None, None, {})
     new = toy.load(tmp_path / "toy", early=Early((0.9, 0.8, 2.0), 2), outputs=(*toy.OUTPUTS, "early"))
-    assert new.manifest.schema == 2
+    assert new.manifest.schema == SCHEMA
     assert bundle.Manifest.parse(new.manifest.json()) == new.manifest
     assert new.manifest.early == Early((0.9, 0.8, 2.0), 2)
     assert new.manifest.known == toy.KNOWN

@@ -21,6 +21,7 @@ from appliance import bundle
 from appliance.__main__ import main
 from appliance.bundle import Early
 from appliance.classifier import softmax
+from appliance.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError
 from appliance.sim import bench, demo, parts, score, script, skin, terminal
 from appliance.sweep import Frames, Status, Sweep, save
 
@@ -201,7 +202,7 @@ def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFix
     manifest = json.loads((folder / bundle.MANIFEST).read_text()) | {"early": None}
     (folder / bundle.MANIFEST).write_text(json.dumps(manifest))
     which = ["--set", "classifier.early=true", "--set", f"classifier.bundle={folder}"]
-    assert main(["run", "--sim", "skin", *VIRTUAL, *which]) == 4
+    assert main(["run", "--sim", "skin", *VIRTUAL, *which]) == BundleError.exit_code
     said = capsys.readouterr()
     assert "has no early heads" in said.err
     assert said.out == ""
@@ -213,7 +214,7 @@ def test_a_sweep_that_was_answered_early_is_replayed_so(tmp_path: Path, capsysbi
     """By a bundle that decides there; another one is named."""
     frames = Frames(np.arange(10), np.arange(10), toy.window(1, 0)[:10])
     save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.OK, frames, share=0.5), toy.FORMAT)
-    for least, code in ((0.5, 0), (2.0, 8)):
+    for least, code in ((0.5, 0), (2.0, FormatError.exit_code)):
         made = toy.files(early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early"))
         folder = toy.put(tmp_path / f"b{least}", made)
         assert main(["replay", str(tmp_path / "s.npy"), "--set", f"classifier.bundle={folder}"]) == code
@@ -252,28 +253,32 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
 
 
 @pytest.mark.parametrize(
-    ("args", "code", "hint"),
+    ("args", "trouble", "hint"),
     [
-        (["run"], 3, "trigger.start names no line"),
-        (["run", "--set", "trigger.start=A", "--set", "trigger.mode=two-lines"], 3, "trigger.stop names no line"),
-        (["run", "--virtual"], 3, "--virtual needs --sim"),
-        (["run", "--sim", "world"], 3, "--sim world is unknown"),
-        (["run", "--board", "toaster"], 3, "rpi5"),
-        (["run", "--set", "sweep.longets_s=1"], 3, "longest_s"),
-        (["run", "--sim", "skin", "--set", "classifier.bundle=/nowhere"], 4, "no bundle at /nowhere"),
-        (["run", "--sim", "replay:/nowhere.npz"], 8, "nowhere.npz: not a sweep set"),
-        (["run", "--board", "rpi5"], 6, "gpiochip"),
-        (["replay", "/nowhere"], 8, "cannot be read"),
-        (["replay", "/nowhere.npy"], 8, "not a recorded sweep"),
-        (["run", "--sim", "skin", "--virtual", "--keep", "/proc/x"], 3, "--keep /proc/x"),
-        (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], 3, "--capture /proc/x"),
+        (["run"], ConfigError, "trigger.start names no line"),
+        (
+            ["run", "--set", "trigger.start=A", "--set", "trigger.mode=two-lines"],
+            ConfigError,
+            "trigger.stop names no line",
+        ),
+        (["run", "--virtual"], ConfigError, "--virtual needs --sim"),
+        (["run", "--sim", "world"], ConfigError, "--sim world is unknown"),
+        (["run", "--board", "toaster"], ConfigError, "rpi5"),
+        (["run", "--set", "sweep.longets_s=1"], ConfigError, "longest_s"),
+        (["run", "--sim", "skin", "--set", "classifier.bundle=/nowhere"], BundleError, "no bundle at /nowhere"),
+        (["run", "--sim", "replay:/nowhere.npz"], FormatError, "nowhere.npz: not a sweep set"),
+        (["run", "--board", "rpi5"], LineError, "gpiochip"),
+        (["replay", "/nowhere"], FormatError, "cannot be read"),
+        (["replay", "/nowhere.npy"], FormatError, "not a recorded sweep"),
+        (["run", "--sim", "skin", "--virtual", "--keep", "/proc/x"], ConfigError, "--keep /proc/x"),
+        (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], ConfigError, "--capture /proc/x"),
     ],
 )
-def test_exit_codes(args: list[str], code: int, hint: str, capsys: pytest.CaptureFixture[str]):
+def test_exit_codes(args: list[str], trouble: type[ApplianceError], hint: str, capsys: pytest.CaptureFixture[str]):
     """Each kind of trouble has its exit code and one line that says what to do."""
-    if "rpi5" in args and code == 6 and any(Path("/dev").glob("gpiochip*")):
+    if "rpi5" in args and trouble is LineError and any(Path("/dev").glob("gpiochip*")):
         pytest.skip("this machine has gpio chips")
-    assert main(args) == code
+    assert main(args) == trouble.exit_code
     err = capsys.readouterr().err.strip()
     assert hint in err
     assert len(err.splitlines()) == 1
@@ -284,7 +289,7 @@ def test_sets_that_lack_something(tmp_path: Path, key: str, capsys: pytest.Captu
     """A sweep set without one of its arrays is named with what is missing."""
     arrays = {"samples": np.zeros((2, 5, 4, 4), np.uint8), "labels": [0, 0], "materials": ["a"], "rate_hz": 750.0}
     np.savez(tmp_path / "s.npz", **{k: v for k, v in arrays.items() if k != key})
-    assert main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == 8
+    assert main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == FormatError.exit_code
     assert key in capsys.readouterr().err
 
 
@@ -293,7 +298,7 @@ def test_a_set_of_another_format(tmp_path: Path, capsys: pytest.CaptureFixture[s
     np.savez(
         tmp_path / "s.npz", samples=np.zeros((2, 5, 3, 3), np.int16), labels=[0, 0], materials=["a"], rate_hz=100.0
     )
-    assert main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == 8
+    assert main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == FormatError.exit_code
     err = capsys.readouterr().err
     assert "3x3 int16 at 100 Hz" in err
     assert "4x4 uint8 at 750 Hz" in err

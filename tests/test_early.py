@@ -200,7 +200,7 @@ def test_lines_tell_it_in_order(rigged: Callable[..., Rigged]):
 
     world.gpio.watchers[stage.DECIDED] = watch
     kept_after: list[bool] = []
-    box.box._keep = lambda sweep: kept_after.append(bool(heard_before))  # a disk may be slow
+    box.box._keep = lambda sweep, verdict: kept_after.append(bool(heard_before))  # a disk may be slow
     all_of(box)
     names = stage.READY, stage.BUSY, stage.DECIDED, stage.RESULT_VALID, stage.BITS[0]
     start, free = [(stage.READY, False), (stage.BUSY, True)], [(stage.READY, True), (stage.BUSY, False)]
@@ -429,7 +429,7 @@ def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_pat
     again, kept = [], []
     replayed = Box(
         play, play, Recorder(FMT, SweepConfig(lead_ms=100)), classifier, play, early=Decider(classifier),
-        port=StdoutPort("replay", play.commands), keep=kept.append,
+        port=StdoutPort("replay", play.commands), keepers=[lambda sweep, verdict: kept.append(sweep)],
     )  # fmt: skip
     while not play.finished:
         again += replayed.step()
@@ -446,7 +446,7 @@ def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_p
     """What was kept of an early answer is what it saw; read again it is decided again, with the same scores."""
     box = rigged(world_of(slid(-10, 60)), SETS, toy())
     (verdict,) = all_of(box)
-    keeper(tmp_path, FMT, print)(box.kept[0])
+    keeper(tmp_path, FMT, print)(box.kept[0], verdict)
     sweep, fmt = load(tmp_path / "sweep-000001.npy")
     assert (fmt, len(sweep.frames), sweep.share) == (FMT, 40, 0.4)
     assert round((sweep.stop_ns - sweep.start_ns) / FMT.period_ns) == LEAD + 39

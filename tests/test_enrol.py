@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import toy
 
-from appliance import bundle, enrol
+from appliance import bundle, disk, enrol
 from appliance.__main__ import main
 from appliance.bundle import Bundle, Early
 from appliance.classifier import Classifier
-from appliance.errors import ApplianceError, BundleError, FormatError
+from appliance.errors import ApplianceError, BundleError, ConfigError, FormatError
 from appliance.known import Means
 from appliance.sim import stage
 from appliance.sim.rig import VirtualClock
@@ -241,7 +241,7 @@ def test_what_is_no_bundle_is_never_replaced(tmp_path: Path, made: dict[str, byt
 
 
 @pytest.mark.parametrize("there", [False, True])
-@pytest.mark.parametrize("call", ["fsync", "_exchange"])
+@pytest.mark.parametrize("call", ["fsync", "exchange"])
 def test_whole_or_not_at_all(
     tmp_path: Path, made: dict[str, bytes], there: bool, call: str, monkeypatch: pytest.MonkeyPatch
 ):
@@ -249,18 +249,18 @@ def test_whole_or_not_at_all(
     target = tmp_path / "t"
     if there:
         toy.put(target, toy.files())
-    elif call == "_exchange":
-        monkeypatch.setattr(Path, "rename", lambda *args: enrol._exchange(*args))
+    elif call == "exchange":
+        monkeypatch.setattr(Path, "rename", lambda *args: disk.exchange(*args))
     before = content(target) if there else None
     left = 3
 
     def fails(*args: object) -> None:
         nonlocal left
         left -= 1
-        if left <= 0 or call == "_exchange":
+        if left <= 0 or call == "exchange":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os if call == "fsync" else enrol, call, fails)
+    monkeypatch.setattr(os if call == "fsync" else disk, call, fails)
     with pytest.raises(BundleError, match=r"cannot be written to .*No space left on device"):
         enrol.write(made, target, there)
     assert (content(target) if target.exists() else None) == before
@@ -270,7 +270,7 @@ def test_whole_or_not_at_all(
 def test_the_disk_has_it_before_the_name(tmp_path: Path, made: dict[str, bytes], monkeypatch: pytest.MonkeyPatch):
     """Each file and its folder are synced, then the name changes in one step, then the folder above is synced."""
     target, steps = toy.put(tmp_path / "t", toy.files()), []
-    sync, swap = os.fsync, enrol._exchange
+    sync, swap = os.fsync, disk.exchange
 
     def synced(at: int) -> None:
         steps.append(Path(os.readlink(f"/proc/self/fd/{at}")).name)
@@ -284,7 +284,7 @@ def test_the_disk_has_it_before_the_name(tmp_path: Path, made: dict[str, bytes],
         steps.append("swap")
 
     monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(enrol, "_exchange", swapped)
+    monkeypatch.setattr(disk, "exchange", swapped)
     enrol.write(made, target, True)
     assert sorted(steps[:4]) == sorted(made)
     assert steps[4:] == ["new", "swap", tmp_path.name]
@@ -359,8 +359,8 @@ def test_sigterm_ends_an_enrolment(rig, tmp_path: Path, monkeypatch: pytest.Monk
     """As it ends a run; nothing is written."""
     keep = enrol.Taken.keep
 
-    def kept(self: enrol.Taken, sweep) -> None:
-        keep(self, sweep)
+    def kept(self: enrol.Taken, *what) -> None:
+        keep(self, *what)
         os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(enrol.Taken, "keep", kept)
@@ -369,16 +369,18 @@ def test_sigterm_ends_an_enrolment(rig, tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("more", "code", "hint"),
+    ("more", "trouble", "hint"),
     [
-        (["--set", "classifier.bundle=/nowhere"], 4, "no bundle at /nowhere"),
-        (["--out", "/nowhere/new"], 4, "/nowhere is no folder that you may write to"),
-        (["--sim", "world"], 3, "--sim world is unknown"),
+        (["--set", "classifier.bundle=/nowhere"], BundleError, "no bundle at /nowhere"),
+        (["--out", "/nowhere/new"], BundleError, "/nowhere is no folder that you may write to"),
+        (["--sim", "world"], ConfigError, "--sim world is unknown"),
     ],
 )
-def test_trouble_is_told_before_the_robot_sweeps(rig, more: list[str], code: int, hint: str, capsys):
+def test_trouble_is_told_before_the_robot_sweeps(
+    rig, more: list[str], trouble: type[ApplianceError], hint: str, capsys
+):
     """A bundle that is not there, a place that is none, a world that is none: one line, no sweep."""
-    assert rig(digits(*FELT), *more) == code
+    assert rig(digits(*FELT), *more) == trouble.exit_code
     said = capsys.readouterr()
     assert hint in said.err
     assert said.out == ""
@@ -387,7 +389,7 @@ def test_trouble_is_told_before_the_robot_sweeps(rig, more: list[str], code: int
 
 def test_the_running_bundle_is_replaced_only_when_told(rig, old: Bundle, tmp_path: Path, capsys):
     """--out of the bundle in use: refused before a sweep, done with --replace."""
-    assert rig(digits(*FELT), out="old") == 4
+    assert rig(digits(*FELT), out="old") == BundleError.exit_code
     said = capsys.readouterr()
     assert "give --replace" in said.err
     assert said.out == ""
@@ -416,9 +418,9 @@ def test_sweeps_are_whole_where_the_box_decides_early(rig, tmp_path: Path, capsy
 
 
 def test_a_bundle_that_cannot_is_told_before_the_robot_sweeps(rig, tmp_path: Path, capsys):
-    """No embedding: exit code 4, and no sweep was asked for."""
+    """No embedding: told at once, and no sweep was asked for."""
     toy.put(tmp_path / "old", toy.files(known=None, outputs=("logits",)))
-    assert rig(digits(*FELT)) == 4
+    assert rig(digits(*FELT)) == BundleError.exit_code
     said = capsys.readouterr()
     assert "has no embedding" in said.err
     assert said.out == ""
@@ -427,7 +429,7 @@ def test_a_bundle_that_cannot_is_told_before_the_robot_sweeps(rig, tmp_path: Pat
 def test_lines_that_cannot_tell_the_new_label(rig, monkeypatch: pytest.MonkeyPatch, capsys):
     """Two class bits hold three labels and 0, not four: told now, since `run` would refuse the new bundle."""
     monkeypatch.setattr(stage, "BITS", stage.BITS[:2])
-    assert rig(digits(*FELT)) == 3
+    assert rig(digits(*FELT)) == ConfigError.exit_code
     said = capsys.readouterr()
     assert "4 labels and the code 0 do not fit output.class_bits" in said.err
     assert said.out == ""
@@ -440,8 +442,7 @@ def test_taken_takes_what_it_wants(old: Bundle):
     with pytest.raises(ApplianceError, match="0 of 2 good sweeps"):
         taken.windows()
     for i, z in enumerate(FELT[:3]):
-        taken.send(it(toy.sweep(*z, number=i)))
-    for i, z in enumerate(FELT[:3]):
-        taken.keep(toy.sweep(*z, number=i))
+        sweep = toy.sweep(*z, number=i)
+        taken.keep(sweep, it(sweep))
     assert taken.windows().tolist() == digits(*FELT[:2]).tolist()
     assert said == ["sweep 0 taken: 1 of 2", "sweep 1 taken: 2 of 2"]

@@ -13,7 +13,7 @@ import pytest
 from fuzz import corpus, files, seeds, targets
 from fuzz.mutators import MUTATORS
 
-from appliance import bundle, capture, config, keys, sensor, sink, sweep, wire
+from appliance import bundle, capture, config, keys, manifest, sensor, sink, sweep, wire
 from appliance.errors import ApplianceError
 
 TARGETS = sorted(targets.TARGETS)
@@ -228,8 +228,8 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
     ("settings", "the file is not named", config, "load", numb(config.load)),
     ("settings", "what is described does not load", config, "describe",
      changed(config, "describe", lambda text: text.replace("= true", "= 1").replace("0x", ""))),
-    ("manifest", "types are not looked at", bundle, "typed", unguarded),
-    ("manifest", "a message of two lines", bundle.json, "loads", broken_json),
+    ("manifest", "types are not looked at", manifest, "typed", unguarded),
+    ("manifest", "a message of two lines", manifest.json, "loads", broken_json),
     ("manifest", "golden sweeps of any form", bundle, "_golden", lambda data, manifest: (np.ones((1, 2, 3, 4)), None)),
     ("recording", "a time is lost", sweep, "Frames", lambda t_ns, seq, taxels: FRAMES(t_ns[1:], seq, taxels)),
     ("recording", "types are not looked at", sweep, "typed", unguarded),
@@ -255,7 +255,7 @@ def test_each_promise_can_be_seen_broken(
 @pytest.mark.parametrize(
     ("target", "room", "name"),
     [("unpack", wire, "unpack_identity"), ("command", sink, "_command"), ("settings", config, "_checked"),
-     ("manifest", bundle, "typed"), ("recording", sweep, "typed"), ("capture", capture, "typed")],
+     ("manifest", manifest, "typed"), ("recording", sweep, "typed"), ("capture", capture, "typed")],
 )  # fmt: skip
 def test_another_error_is_not_kept_back(
     target: str, room: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -45,8 +45,8 @@ def test_a_box_without_lines_has_nothing_to_lower(chip: gpio.SimGpio, capsys: py
 @pytest.mark.parametrize(
     ("args", "code", "message"),
     [
-        (["--board", "rpi5"], 6, "cannot request gpio lines .*errno 16.*another program"),
-        (["--board", "rpi9"], 3, "board = 'rpi9' has no board-NAME.toml"),
+        (["--board", "rpi5"], 69, "cannot request gpio lines .*errno 16.*another program"),
+        (["--board", "rpi9"], 78, "board = 'rpi9' has no board-NAME.toml"),
     ],
 )
 def test_what_cannot_be_lowered_is_said(

@@ -10,11 +10,14 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from conftest import SECOND, Rigged, idle_world
 
 from appliance.errors import ConfigError
+from appliance.health import Health
 from appliance.notify import Manager
 from appliance.sim import rig, script, skin, stage
 
@@ -57,6 +60,11 @@ def told(ear: Ear, **more: str) -> tuple[Manager, rig.VirtualClock]:
     return Manager(clock, {"NOTIFY_SOCKET": ear.address, **more}), clock
 
 
+def how(streams: bool, text: str) -> Any:
+    """As much of a Health as a manager looks at."""
+    return SimpleNamespace(streams=streams, text=text)
+
+
 def test_it_says_what_is_new_and_no_more(ear: Ear):
     """STATUS when it changes, READY once, even where the skin is lost later; STOPPING at the end."""
     manager, _ = told(ear)
@@ -68,7 +76,7 @@ def test_it_says_what_is_new_and_no_more(ear: Ear):
         (False, "no"),
         (True, "no"),
     ]:
-        manager.turn(ready, status)
+        manager.turn(how(ready, status))
     manager.stopping()
     assert ear.heard() == [["STATUS=skin absent"], ["STATUS=fine", "READY=1"], ["STATUS=no"], ["STOPPING=1"]]
 
@@ -76,12 +84,12 @@ def test_it_says_what_is_new_and_no_more(ear: Ear):
 def test_the_watchdog_is_fed_by_turns_alone(ear: Ear):
     """At the first turn, then at most each second of its ten; a box that takes no turn is silent."""
     manager, clock = told(ear, **WATCHDOG, WATCHDOG_PID=str(os.getpid()))
-    manager.turn(True, "fine")
+    manager.turn(how(True, "fine"))
     assert ear.heard() == [["STATUS=fine", "READY=1", "WATCHDOG=1"]]
     fed = []
     for _ in range(400):
         clock.sleep_until(clock.now_ns() + SECOND // 100)
-        manager.turn(True, "fine")
+        manager.turn(how(True, "fine"))
         fed += ear.heard()
     assert fed == [["WATCHDOG=1"]] * 4
     clock.sleep_until(clock.now_ns() + 100 * SECOND)
@@ -92,7 +100,7 @@ def test_turns_without_a_skin_keep_the_start_alive(ear: Ear):
     """Until READY each feeding moves the end of the start on, by the watchdog's time; none after it."""
     manager, clock = told(ear, **WATCHDOG)
     for ready in (False, False, True, True):
-        manager.turn(ready, "")
+        manager.turn(how(ready, ""))
         clock.sleep_until(clock.now_ns() + SECOND)
     later = ["WATCHDOG=1", "EXTEND_TIMEOUT_USEC=10000000"]
     assert ear.heard() == [later, later, ["READY=1", "WATCHDOG=1"], ["WATCHDOG=1"]]
@@ -103,7 +111,7 @@ def test_no_watchdog_or_another_s_is_not_fed(ear: Ear, more: dict[str, str]):
     """WATCHDOG_USEC unset, or WATCHDOG_PID not ours."""
     manager, clock = told(ear, **more)
     for _ in range(3):
-        manager.turn(True, "fine")
+        manager.turn(how(True, "fine"))
         clock.sleep_until(clock.now_ns() + 100 * SECOND)
     assert ear.heard() == [["STATUS=fine", "READY=1"]]
 
@@ -111,7 +119,7 @@ def test_no_watchdog_or_another_s_is_not_fed(ear: Ear, more: dict[str, str]):
 def test_what_a_device_says_of_itself_is_not_obeyed(ear: Ear):
     """A line break in a status would begin another message; what is no text is sent all the same."""
     manager, _ = told(ear)
-    manager.turn(False, "skin absent: no\nREADY=1\r\nMAINPID=1 \udcff")
+    manager.turn(how(False, "skin absent: no\nREADY=1\r\nMAINPID=1 \udcff"))
     assert ear.heard() == [["STATUS=skin absent: no READY=1 MAINPID=1 ?"]]
 
 
@@ -119,7 +127,7 @@ def test_without_a_socket_nothing_is_said(monkeypatch: pytest.MonkeyPatch):
     """Started by hand: no socket is even made."""
     monkeypatch.delattr(socket, "socket")
     manager = Manager(rig.VirtualClock(), WATCHDOG)
-    manager.turn(True, "fine")
+    manager.turn(how(True, "fine"))
     manager.stopping()
 
 
@@ -128,18 +136,18 @@ def test_a_socket_that_is_gone_costs_nothing(ear: Ear, tmp_path: Path):
     manager, _ = told(ear)
     ear.socket.close()
     Path(ear.address).unlink(missing_ok=True)
-    manager.turn(True, "fine")
+    manager.turn(how(True, "fine"))
     ear.open()
-    manager.turn(True, "fine")
+    manager.turn(how(True, "fine"))
     assert ear.heard() == [["STATUS=fine", "READY=1"]]
     for i in range(100_000):
-        manager.turn(True, str(i))
+        manager.turn(how(True, str(i)))
         if manager._status != str(i):
             break
     else:
         pytest.fail("the queue never filled")
     ear.heard()
-    manager.turn(True, "again")
+    manager.turn(how(True, "again"))
     assert ear.heard() == [["STATUS=again"]]
 
 
@@ -156,11 +164,11 @@ class Pulse:
         self.notes: list[tuple[bool, str] | str] = []
         self.turns = 0
 
-    def turn(self, ready: bool, status: str) -> None:
+    def turn(self, health: Health) -> None:
         """As the protocol's."""
         self.turns += 1
-        if not self.notes or self.notes[-1] != (ready, status):
-            self.notes.append((ready, status))
+        if not self.notes or self.notes[-1] != (health.streams, health.text):
+            self.notes.append((health.streams, health.text))
 
     def stopping(self) -> None:
         """As the protocol's."""
@@ -171,7 +179,7 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., 
     """Without a skin it says what it waits for; then it streams, and says how many sweeps it has answered."""
     pulse, world = Pulse(), idle_world()
     world.backend.unplug()
-    box = rigged(world, pulse=pulse)
+    box = rigged(world, pulses=[pulse])
     box.seconds(2)
     ((ready, status),) = pulse.notes
     assert not ready
@@ -193,7 +201,7 @@ def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[...,
     """It counts as streaming until it is found silent, but nothing of it has ever come."""
     pulse, world = Pulse(), idle_world()
     world.backend.mangle = lambda data: b""
-    rigged(world, pulse=pulse).seconds(3)
+    rigged(world, pulses=[pulse]).seconds(3)
     said = {status.split(" for ")[0] for _, status in pulse.notes}
     assert said == {"skin streaming. Sweeps answered: 0", "skin silent: the skin is there but sent no frame"}
     assert not any(ready for ready, _ in pulse.notes)
@@ -202,9 +210,9 @@ def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[...,
 def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
     """One pulse for each whole turn: none for the one that hangs after its sentence, at the disk."""
     pulse = Pulse()
-    box = rigged(stage.build(skin.FORMAT, script.tubes(1, 1), rig.VirtualClock(), "sim"), pulse=pulse)
+    box = rigged(stage.build(skin.FORMAT, script.tubes(1, 1), rig.VirtualClock(), "sim"), pulses=[pulse])
 
-    def hang(sweep: object) -> None:
+    def hang(sweep: object, verdict: object) -> None:
         raise TimeoutError
 
     box.box._keep = hang
@@ -220,10 +228,10 @@ def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
 def test_stopping_is_told_before_the_last_answer(rigged: Callable[..., Rigged]):
     """What is open is answered while the manager knows already."""
     pulse = Pulse()
-    box = rigged(idle_world(), pulse=pulse)
+    box = rigged(idle_world(), pulses=[pulse])
     box.pulse(stage.START, 0.2)
     end = box.world.clock.now_ns() + SECOND
-    box.box._keep = lambda sweep: pulse.notes.append(str(sweep.status))
+    box.box._keep = lambda sweep, verdict: pulse.notes.append(str(sweep.status))
     box.box.run(lambda: box.world.clock.now_ns() > end)
     assert pulse.notes[-2:] == ["stopping", "aborted"]
 

@@ -17,8 +17,7 @@ from rig import soak, soak_judge, soak_page
 from rig.soak_boxes import Gone, Reckoned, Script, ThisMachine, process
 from rig.soak_judge import SAMPLE
 
-from appliance import bundle, config
-from appliance.__main__ import build
+from appliance import build, bundle, config
 from appliance.sim import script, skin, stage
 from appliance.sim.rig import VirtualClock
 from appliance.sim.score import Answer
@@ -376,7 +375,7 @@ def test_a_simulated_world_that_remembers_nothing_stays_as_large_as_it_is():
     world = stage.build(skin.FORMAT, script.tubes(1, 20), VirtualClock(), "sim", remember=False)
     with ExitStack() as stack:
         settings = config.load(None, [], site=Path(__file__).with_name("no-site.toml"))
-        box = build(settings, bundle.load(bundle.DEFAULT), world, StdoutPort("sim"), stack)
+        box = build.box(settings, bundle.load(bundle.DEFAULT), world, StdoutPort("sim"), stack)
         while not world.finished(box.answered):
             box.step()
     assert (world.robot.acts, box.answered, len(world.robot.played), len(world.gpio.written)) == (20, 20, 1, 0)

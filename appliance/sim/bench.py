@@ -73,7 +73,7 @@ class _Watch:
         self.verdicts.append(verdict)
         self.answered_ms.append((self._clock.now_ns() - in_hand_ns) / 1e6)
 
-    def keep(self, sweep: Sweep) -> None:
+    def keep(self, sweep: Sweep, verdict: Verdict) -> None:
         self.seen_ms.append((sweep.complete_ns - sweep.stop_ns) / 1e6)
 
 
@@ -87,7 +87,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     watch = _Watch(clock)
     world = stage.build(fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim")
     with ExitStack() as stack:
-        box, far_end = build(world, stack, [watch], watch.keep)
+        box, far_end = build(world, stack, [watch], [watch.keep])
         while not world.finished(box.answered):
             box.step()
             drain(far_end)

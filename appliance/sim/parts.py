@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from itertools import cycle
 from pathlib import Path
@@ -15,10 +15,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..box import Box
+from ..box import Box, Keeper
 from ..clock import SystemClock
 from ..sink import ResultSink
-from ..sweep import Sweep, SweepFormat
+from ..sweep import SweepFormat
 from . import rig, stage
 
 MEMORY_SWEEPS, STREAM_S = 1000, 15.0
@@ -33,7 +33,7 @@ class Build(Protocol):
         world: stage.SimWorld,
         stack: ExitStack,
         also: Iterable[ResultSink] = (),
-        keep: Callable[[Sweep], None] | None = None,
+        keepers: Iterable[Keeper] = (),
     ) -> tuple[Box, int]:
         """Build it."""
         ...

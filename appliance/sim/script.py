@@ -1,4 +1,4 @@
-"""Scripts for the robot of the rig: sweeps over simulated tubes, or the sweeps of a recorded set. Out: Acts.
+"""Scripts for the robot of the rig: sweeps over simulated tubes, a finger at rest, or a recorded set. Out: Acts.
 
 A set is played so that the middle of each sweep is exactly the recorded window.
 """
@@ -24,6 +24,10 @@ SLIDE_S, REST_S = 3.0, 0.1
 """The slide (paper, sec. II.B), and the finger at rest on the tube before and after it."""
 LEAD_S = 0.5
 """From an edge to a recorded window, as `sweep.lead_ms` has it; the window's first and last frames are held so long."""
+RESTS_MM = (4.0, 3.0), (-2.5, 2.0), (1.5, -1.0), (0.0, 0.0)
+"""Where the skin sits while somebody places it, a little better each time: ahead along the finger, and aside."""
+RESTS_FOR_S, LIFTED_S = 3.0, 1.0
+"""How long the finger then rests on the tube, and how long it is off before."""
 MARGIN = 8
 """Frames before and after the edges, so that these have room."""
 
@@ -33,13 +37,13 @@ def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
 
     Raises ConfigError for another name, FormatError where the bundle wants another skin.
     """
-    if name == "skin":
+    if name in ("skin", "rest"):
         if fmt != skin.FORMAT:
             raise FormatError(f"the simulated skin sends {skin.FORMAT}, the bundle wants {fmt}; use --sim replay:FILE")
-        return tubes(seed), "sim"
+        return (tubes(seed) if name == "skin" else rests(seed)), "sim"
     if name.startswith(SETS):
         return replay(Path(name.removeprefix(SETS)), fmt), "replay"
-    raise ConfigError(f"--sim {name} is unknown; use skin, or replay:FILE with a sweep set")
+    raise ConfigError(f"--sim {name} is unknown; use skin, rest, or replay:FILE with a sweep set")
 
 
 def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = ()) -> Iterator[Act]:
@@ -60,6 +64,18 @@ def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement]
         on = skin.sweep(label, place, rng, world, rest_s=REST_S, slide_s=SLIDE_S, after_s=REST_S)
         start = len(off) + round(REST_S * rate)
         yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
+
+
+def rests(seed: int) -> Iterator[Act]:
+    """A finger that is lifted and put on the wooden tube again, without end; between the touches the skin is moved."""
+    rng = np.random.default_rng(seed)
+    world = skin.World()
+    off = round(LIFTED_S * skin.FORMAT.rate_hz)
+    for dx_mm, dy_mm in itertools.cycle(RESTS_MM):
+        place = skin.Placement(dx_mm, dy_mm, seed=seed)
+        on = skin.sweep("wood", place, rng, world, rest_s=RESTS_FOR_S, slide_s=0, after_s=0)
+        frames = np.concatenate([skin.idle(off, rng, world), on])
+        yield Act(frames, off, len(frames) - 1, "wood")
 
 
 def replay(path: Path, fmt: SweepFormat) -> Iterator[Act]:

@@ -55,7 +55,7 @@ def unpack() -> list[bytes]:
 
 def command() -> list[bytes]:
     """Each command as a program and as a person sends it, the document's sentences, and lines that are none."""
-    sealed = [sink.sentence(name) for name in sink.COMMANDS]
+    sealed = [sink.sentence(name, *["plastic rough"] * (name in sink.TOLD)) for name in sink.COMMANDS]
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
     written = [s.encode() + b"\r\n" for s in re.findall(r"`(\$PPLP[^`]*)`", protocol)]
     by_hand = [b"PPLP," + name.encode() + b"\n" for name in sink.COMMANDS]

@@ -162,7 +162,9 @@ def command(data: bytes, folder: Path) -> None:
 def _is_command(line: bytes, name: str) -> bool:
     """Whether a line is a command by PROTOCOL.md, and this one."""
     body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
-    known = body.startswith(b"PPLP,") and body[5:].decode("ascii", "replace") == name and name in sink.COMMANDS
+    said, comma, _ = body.removeprefix(b"PPLP,").decode("ascii", "replace").partition(",")
+    known = body.startswith(b"PPLP,") and said == name and name in sink.COMMANDS and bool(comma) == (name in sink.TOLD)
+    known = known and not re.search(rb"[^ -~]|[!\\~^]", body)  # what a sentence may not hold (PROTOCOL.md)
     sealed = not star or given.upper() == b"%02X" % reduce(xor, body, 0)
     return known and sealed and len(line) <= LINE
 

@@ -1,0 +1,83 @@
+"""The room where the parts of a box are put together. In: settings, a bundle, a world. Out: a Box; nothing of sim here."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack, suppress
+
+from .box import Box, Keeper, World
+from .bundle import Bundle
+from .capture import CaptureWriter
+from .classifier import Classifier
+from .clock import Clock
+from .config import Config
+from .early import Decider
+from .errors import ConfigError
+from .health import Pulse
+from .lines import Lines
+from .recorder import Recorder
+from .sensor import UsbSensor
+from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort
+from .trigger import GpioTrigger
+
+
+def log(line: str) -> None:
+    """One line for a person; a full disk costs the log, never the classifying."""
+    with suppress(OSError):
+        print(f"palpate: {line}", file=sys.stderr, flush=True)
+
+
+def box(
+    settings: Config, model: Bundle, world: World, port: Port, stack: ExitStack, *,
+    capture: CaptureWriter | None = None, keepers: Iterable[Keeper] = (), pulses: Iterable[Pulse] = (),
+    log: Callable[[str], None] = lambda line: None, also: Iterable[ResultSink] = (), labels: tuple[str, ...] = (),
+    obey: Mapping[str, Callable[[str], list[object]]] | None = None,
+) -> Box:  # fmt: skip
+    """Put the parts together; `stack` takes them apart again. labels: what class bits must hold beside the bundle's."""
+    settings = world.wire(settings)
+    missing = next((k for k in ("start", "stop") if not getattr(settings.trigger, k)), None)
+    if missing == "start" or (missing and settings.trigger.mode == "two-lines"):
+        raise ConfigError(
+            f"trigger.{missing} names no line, so no sweep can be cut; choose a board with --board, or use --sim"
+        )
+    run = classifier(settings, model, world.clock)
+    run.self_test()
+    trigger = stack.enter_context(GpioTrigger(settings.trigger, world.gpio))
+    lines = stack.enter_context(Lines(settings.output, world.gpio, world.clock))
+    sensor = UsbSensor(settings.sensor, model.format, world.clock, world.backend, capture)
+    stack.callback(sensor.close)
+    stack.callback(port.close)
+    sinks: list[ResultSink] = [port, *also]
+    if settings.output.class_bits:
+        sinks.append(LineSink(lines, (*model.manifest.labels, *labels)))
+    return Box(
+        sensor, trigger, Recorder(model.format, settings.sweep), run, world.clock,
+        early=early(settings, run), sinks=sinks,
+        port=port, panel=lines, state_s=settings.serial.state_s, source=world.source, log=log,
+        tap=capture, keepers=[*keepers], pulses=[*pulses], obey=obey or {},
+    )  # fmt: skip
+
+
+def classifier(settings: Config, model: Bundle, clock: Clock) -> Classifier:
+    """The classifier as the settings want it."""
+    how = settings.classifier
+    return Classifier(model, clock, how.fuse, how.sure, how.most_sweeps)
+
+
+def early(settings: Config, run: Classifier) -> Decider | None:
+    """Who answers early, where the settings want it."""
+    return Decider(run) if settings.classifier.early else None
+
+
+def port(settings: Config, world: World) -> Port:
+    """The serial line, or standard output where none is configured."""
+    if settings.serial.port:
+        return SerialSink(settings.serial, world.clock, world.source)
+    return StdoutPort(world.source)
+
+
+def in_service() -> bool:
+    """Whether standard error goes to the journal: systemd says so, and a person reads it there."""
+    return bool(os.environ.get("JOURNAL_STREAM"))
