@@ -19,6 +19,7 @@ from .config import Config
 from .early import Decider
 from .errors import ApplianceError
 from .health import Health, Pulse
+from .journal import WARNING
 from .recorder import Recorder
 from .sensor import Sensor, Tally
 from .sink import Command, Port, ResultSink, sentence
@@ -207,7 +208,7 @@ class Box:
     def _note(self, what: str, trouble: str, fine: str) -> None:
         if self._troubles.get(what) != trouble:
             self._troubles[what] = trouble
-            self._log(f"{what}: {trouble or fine}")
+            self._log(f"{WARNING if trouble else ''}{what}: {trouble or fine}")
 
     @property
     def health(self) -> Health:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, suppress
 
+from . import journal
 from .box import Box, Keeper, World
 from .bundle import Bundle
 from .capture import CaptureWriter
@@ -26,11 +26,11 @@ from .trigger import GpioTrigger
 def log(line: str) -> None:
     """One line for a person; a full disk costs the log, never the classifying."""
     with suppress(OSError):
-        print(f"palpate: {line}", file=sys.stderr, flush=True)
+        print(journal.spoken(line, journal.attached()), file=sys.stderr, flush=True)
 
 
 def box(
-    settings: Config, model: Bundle, world: World, port: Port, stack: ExitStack, *,
+    settings: Config, model: Bundle, world: World, port: Port | None, stack: ExitStack, *,
     capture: CaptureWriter | None = None, keepers: Iterable[Keeper] = (), pulses: Iterable[Pulse] = (),
     log: Callable[[str], None] = lambda line: None, also: Iterable[ResultSink] = (), labels: tuple[str, ...] = (),
     obey: Mapping[str, Callable[[str], list[object]]] | None = None,
@@ -48,8 +48,9 @@ def box(
     lines = stack.enter_context(Lines(settings.output, world.gpio, world.clock))
     sensor = UsbSensor(settings.sensor, model.format, world.clock, world.backend, capture)
     stack.callback(sensor.close)
-    stack.callback(port.close)
-    sinks: list[ResultSink] = [port, *also]
+    if port:
+        stack.callback(port.close)
+    sinks: list[ResultSink] = [*([port] if port else []), *also]
     if settings.output.class_bits:
         sinks.append(LineSink(lines, (*model.manifest.labels, *labels)))
     return Box(
@@ -71,13 +72,8 @@ def early(settings: Config, run: Classifier) -> Decider | None:
     return Decider(run) if settings.classifier.early else None
 
 
-def port(settings: Config, world: World) -> Port:
-    """The serial line, or standard output where none is configured."""
+def port(settings: Config, world: World) -> Port | None:
+    """The serial line, or standard output where none is configured; not into the journal, which a person reads."""
     if settings.serial.port:
         return SerialSink(settings.serial, world.clock, world.source)
-    return StdoutPort(world.source)
-
-
-def in_service() -> bool:
-    """Whether standard error goes to the journal: systemd says so, and a person reads it there."""
-    return bool(os.environ.get("JOURNAL_STREAM"))
+    return None if journal.attached() else StdoutPort(world.source)

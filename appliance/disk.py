@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PART = ".part"
@@ -55,9 +55,29 @@ def write(path: Path, data: bytes) -> None:
         os.fsync(f.fileno())
 
 
-def sync(folder: Path) -> None:
-    """Have the names in `folder` on the disk."""
-    at = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+@contextmanager
+def folder(target: Path) -> Iterator[Path]:
+    """A new folder beside `target` that takes its name when the block ends well, in one step and with all its files on
+    the disk, and vanishes when it does not; what was at `target` gives way. Raises OSError.
+    """
+    import tempfile  # with all it brings 1 MB, and only where a bundle is written
+
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as aside:
+        new = Path(aside) / "new"
+        new.mkdir()
+        yield new
+        for path in (*new.iterdir(), new):
+            sync(path)
+        if target.exists():
+            exchange(new, target)
+        else:
+            new.rename(target)
+        sync(target.parent)
+
+
+def sync(path: Path) -> None:
+    """Have a file's content, or the names in a folder, on the disk."""
+    at = os.open(path, os.O_RDONLY)
     try:
         os.fsync(at)
     finally:

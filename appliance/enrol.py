@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -215,18 +214,10 @@ def write(files: Mapping[str, bytes], target: Path, swap: bool) -> None:
     check_place(target, swap)
     target = target.resolve()
     try:
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as aside:
-            new = Path(aside) / "new"
-            new.mkdir()
+        with disk.folder(target) as new:
             for name, data in files.items():
-                disk.write(new / name, data)
-            disk.sync(new)
+                (new / name).write_bytes(data)
             Classifier(bundle.load(new), SystemClock()).self_test()
-            if target.exists():
-                disk.exchange(new, target)
-            else:
-                new.rename(target)
-            disk.sync(target.parent)
     except OSError as e:
         why = e.strerror or e
         raise BundleError(f"the bundle cannot be written to {target}: {why}; name another folder with --out") from e

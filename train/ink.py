@@ -27,6 +27,7 @@ TEXT, SMALL = 10.5, 9.0
 DEFAULT_FONT = re.compile(r" font-family: [^;]*;")
 STYLE = re.compile(r"<defs>\s*<style.*?</style>\s*</defs>", re.S)
 NAMES = re.compile(r'(?<=<g) id="[^"]*"')
+TAG = re.compile(r"<[^>]*>")
 DIGITS = re.compile(r"(?<=\d\.\d\d)\d+")
 UPRIGHT = re.compile(r' transform="rotate\(-0 [^)]*\)"')
 HEAD = re.compile(r'width="[^"]*" height="[^"]*" (viewBox="[^"]*")([^>]*)>')
@@ -96,9 +97,9 @@ def svg(figure: Figure, about: str) -> str:
         DEFAULT_FONT,
         STYLE,
         NAMES,
-        DIGITS,
-    ):  # of matplotlib, for all of a page, twice in a page, finer than seen
+    ):  # of matplotlib, for all of a page, twice in a page
         text = what.sub("", text)
+    text = TAG.sub(lambda tag: DIGITS.sub("", tag[0]), text)  # finer than seen; a text keeps its digits
     text = re.sub(r"\s*\n\s*", "\n", text)
     for role, colour in ROLES.items():
         text = text.replace(f": {colour}", f": var(--{role}, {colour})")

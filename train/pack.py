@@ -9,7 +9,6 @@ import contextlib
 import io
 import os
 import platform
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
-from appliance import bundle
+from appliance import bundle, disk
 from appliance.classifier import Classifier, softmax
 from appliance.clock import SystemClock
 from appliance.errors import BundleError, FormatError
@@ -232,17 +231,7 @@ def _aside(target: Path) -> Iterator[Path]:
         raise ExportRefused(f"{target} is no bundle and will not be replaced; name another folder with --out")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as workplace:
-            new, old = Path(workplace) / "new", Path(workplace) / "old"
-            new.mkdir()
+        with disk.folder(target.resolve()) as new:
             yield new
-            if target.exists():
-                target.rename(old)
-            try:
-                new.rename(target)
-            except OSError:
-                if old.exists():
-                    old.rename(target)
-                raise
     except OSError as e:
         raise ExportRefused(f"the bundle cannot be written to {target}: {e}; name another folder with --out") from e
