@@ -9,9 +9,10 @@ from typing import Any
 
 from . import __version__
 
-EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments;
-3 configuration; 4 bundle; 6 gpio lines; 8 a file of another form; 130 interrupted. A skin or a serial port that is not
-there ends nothing: it is waited for, and `check` names it"""
+EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments; 65 a file of
+another form; 69 hardware is not there; 78 configuration or bundle; 130 interrupted. For a skin or a serial port `run`
+waits, however long; `check` names it"""
+WEB_PORT = 8137
 MOST_SWEEPS = 10
 """What a person may be asked to take for an enrolment; a mean of more would hardly be better."""
 
@@ -30,7 +31,9 @@ def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argpars
     common = settings()
     world = argparse.ArgumentParser(add_help=False)
     world.add_argument(
-        "--sim", metavar="skin|replay:FILE", help="simulated tubes, or a sweep set, instead of the devices"
+        "--sim",
+        metavar="skin|rest|replay:FILE",
+        help="simulated tubes, a finger at rest on one, or a sweep set, instead of the devices",
     )
     world.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
     world.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
@@ -54,8 +57,22 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
         return command
 
     run = add("run", "classify sweeps until SIGTERM", world, some)
-    run.add_argument("--capture", type=Path, metavar="FILE", help="write everything that comes in to FILE, for replay")
-    run.add_argument("--keep", type=Path, metavar="DIR", help="save the window of each sweep to DIR, for replay")
+    record = add("record", "the same, and keep each sweep with its label, for training", world, some)
+    for command in (run, record):
+        command.add_argument("--capture", type=Path, metavar="FILE", help="write all that comes in to FILE, for replay")
+        command.add_argument(
+        "--shadow", nargs="?", const="", metavar="DIR",
+        help="classify with the bundle in DIR beside, by default the store's candidate; its answers go nowhere",
+    )  # fmt: skip
+    record.add_argument("--out", type=Path, metavar="DIR", help="where to (default: sweeps/ in the store's folder)")
+    for name in ("material", "position", "session"):
+        record.add_argument(f"--{name}", default="", metavar="TEXT", help="until the serial line says otherwise")
+    place = add("place", "show where the contact lies on the skin, and where it should", world)
+    place.add_argument(
+        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        help=f"as a page on localhost as well (default port {WEB_PORT})",
+    )  # fmt: skip
+    place.set_defaults(sweeps=None)
     demo = add("demo", "watch simulated sweeps being classified", world, some)
     demo.add_argument("--raw", action="store_true", help="print the sentences alone")
     add("check", "self-test: bundle, golden sweeps, devices", world, some)
@@ -68,8 +85,21 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
         help=f"how many good sweeps it takes, 1 to {MOST_SWEEPS} (default 5)",
     )  # fmt: skip
     enrol.set_defaults(sweeps=None)
-    add("replay", "play a capture or a saved sweep through the same rooms").add_argument("file", type=Path)
+    add("replay", "play a capture, a kept sweep or a folder of them through the same rooms").add_argument(
+        "file", type=Path
+    )
     add("config", "print each value with its source")
+    status = add("status", "how the service is, and its last verdicts")
+    listed = add("bundles", "the bundles on this box: which one runs, and what it goes back to")
+    for command in (status, listed):
+        command.add_argument("--json", action="store_true", help="as JSON")
+    accept = add("accept", "check the signed bundle in DIR, and have it run on trial from the next start on")
+    accept.add_argument("--shadow", action="store_true", help="as the candidate of `run --shadow` instead")
+    for command in (accept, add("verify", "check the signed bundle in DIR, and change nothing")):
+        command.add_argument("folder", type=Path, metavar="DIR")
+    add("commit", "end the trial of the bundle that runs: it stays")
+    add("rollback", "go back to the bundle before, from the next start on")
+    add("promote", "have the candidate run on trial from the next start on")
     bench = add("bench", "measure latency, memory, start and processor share on this machine")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
     bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")

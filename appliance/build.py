@@ -11,7 +11,7 @@ from .box import Box, Keeper, World
 from .bundle import Bundle
 from .capture import CaptureWriter
 from .classifier import Classifier
-from .clock import Clock
+from .clock import Clock, SystemClock
 from .config import Config
 from .early import Decider
 from .errors import ConfigError
@@ -19,7 +19,8 @@ from .health import Pulse
 from .lines import Lines
 from .recorder import Recorder
 from .sensor import UsbSensor
-from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort
+from .sink import LineSink, Port, ResultSink, SerialSink, StdoutPort, check_bits
+from .store import Store
 from .trigger import GpioTrigger
 
 
@@ -70,6 +71,20 @@ def classifier(settings: Config, model: Bundle, clock: Clock) -> Classifier:
 def early(settings: Config, run: Classifier) -> Decider | None:
     """Who answers early, where the settings want it."""
     return Decider(run) if settings.classifier.early else None
+
+
+def prove(settings: Config, model: Bundle) -> None:
+    """Raises BundleError or ConfigError where this machine, set as it is, does not run a bundle as it should."""
+    run = classifier(settings, model, SystemClock())
+    run.self_test()
+    early(settings, run)
+    if settings.output.class_bits:
+        check_bits(1 << len(settings.output.class_bits), model.manifest.labels)
+
+
+def store(settings: Config) -> Store:
+    """The box's store of bundles."""
+    return Store(settings.store, lambda model: prove(settings, model))
 
 
 def port(settings: Config, world: World) -> Port | None:

@@ -126,7 +126,7 @@ def files(folder: Path) -> dict[str, bytes]:
     try:
         held = {MANIFEST: _read(folder / MANIFEST, MOST_SMALL)}
     except OSError as e:
-        raise BundleError(f"no bundle at {folder}: {e.strerror}; name its folder with classifier.bundle") from e
+        raise BundleError(f"no bundle at {folder}: {MANIFEST}: {e.strerror}; name the folder of one") from e
     for name, size in _named(held[MANIFEST]).items():
         try:
             held[name] = _read(folder / name, size)

@@ -6,7 +6,6 @@ A capture played through the same rooms gives the same verdicts bit for bit, sin
 from __future__ import annotations
 
 import json
-import re
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from .errors import ConfigError, FormatError, SensorError, SensorMismatch
 from .keys import typed
 from .sensor import Stream, Tally
 from .sink import Command, command
-from .sweep import Frames, Sweep, SweepFormat, Verdict, save
+from .sweep import Frames, SweepFormat
 from .trigger import Edge, EdgeKind
 from .wire import Identity
 
@@ -30,7 +29,6 @@ _EDGE = struct.Struct("<QB")
 _KINDS = tuple(EdgeKind)
 _MOST_NS = 1 << 63
 """Times are int64."""
-_KEPT = re.compile(r"sweep-[0-9]+\.(npy|json)(\.part)?")
 
 
 class Kind(IntEnum):
@@ -89,35 +87,6 @@ class CaptureWriter:
             if not self._ended:
                 self._log(f"capture: {self._path} cannot be written: {e.strerror}; it ends here, classifying goes on")
             self._ended = True
-
-
-def keeper(folder: Path, fmt: SweepFormat, log: Callable[[str], None]) -> Callable[[Sweep, Verdict], None]:
-    """Saves the sweeps that have a window to `folder`. A full disk costs the recording, never the classifying.
-
-    A file's number is the sweep's, counted on from what an earlier run has left there: nothing is written over. What a
-    run that was killed had not finished is taken away. Raises ConfigError where the folder cannot be made or read.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        there = [path for path in folder.iterdir() if _KEPT.fullmatch(path.name)]
-    except OSError as e:
-        raise ConfigError(f"--keep {folder}: {e.strerror}; name a folder that can be written") from e
-    for part in (path for path in there if path.suffix == ".part"):
-        with suppress(OSError):
-            part.unlink()
-    last = max((int(path.name[6:].partition(".")[0]) for path in there), default=0)
-
-    def keep(sweep: Sweep, verdict: Verdict) -> None:
-        if len(sweep.frames):
-            try:
-                save(folder / f"sweep-{last + sweep.id:06d}.npy", sweep, fmt)
-            except OSError as e:
-                log(
-                    f"keep: sweep {sweep.id} cannot be saved: {e.strerror}; "
-                    f"see that {folder} has room and may be written; classifying goes on"
-                )
-
-    return keep
 
 
 class Playback:

@@ -1,55 +1,23 @@
-"""What needs no device: replay, settings. In: arguments. Out: lines on standard output, exit codes."""
+"""What needs no device: replay, settings, status, the store. In: arguments. Out: lines on standard output, exit codes."""
 
 from __future__ import annotations
 
 import argparse
-import sys
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 from . import build, config
-from .box import Box
-from .bundle import Bundle
-from .capture import Playback
 from .clock import SystemClock
-from .early import Decider
-from .errors import FormatError
-from .recorder import Recorder
-from .sink import StdoutPort, result
-from .sweep import SweepFormat, load
 from .tasks import model, settings
 
 
 def run_replay(args: argparse.Namespace) -> int:
-    """`palpate replay`: all sentences of a capture, or that of one saved sweep."""
+    """`palpate replay`: the sentences of a capture, a kept sweep or a folder of them; 1 where a verdict is another."""
+    from .replay import replay
+
     how = settings(args)
-    held = model(how)
-    if args.file.suffix == ".npy":
-        sweep, fmt = load(args.file)
-        _same(args.file, fmt, held)
-        classifier = build.classifier(how, held, SystemClock())
-        verdict = classifier(sweep) if sweep.share == 1 else Decider(classifier)(sweep)
-        if verdict is None:
-            raise FormatError(
-                f"{args.file} was answered early, which this bundle does not do; name the one it was kept with"
-            )
-        sys.stdout.buffer.write(result(verdict, "replay"))
-        return 0
-    play = Playback(args.file)
-    _same(args.file, play.format, held)
-    classifier = build.classifier(how, held, play)
-    port = StdoutPort("replay", play.commands)
-    recorder = Recorder(held.format, how.sweep)
-    early = build.early(how, classifier)
-    box = Box(play, play, recorder, classifier, play, early=early, sinks=[port], port=port, source="replay")
-    box.run(lambda: play.finished)
-    return 0
-
-
-def _same(file: Path, fmt: SweepFormat, held: Bundle) -> None:
-    if fmt != held.format:
-        raise FormatError(
-            f"{file} holds {fmt}, the bundle wants {held.format}; name its bundle with --set classifier.bundle=DIR"
-        )
+    return replay(args.file, how, model(how), lambda text: print(text, end="", flush=True))
 
 
 def run_config(args: argparse.Namespace) -> int:
@@ -58,4 +26,68 @@ def run_config(args: argparse.Namespace) -> int:
     return 0
 
 
-RUNS = {"replay": run_replay, "config": run_config}
+def run_status(args: argparse.Namespace) -> int:
+    """`palpate status`: how the service is; 69 where it waits for the skin, 1 where it does not run."""
+    from . import status
+
+    now_ns = SystemClock().now_ns()
+    told = status.read(Path(settings(args).store.status), now_ns)
+    print(json.dumps(told, indent=1) if args.json else "\n".join(status.lines(told, now_ns)))
+    return status.exit_code(told)
+
+
+def run_bundles(args: argparse.Namespace) -> int:
+    """`palpate bundles`: which bundle runs, and what it goes back to."""
+    from . import catalogue, shadow
+
+    how = settings(args)
+    store, folder = build.store(how), Path(how.store.folder) / "shadow"
+    told, beside = catalogue.entries(store), shadow.read(folder)
+    lines = catalogue.lines(told)
+    if beside and store.ledger.candidate.startswith(beside.candidate):
+        lines += beside.lines(folder)
+    print(json.dumps([asdict(e) for e in told], indent=1) if args.json else "\n".join(lines))
+    return 0
+
+
+def run_accept(args: argparse.Namespace) -> int:
+    """`palpate accept`: a signed bundle comes into the store."""
+    store = build.store(settings(args))
+    sha = store.accept(args.folder, args.shadow)
+    committed = "it is committed already" if store.ledger.of(sha).committed else f"it runs on trial {NEXT}"
+    print(f"bundle {sha[:8]} is accepted; {'it is the candidate' if args.shadow else committed}")
+    return 0
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    """`palpate verify`: whether a bundle would be accepted, but for its counter."""
+    held = build.store(settings(args)).examine(args.folder)
+    m = held.bundle.manifest
+    print(f"bundle {held.bundle.id}: {m.name} {m.version}, counter {m.counter}, signed by {held.signer}; all is well")
+    return 0
+
+
+def run_commit(args: argparse.Namespace) -> int:
+    """`palpate commit`: the trial is over."""
+    print("committed" if build.store(settings(args)).commit() else "nothing is on trial")
+    return 0
+
+
+def run_rollback(args: argparse.Namespace) -> int:
+    """`palpate rollback`: back to the bundle before."""
+    sha = build.store(settings(args)).rollback()
+    print(f"{f'bundle {sha[:8]}' if sha else 'the packaged bundle'} runs {NEXT}")
+    return 0
+
+
+def run_promote(args: argparse.Namespace) -> int:
+    """`palpate promote`: the candidate becomes the current bundle."""
+    print(f"bundle {build.store(settings(args)).promote()[:8]} runs on trial {NEXT}")
+    return 0
+
+
+NEXT = "from the next start on: systemctl restart palpate"
+RUNS = {
+    "replay": run_replay, "config": run_config, "status": run_status, "bundles": run_bundles, "accept": run_accept,
+    "verify": run_verify, "commit": run_commit, "rollback": run_rollback, "promote": run_promote,
+}  # fmt: skip

@@ -72,6 +72,6 @@ class Journal:
         self._log = log
 
     def send(self, verdict: Verdict) -> None:
-        """Log it; one without an answer is a warning."""
-        answered = verdict.status.classified or verdict.status is Status.ABORTED
-        self._log(("" if answered else WARNING) + words(verdict))
+        """Log it; one without an answer, or of a finger that lies elsewhere than in training, is a warning."""
+        fine = verdict.status.classified or verdict.status is Status.ABORTED
+        self._log(("" if fine and not verdict.moved else WARNING) + words(verdict))

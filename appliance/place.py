@@ -82,7 +82,7 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
     """
     series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # twice as fast to reduce
     load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
-    load = mended(np.where(np.isfinite(load) & (load >= contact), np.maximum(load, 0), 0))
+    load = mended(np.where(np.isfinite(load) & (load >= contact), load, 0))
     total = load.sum()
     if total <= 0:
         return None
@@ -91,7 +91,7 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
 
 
 def mended(load: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`load` [R, C] (0: not loaded) with dead taxels filled in: one that is silent between two loaded ones of its row
+    """`load` [R, C] (0 and less: not loaded) with dead taxels filled in: one that is silent between two loaded ones of its row
     or column gets their mean. A contact has no hole, and one would push its centre away."""
     padded = np.zeros((load.shape[0] + 2, load.shape[1] + 2))
     padded[1:-1, 1:-1] = load

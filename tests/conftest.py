@@ -100,15 +100,15 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
     with ExitStack() as stack:
 
         def make(
-            world: stage.SimWorld | None = None, sets: tuple[str, ...] = (), model=default_bundle, **more
+            world: stage.SimWorld | None = None, sets: tuple[str, ...] = (), model=default_bundle, keepers=(), **more
         ) -> Rigged:
             world = world or stage.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
             settings = config.load(None, sets, site=Path(__file__).with_name("no-site.toml"))
             far_end, name = stack.enter_context(terminal.pair())
             port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
             kept: list[Sweep] = []
-            keepers = [lambda sweep, verdict: kept.append(sweep)]
-            box = build.box(settings, model, world, port, stack, keepers=keepers, **more)
+            all_keepers = [lambda sweep, verdict: kept.append(sweep), *keepers]
+            box = build.box(settings, model, world, port, stack, keepers=all_keepers, **more)
             return Rigged(box, world, far_end, port, kept=kept)
 
         yield make

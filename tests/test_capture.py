@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import resource
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from conftest import SECOND, Rigged
 from appliance import wire
 from appliance.box import Box
 from appliance.bundle import Bundle
-from appliance.capture import CaptureWriter, Playback, keeper
+from appliance.capture import CaptureWriter, Playback
 from appliance.classifier import Classifier
 from appliance.config import SweepConfig
 from appliance.errors import FormatError
@@ -206,50 +205,10 @@ def test_broken_recordings_are_named(rigged: Callable[..., Rigged], tmp_path: Pa
         load(tmp_path / "s.npy")
 
 
-VERDICT = Verdict(1, 0, Status.OK, "wood", 1.0, 1.0, np.ones(1), 1, 0, 0, "")
-
-
 def kept(n: int) -> Sweep:
     """Sweep number `n` of 40 frames."""
     frames = Frames(np.arange(40), np.arange(40), np.full((40, 4, 4), n, np.uint8))
     return Sweep(n, 0, 40, Status.OK, frames)
-
-
-def test_a_later_run_writes_nothing_over(tmp_path: Path):
-    """A program that was started again counts on from what it finds; half a file of the killed one goes, no other."""
-    keeper(tmp_path, skin.FORMAT, print)(kept(1), VERDICT)
-    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    (tmp_path / "sweep-000002.json").write_text("{}")
-    for left in ("sweep-000003.json.part", "sweep-000003.npy.part", "mine.part"):
-        (tmp_path / left).write_bytes(b"half")
-    keeper(tmp_path, skin.FORMAT, print)(kept(1), VERDICT)
-    after = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    assert before.items() <= after.items()
-    assert sorted(after.keys() - before.keys()) == [
-        "mine.part", "sweep-000002.json", "sweep-000004.json", "sweep-000004.npy"
-    ]  # fmt: skip
-    assert load(tmp_path / "sweep-000004.npy")[0].id == 1
-
-
-def test_what_cannot_be_written_leaves_nothing(tmp_path: Path):
-    """The disk ends after n bytes, for n across both files: it is said why, nothing stays, what was there is whole."""
-    said: list[str] = []
-    keep = keeper(tmp_path, skin.FORMAT, said.append)
-    keep(kept(1), VERDICT)
-    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    sizes = range(0, len(before["sweep-000001.npy"]), 100)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    for size in sizes:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-        try:
-            keep(kept(2), VERDICT)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
-    why = f"keep: sweep 2 cannot be saved: File too large; see that {tmp_path} has room and may be written; "
-    assert said == [why + "classifying goes on"] * len(sizes)
-    keep(kept(3), VERDICT)
-    assert load(tmp_path / "sweep-000003.npy")[0].id == 3
 
 
 def test_a_name_that_cannot_be_taken_leaves_nothing(tmp_path: Path):

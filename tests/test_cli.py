@@ -108,11 +108,9 @@ def test_run_on_a_serial_port():
 
 
 def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]):
-    """`run --keep --capture`, then `replay` of either: the same labels and probabilities."""
-    assert (
-        main(["run", "--sim", "skin", *VIRTUAL, "--keep", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")])
-        == 0
-    )
+    """`record --capture`, then `replay` of either: the same labels and probabilities."""
+    where = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
+    assert main(["record", "--sim", "skin", *VIRTUAL, *where]) == 0
 
     def said() -> list[list[bytes]]:
         return [line.split(b",")[4:8] for line in capsysbinary.readouterr().out.splitlines() if b",RES," in line]
@@ -133,11 +131,12 @@ def test_a_full_disk_costs_the_recording_never_the_classifying(
     def full(*args: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("appliance.capture.save", full)
-    assert main(["run", "--sim", "skin", *VIRTUAL, "--keep", str(tmp_path), "--capture", "/dev/full"]) == 0
+    monkeypatch.setattr("appliance.disk.write", full)
+    assert main(["record", "--sim", "skin", *VIRTUAL, "--out", str(tmp_path), "--capture", "/dev/full"]) == 0
     said = capfd.readouterr()
     assert said.out.count(",RES,") == 3
-    assert said.err.count("cannot be saved: No space left on device") == 3
+    assert said.out.count(",full,0,,,,No space left on device*") == 3
+    assert said.err.count("not stored: No space left on device") == 1
     assert said.err.count("capture: /dev/full cannot be written: No space left on device") == 1
 
 
@@ -178,8 +177,8 @@ def test_the_sequential_test_is_configured(
         group_recording=np.zeros(3, int),
     )  # fmt: skip
     never = ["--set", "classifier.sure=1", "--set", "classifier.most_sweeps=2", "--set", "classifier.fuse=product"]
-    played = ["run", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
-    kept = ["--keep", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
+    played = ["record", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
+    kept = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
 
     def said() -> list[bytes]:
         return [r.split(b",")[4] for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
@@ -192,7 +191,7 @@ def test_the_sequential_test_is_configured(
     assert said()[:2] == [b"unsure", b"undecided"]
     assert main(["replay", str(next((tmp_path / "kept").glob("*.npy"))), *never]) == 0
     assert said() == [b"unsure"]
-    assert main(played) == 0
+    assert main(["run", *played[1:]]) == 0
     assert said() == [b"ok"] * 3
 
 
@@ -214,14 +213,14 @@ def test_a_sweep_that_was_answered_early_is_replayed_so(tmp_path: Path, capsysbi
     """By a bundle that decides there; another one is named."""
     frames = Frames(np.arange(10), np.arange(10), toy.window(1, 0)[:10])
     save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.OK, frames, share=0.5), toy.FORMAT)
-    for least, code in ((0.5, 0), (2.0, FormatError.exit_code)):
+    for least, code in ((0.5, 0), (2.0, 1)):
         made = toy.files(early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early"))
         folder = toy.put(tmp_path / f"b{least}", made)
         assert main(["replay", str(tmp_path / "s.npy"), "--set", f"classifier.bundle={folder}"]) == code
     said = capsysbinary.readouterr()
     assert said.out.count(b",RES,1,") == 1
     assert b",ok,a," in said.out
-    assert b"answered early, which this bundle does not do" in said.err
+    assert b"answered early, which this bundle does not do" in said.out
 
 
 def test_check_says_ok_part_by_part(capsys: pytest.CaptureFixture[str]):
@@ -270,7 +269,7 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (["run", "--board", "rpi5"], LineError, "gpiochip"),
         (["replay", "/nowhere"], FormatError, "cannot be read"),
         (["replay", "/nowhere.npy"], FormatError, "not a recorded sweep"),
-        (["run", "--sim", "skin", "--virtual", "--keep", "/proc/x"], ConfigError, "--keep /proc/x"),
+        (["record", "--sim", "skin", "--virtual", "--out", "/proc/x"], ConfigError, "--out /proc/x"),
         (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], ConfigError, "--capture /proc/x"),
     ],
 )

@@ -16,7 +16,7 @@ from appliance import bundle
 from appliance.__main__ import main
 from appliance.box import Box
 from appliance.bundle import Bundle, Early, Manifest, Thresholds
-from appliance.capture import CaptureWriter, Playback, keeper
+from appliance.capture import CaptureWriter, Playback
 from appliance.classifier import Classifier
 from appliance.config import SweepConfig
 from appliance.early import Decider, decides
@@ -25,7 +25,7 @@ from appliance.recorder import Recorder
 from appliance.sim import demo, gpio, rig, script, stage
 from appliance.sim.score import Answer
 from appliance.sink import StdoutPort
-from appliance.sweep import Frames, Status, Sweep, SweepFormat, Verdict, load
+from appliance.sweep import Frames, Status, Sweep, SweepFormat, Verdict, load, save
 
 onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
 helper, numpy_helper = onnx.helper, onnx.numpy_helper
@@ -446,7 +446,7 @@ def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_p
     """What was kept of an early answer is what it saw; read again it is decided again, with the same scores."""
     box = rigged(world_of(slid(-10, 60)), SETS, toy())
     (verdict,) = all_of(box)
-    keeper(tmp_path, FMT, print)(box.kept[0], verdict)
+    save(tmp_path / "sweep-000001.npy", box.kept[0], FMT)
     sweep, fmt = load(tmp_path / "sweep-000001.npy")
     assert (fmt, len(sweep.frames), sweep.share) == (FMT, 40, 0.4)
     assert round((sweep.stop_ns - sweep.start_ns) / FMT.period_ns) == LEAD + 39
@@ -474,10 +474,9 @@ def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.Capt
         answers = [line.split(",") for line in capsys.readouterr().out.splitlines() if ",RES," in line]
         return [[a[2], *a[4:10], a[13]] for a in answers]
 
-    kept, capture = tmp_path / "kept", tmp_path / "capture"
-    first = said(
-        "run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--keep", str(kept), "--capture", str(capture)
-    )
+    kept, capture = tmp_path / "black-box", tmp_path / "capture"
+    sets += ["--set", f"store.folder={tmp_path}", "--set", "store.black_box=9"]
+    first = said("run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--capture", str(capture))
     assert [(a[1], a[-1]) for a in first] == [("ok", "0.20"), ("ok", "1.00"), ("ok", "0.40")]
     assert said("replay", str(capture)) == first
     assert [said("replay", str(path))[0] for path in sorted(kept.glob("*.npy"))] == first

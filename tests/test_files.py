@@ -12,7 +12,7 @@ import pytest
 from test_sets import held
 
 from appliance.errors import FormatError
-from appliance.sweep import Frames, Status, Sweep, SweepFormat, save
+from appliance.sweep import Frames, Status, Sweep, SweepFormat, load, save
 from train import files, sets
 
 FORMAT = SweepFormat(2, 3, 50.0, 8, "int16")
@@ -44,6 +44,13 @@ def record(path: Path, material: str = "a", status: Status = Status.OK, fmt: Swe
     path.parent.mkdir(parents=True, exist_ok=True)
     frames = Frames(np.arange(n), np.arange(n), taxels)
     save(path, Sweep(start_ns=0, stop_ns=1, status=status, frames=frames, material=material, **more), fmt)
+
+
+def before_crc(path: Path) -> None:
+    """Make a sidecar what it was in schema 1: the sweep and its format, no check of its bytes."""
+    held = json.loads(path.read_text()) | {"schema": 1}
+    del held["crc32"]
+    path.write_text(json.dumps(held))
 
 
 def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
@@ -251,6 +258,47 @@ def test_recordings_are_a_set(tmp_path: Path):
     np.testing.assert_array_equal(s.samples[2], 2 + np.arange(48).reshape(8, 2, 3))
 
 
+def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
+    """Where all names are whole numbers a group has these, so that --only position=12 means what it says."""
+    for i, (position, session) in enumerate([("12", "7"), ("3", "07"), ("3", "8"), ("0", "7")]):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], position=position, session=session)
+    groups = sets.load(str(tmp_path)).groups
+    assert list(groups["position"]) == [12, 3, 3, 0]
+    assert list(groups["session"]) == [1, 0, 2, 1]
+
+
+def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):
+    """Recordings of the box, with device, clock, tare and verdict, beside those of before."""
+    for i in range(4):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, position="tip")
+    before = sets.digest(sets.load(str(tmp_path)))
+    for i in range(2):
+        about = {"device": {"serial": "x"}, "tare": [[0] * 3] * 2, "verdict": {"status": ("unknown", "unsure")[i]}}
+        save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), about)
+    before_crc(tmp_path / "3.json")
+    assert sets.digest(sets.load(str(tmp_path))) == before
+
+
+def test_what_the_box_refused_is_left_out(tmp_path: Path):
+    """A skin that did not touch, or was broken, whatever its label; an early answer's part of a window."""
+    for i in range(8):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
+    for i, status in enumerate(files.REFUSED):
+        save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), {"verdict": {"status": str(status)}})
+    record(tmp_path / "9.npy", "a", frames=3, share=0.4)
+    s = sets.load(str(tmp_path))
+    assert s.source.endswith("(left out: 1 dead-taxel, 1 early, 1 no-contact, 1 saturated, 1 stuck-taxel)")
+    assert list(s.samples[:, 0, 0, 0]) == [4, 5, 6, 7]
+
+
+def test_objects_of_several_runs_in_one_folder_stay_apart(tmp_path: Path):
+    """Each run of the box counts its objects anew and says in the sidecar which run it was."""
+    for i, (run, obj) in enumerate([(0, 1), (0, 1), (2, 1), (2, 2)]):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, object=obj)
+        save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), {"run": run})
+    assert list(sets.load(str(tmp_path)).groups["object"]) == [0, 0, 1, 2]
+
+
 def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
     """Nothing is known, nothing is grouped but the recording."""
     for i in range(4):
@@ -309,5 +357,6 @@ def test_a_recording_is_never_unpickled(tmp_path: Path):
     """Objects in an .npy are refused where they stand."""
     record(tmp_path / "1.npy", "a")
     np.save(tmp_path / "1.npy", np.array([{}], object), allow_pickle=True)
+    before_crc(tmp_path / "1.json")
     with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep .*allow_pickle"):
         files.read(tmp_path, sets.SweepSet)

@@ -288,50 +288,6 @@ def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
     assert sets.digest(replace(s, source="elsewhere", labels=s.labels.astype(np.uint8))) == sets.digest(s)
 
 
-def test_describe_says_what_a_set_holds():
-    """Sweeps, form, materials with their counts, recordings, groups with their values, long lists shortened."""
-    s = easy(20, pieces=2)
-    s.groups["force"] = np.arange(60) % 12 * 10
-    lines = sets.describe(s).splitlines()
-    assert lines[0] == f"easy: 60 sweeps of 0.64 s; 2x2 uint8 at 100 Hz, window 64; digest {sets.digest(s)}"
-    assert lines[1:] == [
-        "  materials: 3: low 20, middle 20, high 20",
-        "  recordings: 30, of 2 each",
-        "  force: 12: 0, 10, 20, 30, 40, 50, 60, 70, …, 110",
-        "  speed: 4: 0, 1, 2, 3",
-    ]
-    assert "  recordings: 29, of 1 to 2 each" in sets.describe(s.take(np.arange(1, 58)))
-
-
-def test_describe_says_what_is_confounded():
-    """Values that hold one material, a material that one value takes with it, recordings of several; not one value."""
-    s = easy(4, pieces=8)
-    s.groups.update(session=s.labels // 2, one=np.zeros(12, int))
-    assert sets.describe(s).splitlines()[2:] == [
-        "  recordings: 2, of 4 to 8 each",
-        "    1 of them hold sweeps of several materials: number recordings within one material",
-        "  one: 1: 0",
-        "  session: 2: 0, 1",
-        "    confounded: one material only at 1",
-        "    confounded: 'low' only at 0; leaving that out leaves none to train on",
-        "    confounded: 'middle' only at 0; leaving that out leaves none to train on",
-        "    confounded: 'high' only at 1; leaving that out leaves none to train on",
-        "  speed: 2: 0, 1",
-        "    confounded: one material only at 1",
-        "    confounded: 'low' only at 0; leaving that out leaves none to train on",
-        "    confounded: 'middle' only at 0; leaving that out leaves none to train on",
-        "    confounded: 'high' only at 1; leaving that out leaves none to train on",
-    ]
-
-
-def test_what_is_known_can_be_loaded():
-    """Every simulated set in the list has as many sweeps as it says (the large one: sixty for each of its worlds)."""
-    said = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", sets.known()))
-    assert said == {"sim:T-LAB": "240", "sim:T-REAL": "540", "sim:T-HARD": "60", "sim:T-HARD:1-20": "1200"}
-    assert len(sets.load("sim:T-LAB", 1001)) == 240
-    assert len(sets.load("sim:T-HARD:1001-1002")) == 120
-
-
 def test_a_set_goes_to_another_process():
     """Pickled and back, as a cluster does; this is no way to load a file."""
     s = easy(4)

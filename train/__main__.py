@@ -18,6 +18,7 @@ from . import (
     calibrate,
     certainty,
     choose,
+    contents,
     evaluate,
     export,
     fit,
@@ -25,10 +26,11 @@ from . import (
     methods,
     options,
     pack,
+    pull,
     score,
-    sets,
     shows,
-)
+    sign,
+)  # fmt: skip
 from .fold import whole
 from .ladder import LADDER, USUAL
 
@@ -62,20 +64,13 @@ def _parser() -> argparse.ArgumentParser:
         command.set_defaults(run=run)
         return command
 
-    _add_looking(add)
+    add("methods", run_methods, "list the methods that evaluate knows")
     _add_evaluate(add)
     _add_fit(add)
     _add_bundles(add)
-    for room in (export, shows, frontier, choose, certainty, calibrate):
+    for room in (contents, pull, export, sign, shows, frontier, choose, certainty, calibrate):
         room.register(add)
     return parser
-
-
-def _add_looking(add: Add) -> None:
-    """The commands that only tell."""
-    add("methods", run_methods, "list the methods that evaluate knows")
-    one = add("sets", run_sets, "tell what sweep sets can be named, or what is in some")
-    one.add_argument("sets", nargs="*", metavar="SET", help=options.SET)
 
 
 def _add_evaluate(add: Add) -> None:
@@ -135,11 +130,6 @@ def run_methods(args: argparse.Namespace) -> None:
     for method in methods.every().values():
         extra = f" (needs pip install 'palpate-train[{method.extra}]')" if method.extra else ""
         print(f"{method.name:<16} {method.about}{extra}")
-
-
-def run_sets(args: argparse.Namespace) -> None:
-    """What can be named, or what is in the sets named."""
-    print("\n\n".join(sets.describe(sets.load(spec, 1)) for spec in args.sets) if args.sets else sets.known())
 
 
 def run_evaluate(args: argparse.Namespace) -> None:

@@ -7,8 +7,10 @@ unpickled, and nothing outside the named file or folder is read.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +19,46 @@ import numpy as np
 
 from appliance.errors import FormatError
 from appliance.sim.sets import Array, Set, build, load_file
-from appliance.sweep import Status, Sweep, SweepFormat
+from appliance.sweep import Status, Sweep, SweepFormat, sidecar
 from appliance.sweep import load as load_recording
 
 HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
 """Rate of the TactMat data, which neither the file nor the page it is published on names: that of the same laboratory's
 skin in the paper (sec. II.A). A `rate_hz` in the file goes before it."""
+NAMED = ("position", "session")
+"""What a recording may have a name for, beside its material."""
+REFUSED = (Status.NO_CONTACT, Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
+"""What the box says of a window that it does not judge."""
+NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
+"""A name that is a whole number; 07 is none, or it would be the same as 7."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One sweep as the box recorded it, where, and what else its sidecar says."""
+
+    path: Path
+    sweep: Sweep
+    format: SweepFormat
+    about: Mapping[str, Any]
+
+    @classmethod
+    def load(cls, path: Path) -> Recording:
+        """Read an .npy with its sidecar. Raises FormatError where it is broken."""
+        return cls(path, *load_recording(path), sidecar(path))
+
+    @property
+    def why_not(self) -> str:
+        """Why it is not trained on, in a word; "" where it is: not a whole window, or a skin that the box refused.
+
+        A material that the box did not know, or was not sure of, is what it was recorded for.
+        """
+        verdict = self.about.get("verdict")
+        said = verdict.get("status") if isinstance(verdict, dict) else ""
+        if self.sweep.status is not Status.OK:
+            return str(self.sweep.status)
+        return str(said) if said in REFUSED else "early" if self.sweep.share < 1 else ""
 
 
 def read(path: Path, kind: type[Set]) -> Set:
@@ -105,48 +140,79 @@ def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
             file.create_dataset(name, data=values, compression="gzip" if name == "samples" else None)
 
 
-def recordings(folder: Path, kind: type[Set]) -> Set:
-    """The set of all sweeps that the box kept in `folder` (.npy with .json) and below; each is a recording.
+def recorded(folder: Path) -> list[Recording]:
+    """All sweeps that the box recorded in `folder` (.npy with .json) and below, in the order of their names.
 
-    Its label is its material; groups are position and session, numbered in the order of their names, and the object
-    where NEW OBJECT was ever signalled. Sweeps whose status is not ok are left out and counted in `source`.
-    Raises FormatError naming the file that is broken, lacks a name or is of another format.
+    Raises FormatError naming the file that is broken.
     """
-    held = [(path, *load_recording(path)) for path in sorted(folder.rglob("*.npy"))]
-    kept = [(path, sweep) for path, sweep, _ in held if sweep.status is Status.OK]
-    left = Counter(str(sweep.status) for _, sweep, _ in held if sweep.status is not Status.OK)
-    source = f"{folder}" + (
-        f" (left out: {', '.join(f'{n} {name}' for name, n in sorted(left.items()))})" if left else ""
-    )
+    return [Recording.load(path) for path in sorted(folder.rglob("*.npy"))]
+
+
+def ok(held: Sequence[Recording]) -> list[Recording]:
+    """Those that are trained on."""
+    return [one for one in held if not one.why_not]
+
+
+def recordings(folder: Path, kind: type[Set]) -> Set:
+    """The set of all sweeps that the box recorded in `folder` and below; each is a recording.
+
+    Its label is its material; groups are position and session, by their numbers where each has one for its name, else
+    numbered in the order of their names; and the object where NEW OBJECT was ever signalled. Sweeps that are not
+    trained on are counted in `source`. Raises FormatError naming the file that is broken, lacks a name or is of
+    another format.
+    """
+    return joined(recorded(folder), folder, kind)
+
+
+def joined(held: Sequence[Recording], folder: Path, kind: type[Set]) -> Set:
+    """What `recordings` gives, of sweeps that were read already."""
+    kept = ok(held)
+    left = Counter(one.why_not for one in held if one.why_not)
+    source = f"{folder} (left out: {counted(left)})" if left else str(folder)
     if not kept:
-        raise FormatError(f"{source}: not a sweep set: no recorded sweep is ok; record some with `palpate run --keep`")
-    fmt = next(fmt for _, sweep, fmt in held if sweep.status is Status.OK)
-    for path, sweep, its in held:
-        if sweep.status is Status.OK:
-            _check(path, sweep, its, fmt)
+        raise FormatError(f"{source}: not a sweep set: no recorded sweep is ok; record some with `palpate record`")
+    for one in kept:
+        _check(one, kept[0].format)
     groups = {"group_recording": np.arange(len(kept))}
-    for name in ("position", "session"):
-        texts = [getattr(sweep, name) for _, sweep in kept]
+    for name in NAMED:
+        texts = [getattr(one.sweep, name) for one in kept]
         if any(texts):
             if "" in texts:
-                raise FormatError(f"{kept[texts.index('')][0]}: has no {name} though others have; name it in its .json")
-            groups[f"group_{name}"] = _numbered(texts)
-    if any(sweep.object for _, sweep in kept):  # counted anew in each run, and each run has its folder
-        groups["group_object"] = _numbered([(str(path.parent), sweep.object) for path, sweep in kept])
-    materials = [sweep.material for _, sweep in kept]
-    samples = np.stack([sweep.frames.taxels for _, sweep in kept])
-    about = {"labels": _numbered(materials), "materials": np.unique(materials), "rate_hz": np.array(fmt.rate_hz)}
+                raise FormatError(
+                    f"{kept[texts.index('')].path}: has no {name} though others have; name it in its .json"
+                )
+            groups[f"group_{name}"] = numbered(texts)
+    if any(one.sweep.object for one in kept):  # counted anew in each run
+        groups["group_object"] = _places(
+            [(str(one.path.parent), str(one.about.get("run", "")), one.sweep.object) for one in kept]
+        )
+    materials = [one.sweep.material for one in kept]
+    samples = np.stack([one.sweep.frames.taxels for one in kept])
+    rate = np.array(kept[0].format.rate_hz)
+    about = {"labels": _places(materials), "materials": np.unique(materials), "rate_hz": rate}
     return build({"samples": samples} | about | groups, source, kind)
 
 
-def _check(path: Path, sweep: Sweep, fmt: SweepFormat, wanted: SweepFormat) -> None:
-    if fmt != wanted or len(sweep.frames) != fmt.window:
-        raise FormatError(f"{path}: {len(sweep.frames)} frames of {fmt}; others have {wanted}: give each its folder")
-    if not sweep.material:
+def counted(those: Counter[str]) -> str:
+    """How many of what, in a line."""
+    return ", ".join(f"{n} {what}" for what, n in sorted(those.items()))
+
+
+def _check(one: Recording, wanted: SweepFormat) -> None:
+    """Raises FormatError where it is not what the first one is, or nobody said what was touched."""
+    path, n = one.path, len(one.sweep.frames)
+    if one.format != wanted or n != wanted.window:
+        raise FormatError(f"{path}: {n} frames of {one.format}; others have {wanted}: give each its folder")
+    if not one.sweep.material:
         raise FormatError(f'{path}: has no material; write it into {path.with_suffix(".json").name}, "material": "…"')
 
 
-def _numbered(values: Sequence[Any]) -> Array:
+def numbered(names: Sequence[str]) -> Array:
+    """A number for each name: the one that it is, where all are whole numbers, else its place among the different ones."""
+    return np.array([int(name) for name in names]) if all(map(NUMBER.fullmatch, names)) else _places(names)
+
+
+def _places(values: Sequence[Any]) -> Array:
     """Each value as its place among the different ones, in their order."""
     place = {value: i for i, value in enumerate(sorted(set(values)))}
     return np.array([place[value] for value in values])

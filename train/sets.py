@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -86,7 +86,7 @@ class SweepSet(sets.SweepSet):
             return LIMITS[how](of_each, values[0])
         for value in values:
             if not (of_each == value).any():
-                raise self._error(f"no sweep fulfils {name}={value}; it has {_shortened(np.unique(of_each))}")
+                raise self._error(f"no sweep fulfils {name}={value}; it has {shortened(np.unique(of_each))}")
         return np.isin(of_each, values)
 
     def without_means(self) -> SweepSet:
@@ -207,52 +207,7 @@ def digest(sweeps: SweepSet) -> str:
     return total.hexdigest()[:16]
 
 
-def describe(sweeps: SweepSet) -> str:
-    """What a set holds, in lines: sweeps and their form, materials, recordings, groups and what is confounded."""
-    fmt, counts = sweeps.format, np.bincount(sweeps.labels, minlength=len(sweeps.materials))
-    each = ", ".join(f"{name} {n}" for name, n in zip(sweeps.materials, counts, strict=True))
-    _, _, held = sweeps.tally("recording")
-    least, most = (windows := held.sum(axis=1)).min(), windows.max()
-    lines = [
-        f"{sweeps.source}: {len(sweeps)} sweeps of {fmt.window / fmt.rate_hz:.3g} s; {fmt}; digest {digest(sweeps)}",
-        f"  materials: {len(counts)}: {each}",
-        f"  recordings: {len(windows)}, of {least if least == most else f'{least} to {most}'} each",
-    ]
-    if several := np.count_nonzero((held > 0).sum(axis=1) > 1):
-        lines.append(f"    {several} of them hold sweeps of several materials: number recordings within one material")
-    for name in sorted(set(sweeps.groups) - {"recording"}):
-        values, _, counts = sweeps.tally(name)
-        lines.append(f"  {name}: {len(values)}: {_shortened(values)}")
-        lines += [f"    confounded: {why}" for why in _confounded(values, counts > 0, sweeps.materials)]
-    return "\n".join(lines)
-
-
-def _confounded(values: Array, holds: Array, materials: Sequence[str]) -> Iterator[str]:
-    """How a group of several values tells the material, or takes one with it when left out. holds: bool [V, K]."""
-    if len(values) < 2:
-        return
-    if len(single := values[holds.sum(axis=1) == 1]):
-        yield f"one material only at {_shortened(single)}"
-    for k in np.flatnonzero(holds.sum(axis=0) == 1):
-        yield f"{materials[k]!r} only at {values[holds[:, k].argmax()]}; leaving that out leaves none to train on"
-
-
-def _shortened(values: Array) -> str:
+def shortened(values: Sequence[object]) -> str:
+    """Values in a line, those in the middle left out where they are many."""
     texts = [str(value) for value in values]
     return ", ".join(texts if len(texts) <= 9 else [*texts[:8], "…", texts[-1]])
-
-
-def known() -> str:
-    """What `load` takes, in lines."""
-    tubes = len(skin.MATERIALS)
-    lines = [
-        "FILE.npz, .h5, .hdf5   samples [N, T, R, C], labels [N], materials [K], rate_hz, group_NAME [N]",
-        "FILE.h5, .hdf5         TactMat: samples [materials, repetitions, T, R, C], materials",
-        "FOLDER                 what palpate run --keep FOLDER recorded, with its material in each .json",
-        "sim:NAME[:SEED[-LAST][:SWEEPS]]  simulated; SWEEPS of a tube at each position, SEED to LAST joined",
-    ]
-    for name, (positions, each) in skin.SETS.items():
-        total = positions * each * tubes
-        lines.append(f"  sim:{name:<12}{total:>5} sweeps, {each} of each of {tubes} tubes at {positions} position(s)")
-    lines.append(f"  sim:{'T-HARD:1-20':<12}{20 * total:>5} sweeps, twenty worlds joined, for tight intervals")
-    return "\n".join(lines)

@@ -26,7 +26,7 @@ from .machine import Machine
 
 KEPT = "/var/lib/palpate/kept"
 DROP_IN = "/etc/systemd/system/palpate.service.d/arguments.conf"
-RUN = "/opt/palpate/bin/palpate run"
+PALPATE = "/opt/palpate/bin/palpate"
 CLASSIFIED = {str(status) for status in Status if status.classified} | {"unknown"}
 
 
@@ -46,7 +46,7 @@ def runs_with(machine: Machine, arguments: str, more: str = "") -> None:
     """From the next start on the service runs with these arguments. more: further lines of its drop-in."""
     folder = DROP_IN.rpartition("/")[0]
     machine.run(f"mkdir -p {folder}", check=True)
-    machine.put(DROP_IN, f"[Service]\nExecStart=\nExecStart={RUN} {arguments}\n{more}\n".encode())
+    machine.put(DROP_IN, f"[Service]\nExecStart=\nExecStart={PALPATE} {arguments}\n{more}\n".encode())
     machine.run("systemctl daemon-reload", check=True, timeout_s=60)
 
 

@@ -105,7 +105,7 @@ def killed(image: Image, folder: Path, ledger: Ledger, n: int, rng: random.Rando
         cell = Cell(machine)
         cell.acts = known(script.tubes(rng.randrange(1 << 30)))
         cell.packet_frames = PACKET
-        runs_with(machine, f"--keep {KEPT}", "RestartSec=100ms")
+        runs_with(machine, f"record --out {KEPT}", "RestartSec=100ms")
         machine.run("systemctl restart --no-block palpate", check=True)
         cell.plug()
         cell.until_ready(BACK_S)
@@ -155,7 +155,7 @@ def disk(image: Image, tmp_path: Path) -> Path:
     made = tmp_path / "disk.qcow2"
     shutil.copy(image.disk, made)
     with Machine(image, tmp_path, snapshot=True, disk=made) as machine:
-        runs_with(machine, f"--keep {KEPT}")
+        runs_with(machine, f"record --out {KEPT}")
         machine.run("systemctl stop --no-block palpate; sync; sync", check=True)
     subprocess.run(["qemu-img", "snapshot", "-d", "ready", made], check=True)
     return made

@@ -88,7 +88,7 @@ class GuestClock:
 def clock(shared: Cell) -> GuestClock:
     """The service keeps its sweeps; sweeps whose answer is known."""
     shared.acts, shared.packet_frames = known(script.tubes(2)), 12
-    runs_with(shared.machine, f"--keep {KEPT}")
+    runs_with(shared.machine, f"record --out {KEPT}")
     shared.machine.run("systemctl stop palpate; systemctl start --no-block palpate", check=True, timeout_s=60)
     shared.serial.wait_for("$PPLP,STA,", 120, len(shared.serial.heard))
     return GuestClock(shared.machine)

@@ -1,0 +1,109 @@
+"""What is copied to a box that is installed. In: the wheel, the lock, this checkout. Out: an archive for each kind of box.
+
+Wheels for another architecture or Python are fetched here, each checked by its hash: the boxes need no internet for them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import sys
+import tarfile
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Lock
+
+from fleet import Failed
+from packaging.requirements import Requirement
+
+from appliance import __version__
+
+ROOT = Path(__file__).resolve().parent.parent
+LOCK = ROOT / "appliance" / "requirements.lock"
+GLIBC = 36
+"""Wheels may want glibc 2.36, that of Debian 12, or an older one."""
+
+
+class Parcels:
+    """What is copied to a box: one archive for each architecture and Python, made when a box wants it.
+
+    wheel: Palpate's own. shares: files and folders of this checkout that go along. folder: where the archives are put.
+    """
+
+    def __init__(self, wheel: Path, shares: Sequence[str], folder: Path) -> None:
+        self._wheel = wheel
+        self._shares = [ROOT / name for name in shares if (ROOT / name).exists()]
+        self._folder = folder
+        self._lock = Lock()
+        self._made: dict[tuple[str, str], tuple[str, Path]] = {}
+
+    def of(self, machine: str, python: str) -> tuple[str, Path]:
+        """The name of the release and its archive. Raises Failed where a wheel is not to be had."""
+        with self._lock:
+            if (machine, python) not in self._made:
+                self._made[machine, python] = self._make(machine, python)
+            return self._made[machine, python]
+
+    def _make(self, machine: str, python: str) -> tuple[str, Path]:
+        lock = locked(LOCK.read_text(), python, machine)
+        content = hashlib.sha256(f"{python.rpartition('.')[0]}\n{lock}".encode())
+        with zipfile.ZipFile(self._wheel) as held:  # its bytes hold dates
+            content.update(repr([(name, held.read(name)) for name in sorted(held.namelist())]).encode())
+        for file in sorted(one for share in self._shares for one in (share, *share.rglob("*")) if one.is_file()):
+            content.update(f"{file.relative_to(ROOT)}\n".encode() + file.read_bytes())
+        name = f"{__version__}-{content.hexdigest()[:8]}"
+        archive = self._folder / f"{name}-{machine}.tar"
+        wheels = fetch(lock, python, machine)
+        with tarfile.open(archive, "w") as tar:
+            for file in (*sorted(wheels.iterdir()), self._wheel):
+                tar.add(file, f"wheels/{file.name}", filter=_plain)
+            for share in self._shares:
+                tar.add(share, f"share/palpate/{share.name}", filter=_plain)
+        return name, archive
+
+
+def _plain(member: tarfile.TarInfo) -> tarfile.TarInfo:
+    member.mode = 0o755 if member.isdir() else 0o644
+    return member
+
+
+def locked(text: str, python: str, machine: str) -> str:
+    """The lock without what another Python or architecture has: pip looks only at its own when it fetches for another."""
+    there = {
+        "python_full_version": python, "python_version": python.rpartition(".")[0], "platform_machine": machine,
+    }  # fmt: skip
+    kept = []
+    for block in re.split(r"(?m)^(?=\w)", text):
+        first, rest = block.partition("\\\n")[::2]
+        if rest:
+            wanted = Requirement(first.strip())
+            if not wanted.marker or wanted.marker.evaluate(there):
+                kept.append(f"{wanted.name}{wanted.specifier} \\\n{rest}")
+    return "".join(kept)
+
+
+def fetch(lock: str, python: str, machine: str) -> Path:
+    """The folder with the lock and its wheels, kept for the next time. Raises Failed."""
+    short = python.rpartition(".")[0]
+    target = ROOT / "build" / "wheels" / f"{machine}-{short}-{hashlib.sha256(lock.encode()).hexdigest()[:8]}"
+    if target.exists():
+        return target
+    tags = [f"--platform=manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 16, -1)]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+        part = Path(folder) / "part"
+        part.mkdir()
+        (part / "requirements.lock").write_text(lock)
+        command = (
+            sys.executable, "-m", "pip", "--disable-pip-version-check", "-q", "download", "--no-deps",
+            "--only-binary", ":all:", "--implementation", "cp", "--python-version", short, *tags,
+            f"--platform=manylinux2014_{machine}", "--require-hashes", "-r", part / "requirements.lock", "-d", part,
+        )  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise Failed(f"wheels for {machine}, Python {short}: {done.stderr.strip().splitlines()[-1]}")
+        part.rename(target)
+    return target

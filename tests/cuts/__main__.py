@@ -1,0 +1,120 @@
+"""Cuts every scene at every moment: `python -m cuts [SCENE ...]`. In: scenes by name. Out: a line for each command, and in
+build/cuts.jsonl one for each point, with the machine and the commit.
+
+It goes on where it was broken off, as long as neither the box nor the scenes have changed. 1 where anything is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from cuts import black_box, delivery, recording, tree
+from cuts.scene import ROOT, Play, Point, Scene, stage
+
+SCENES: dict[str, Callable[[Path], Scene]] = {
+    "recording": lambda beside: recording.scene(),
+    "black box": lambda beside: black_box.scene(),
+    "delivery": lambda beside: delivery.Shop.opened(beside).scene(),
+}
+"""Each gets an empty folder for what it needs."""
+HOWS = ("power", "kill", "kill_then_power")
+
+
+def main() -> int:
+    """Cut the named scenes, or all."""
+    parser = argparse.ArgumentParser(prog="cuts", description=__doc__.split("\n\n")[0])
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"from {', '.join(SCENES)}; all by default")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "cuts.jsonl", help="points (%(default)s)")
+    given = parser.parse_args()
+    if wrong := set(given.scenes) - set(SCENES):
+        parser.error(f"no scene {', '.join(sorted(wrong))}; there are {', '.join(SCENES)}")
+    ledger = Ledger(given.out)
+    for name in given.scenes or SCENES:
+        with TemporaryDirectory(prefix="cuts-") as beside:
+            for point in cut(SCENES[name](Path(beside)), ledger):
+                print(".", end="", flush=True)
+                for wrong in point.wrong:
+                    print(f"\n{point.scene}: {point.step}: {point.how} before {point.call}: {wrong}", flush=True)
+    print("", *figures(ledger.points()), sep="\n")
+    return 1 if any(point.wrong for point in ledger.points()) else 0
+
+
+class Ledger:
+    """Points by their moments; one line of a file each, under a first line that says what was cut, where."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, head = path, json.dumps(_head())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lines = path.read_text().splitlines() if path.exists() else []
+        if lines[:1] != [head]:
+            lines = [head]
+            path.write_text(head + "\n")
+        self._points = [_point(json.loads(line)) for line in lines[1:] if line.endswith("}")]
+
+    def points(self, scene: str = "") -> list[Point]:
+        """Those of a scene, or all."""
+        return [point for point in self._points if scene in ("", point.scene)]
+
+    def add(self, point: Point) -> None:
+        """Write a point down."""
+        self._points.append(point)
+        with self._path.open("a") as file:
+            file.write(json.dumps(asdict(point)) + "\n")
+
+
+def _point(told: dict[str, Any]) -> Point:
+    return Point(**told | {"wrong": tuple(told["wrong"])})
+
+
+def _head() -> dict[str, str]:
+    """What was cut: the commit, a digest of what is really there, the machine."""
+    git = ("git", "-C", str(ROOT), "describe", "--always", "--dirty")
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    sources = (tree.read(ROOT / room) for room in ("appliance", "tests/cuts"))
+    digests = [tree.digest({name: held for name, held in s.items() if "__pycache__" not in name}) for s in sources]
+    return {
+        "commit": commit, "source": "".join(d[:16] for d in digests), "kernel": platform.platform(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "python": platform.python_version(),
+    }  # fmt: skip
+
+
+def cut(scene: Scene, ledger: Ledger) -> Iterator[Point]:
+    """All points of a scene that are not in the ledger yet; each is written down."""
+    done = {(point.step, point.how, point.moment) for point in ledger.points(scene.name)}
+    with stage() as work:
+        play = Play(scene, Path(work))
+        for how in HOWS:
+            for moment in play.moments():
+                at = scene.steps[moment.step].name, how, moment.number
+                if at not in done and (moment.call or how == "power"):
+                    ledger.add(point := getattr(play, how)(moment))
+                    yield point
+
+
+def figures(points: Iterable[Point]) -> Iterator[str]:
+    """A line for each command, and one for all."""
+    steps: dict[str, list[Point]] = {}
+    for point in points:
+        for name in (f"{point.scene}: {point.step}", "all"):
+            steps.setdefault(name, []).append(point)
+    for name in sorted(steps, key="all".__eq__):
+        told = []
+        for how in HOWS:
+            of_it = [point for point in steps[name] if point.how == how]
+            states, wrong = sum(point.states for point in of_it), sum(bool(point.wrong) for point in of_it)
+            told.append(f"{how.replace('_', ' ')} at {len(of_it)} moments, {states} folders, wrong {wrong}")
+        yield f"{name}: {'; '.join(told)}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

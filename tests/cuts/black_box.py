@@ -1,0 +1,66 @@
+"""The black box, cut short. In: a program that keeps the last sweeps in service. Out: a scene, whose judge finds what is
+lost of these beyond the sweep in progress.
+
+`python -m cuts.black_box FOLDER` is that program: it goes on in the folder, and says of each sweep when it is kept.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from appliance.black_box import BlackBox
+from cuts import recording
+from cuts.scene import Found, Scene, Step
+
+MOST = 2
+"""Sweeps that are kept: so few that each run takes old ones away."""
+KEPT = re.compile(r"^kept (\S+)$", re.MULTILINE)
+
+
+def keep(folder: Path) -> None:
+    """Keep three sweeps."""
+    box = BlackBox(folder, recording.FORMAT, MOST, circumstances=dict, log=sys.exit)
+    for number in (1, 2, 3):
+        box.keep(*recording.taken(number))
+        print(f"kept {max(folder.glob('*.npy')).stem}", flush=True)
+    box.close()
+
+
+def judge(found: Found) -> list[str]:
+    """What is wrong with the sweeps that were found, and with what the next run makes of them."""
+    folder = found.folder / recording.KEPT
+    wrong, there = recording.read(folder)
+    last = sorted(there.keys() | KEPT.findall(found.heard))[-MOST:]
+    wrong += [f"{name} was kept and is gone" for name in last if name not in there]
+    if len(there) > MOST + 1:
+        wrong.append(f"{len(there)} sweeps are kept instead of {MOST}, and the one in progress")
+    return wrong or _goes_on(folder, max(there, default=""))
+
+
+def _goes_on(folder: Path, last: str) -> list[str]:
+    """What the next run does wrong in the folder. last: the newest sweep there."""
+    wrong: list[str] = []
+    box = BlackBox(folder, recording.FORMAT, MOST, circumstances=dict, log=wrong.append)
+    for number in (1, 2):
+        box.keep(*recording.taken(number))
+    box.close()
+    broken, there = recording.read(folder)
+    left = {path.stem for path in folder.iterdir()}
+    if len(there) != MOST or left != there.keys() or min(there) <= last:
+        wrong.append(f"the next run leaves {', '.join(sorted(left))} beyond {last or 'nothing'}")
+    return wrong + broken
+
+
+def scene() -> Scene:
+    """Two runs that keep sweeps, the second one in what the first has left."""
+
+    def step(name: str) -> Step:
+        return Step(name, lambda folder: [sys.executable, "-m", "cuts.black_box", folder / recording.KEPT])
+
+    return Scene("black box", lambda folder: None, (step("first"), step("second")), judge)
+
+
+if __name__ == "__main__":
+    keep(Path(sys.argv[1]))

@@ -1,0 +1,158 @@
+"""The system calls of a command, in their order, seen by strace; and the command killed at one of them. In: a command.
+Out: the calls with their paths and data, and how it ended.
+
+strace delivers the SIGKILL on entry, and Linux does not carry out a call that a killed process has only entered: so a
+kill at call k leaves the disk as it is after call k-1 and before call k. (strace 6.1 delivers no signal where its seccomp
+filter is in use, so killed runs do without it.)
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+WATCHED = (
+    "open|creat|p?write|lseek|sendfile|copy_file|splice|f?truncate|fallocate|fsync|fdatasync|sync|rename|unlink|rmdir|"
+    "mkdir|symlink|link|f?chmod|f?chown|mknod"
+)
+"""The calls that matter, by how their names begin."""
+MOST_BYTES = 1 << 24
+"""Of one write that strace shows."""
+DEADLINE_S = 120
+LINE = re.compile(r"(\d+) +(\w+)\((.*)\) += (-?\d+|\?)(?:[ <].*)?")
+END = re.compile(r"\d+ +\+\+\+ .* \+\+\+")
+CUT, RESUMED = " <unfinished ...>", re.compile(r"(\d+) +<\.\.\. \w+ resumed>(.*)")
+STRING = re.compile(r'"((?:\\x[0-9a-f]{2})*)"(\.\.\.)?')
+DESCRIPTOR = re.compile(r"(AT_FDCWD|\d+)<((?:\\x[0-9a-f]{2})*)>")
+
+
+class Missing(Exception):
+    """What is needed to see a command's calls is not there; says what to install."""
+
+
+class NotFollowed(Exception):
+    """The command did something to its files that is not followed here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One system call. nth: which one of its name in its process, from 1, as strace counts. paths: what it is about,
+    absolute. data: what it writes, or where a symlink leads. words: its arguments as strace shows them. result: None
+    where the process was killed in it.
+    """
+
+    process: int
+    name: str
+    nth: int
+    paths: tuple[str, ...]
+    data: bytes
+    words: str
+    result: int | None
+
+    @property
+    def descriptor(self) -> int:
+        """The number of the file descriptor that it is about, -1 where it has none."""
+        number = re.match(r"(\d+)<", self.words)
+        return int(number[1]) if number else -1
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """How a command went: its calls, all that it wrote to standard output and standard error, its exit code."""
+
+    calls: tuple[Call, ...]
+    said: str
+    code: int
+
+
+def lacking() -> str:
+    """What to install before calls can be seen here; empty where nothing is missing."""
+    if not shutil.which("strace"):
+        return "strace (apt-get install strace)"
+    tried = subprocess.run(["strace", "-o", os.devnull, "true"], capture_output=True, check=False)
+    return "" if tried.returncode == 0 else "permission to trace a process (CAP_SYS_PTRACE, or ptrace_scope 0 or 1)"
+
+
+def run(command: Sequence[str | Path], log: Path, at: Call | None = None, env: dict[str, str] | None = None) -> Run:
+    """Run a command under strace, in the folder of the log; `at`: kill it when it enters this call.
+
+    env: what is added to the environment. Raises Missing, NotFollowed, and subprocess.TimeoutExpired.
+    """
+    if lack := lacking():
+        raise Missing(f"needs {lack}")
+    how = [f"--inject={at.name}:signal=SIGKILL:when={at.nth}"] if at else ["--seccomp-bpf"]
+    done = subprocess.run(
+        ["strace", "-f", "-y", "-xx", "-s", str(MOST_BYTES), "-e", "signal=none", "-e", f"trace=/^({WATCHED})",
+         *how, "-o", log, *command],
+        cwd=log.parent, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"} | (env or {}),
+        stdin=subprocess.DEVNULL, capture_output=True, timeout=DEADLINE_S, check=False,
+    )  # fmt: skip
+    calls = tuple(_calls(log.read_text("ascii").splitlines(), str(log.parent)))
+    if at and not any(c.result is None and (c.process, c.name, c.nth) == (at.process, at.name, at.nth) for c in calls):
+        raise NotFollowed(f"was not killed at its {at.name} number {at.nth}: it ended with {done.returncode}")
+    said = b"".join(call.data for call in calls if call.result and speaks(call))
+    return Run(calls, said.decode("utf-8", "replace"), done.returncode)
+
+
+def speaks(call: Call) -> bool:
+    """True where a command says something: what it writes to standard output or standard error."""
+    return call.name in ("write", "writev") and call.descriptor in (1, 2)
+
+
+def _calls(lines: list[str], folder: str) -> Iterator[Call]:
+    """The calls in the order in which they ended; last those that did not, since the process was killed in them."""
+    counts: Counter[tuple[str, str]] = Counter()
+    ranks: dict[str, int] = {}
+    for line in _joined(lines):
+        found = LINE.fullmatch(line)
+        if not found:
+            raise NotFollowed(f"strace says {line[:200]!r}")
+        process, name, words, result = found.groups()
+        counts[process, name] += 1
+        rank = ranks.setdefault(process, len(ranks))
+        paths, data = _arguments(name, words, folder)
+        yield Call(rank, name, counts[process, name], paths, data, words, None if result == "?" else int(result))
+
+
+def _joined(lines: list[str]) -> Iterator[str]:
+    """Each call as one line, where strace broke it in two since another process came between."""
+    begun: dict[str, str] = {}
+    for line in (line for line in lines if not END.fullmatch(line)):
+        if line.endswith(CUT):
+            begun[line.split()[0]] = line.removesuffix(CUT)
+        elif resumed := RESUMED.fullmatch(line):
+            yield begun.pop(resumed[1]) + resumed[2]
+        else:
+            yield line
+    yield from (f"{line}) = ?" for line in begun.values())
+
+
+def _arguments(name: str, words: str, folder: str) -> tuple[tuple[str, ...], bytes]:
+    """Paths and data among the arguments of a call: a path is relative to the descriptor before it, or to `folder`."""
+    paths: list[str] = []
+    data, base = b"", folder
+    of_data = name.startswith(("write", "pwrite"))
+    found = sorted([*STRING.finditer(words), *DESCRIPTOR.finditer(words)], key=re.Match.start)
+    for i, match in enumerate(found):
+        if match.re is DESCRIPTOR:
+            base = _bytes(match[2]).decode("utf-8", "surrogateescape")
+            if of_data or i + 1 == len(found) or found[i + 1].re is DESCRIPTOR:
+                paths.append(base)
+        elif match[2]:
+            raise NotFollowed(f"{name} of more than {MOST_BYTES} bytes")
+        elif of_data or (name.startswith("symlink") and not data):
+            data += _bytes(match[1])
+        else:
+            paths.append(os.path.normpath(os.path.join(base, _bytes(match[1]).decode("utf-8", "surrogateescape"))))
+            base = folder
+    return tuple(paths), data
+
+
+def _bytes(text: str) -> bytes:
+    return bytes.fromhex(text.replace("\\x", ""))

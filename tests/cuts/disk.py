@@ -1,0 +1,295 @@
+"""A disk that keeps only what it was told to keep. In: a folder, and the calls that change it. Out: all the folders that
+may be found when the power comes back.
+
+What a program has written is on the disk for sure only once it was synced: a file's content by an fsync of the file, a
+name (new, moved, gone) by an fsync of the folder it stands in. As long as it was not, it may be there or not:
+
+- names: those of one folder are kept in their order; those of different folders in any order. A rename is never half
+  done, also from folder to folder, and a folder's fsync takes with it whatever had to happen before.
+- contents: all of it, what was last synced, nothing, the first half, or as many zeros; each file by itself, too.
+
+That is less than ext4 promises (there a sync of one file takes all earlier names with it), and about what POSIX does. A
+symlink leads where it leads as soon as its name is there. Modes and owners are not looked at.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from cuts.calls import Call, NotFollowed
+from cuts.tree import NOTHING, Tree, digest
+
+MOST_STATES = 4096
+"""Of the names at one moment; who leaves more open should have synced long ago."""
+
+
+@dataclass(eq=False, slots=True)
+class File:
+    """A file. synced: its content as the disk has it for sure. at: where the next write goes, None for the end."""
+
+    data: bytes = b""
+    synced: bytes = b""
+    at: int | None = 0
+
+
+@dataclass(eq=False, slots=True)
+class Folder:
+    """A folder. names: as a program sees them. synced: as the disk has them for sure."""
+
+    names: dict[str, Inode] = field(default_factory=dict)
+    synced: dict[str, Inode] = field(default_factory=dict)
+
+
+@dataclass(eq=False, slots=True)
+class Link:
+    """A symlink."""
+
+    target: str
+
+
+Inode = File | Folder | Link
+Change = tuple[tuple[Folder, str, Inode | None], ...]
+"""Names that change at once: folder, name, what it then stands for (None: nothing)."""
+
+
+class Disk:
+    """`folder`, of which `there` is on the disk; what `effect` gives then happens to it.
+
+    apart: paths that do not matter: their contents are not varied.
+    """
+
+    def __init__(self, folder: Path, there: Tree, apart: re.Pattern[str] = NOTHING) -> None:
+        self._path, self._apart = folder, apart
+        self._root = Folder()
+        self._open: list[Change] = []
+        for name, held in sorted(there.items()):
+            inode = Folder() if held is None else Link(held) if isinstance(held, str) else File(held, held)
+            above, last, _ = self._find(str(self._path / name))
+            above.names[last] = above.synced[last] = inode
+
+    def follow(self, calls: Iterable[Call]) -> None:
+        """All this happens to the folder. Raises NotFollowed."""
+        for call in calls:
+            if effect := self.effect(call):
+                effect()
+
+    def effect(self, call: Call) -> Callable[[], None] | None:
+        """What this call does to the folder; None for nothing. Raises NotFollowed."""
+        if call.result is None or call.result < 0:
+            return None
+        if call.name == "sync":
+            return self._sync_all
+        if not any(self._inside(path) for path in call.paths):
+            return None
+        if call.process:
+            raise NotFollowed(f"a process that the command started calls {call.name} on {call.paths}")
+        return self._effect(call)
+
+    def _effect(self, call: Call) -> Callable[[], None] | None:
+        match call.name:
+            case "open" | "openat" | "creat":
+                return self._opened(call)
+            case "write" | "writev" | "pwrite64":
+                return self._written(call)
+            case "lseek":
+                if isinstance(file := self._at(call.paths[0]), File):
+                    file.at = call.result
+                return None
+            case "truncate" | "ftruncate":
+                return self._resized(call)
+            case "fsync" | "fdatasync":
+                return lambda: self._sync(self._at(call.paths[0]))
+            case "syncfs":
+                return self._sync_all
+            case "sync_file_range":  # promises nothing
+                return None
+            case name if name.endswith(("mod", "modat", "own", "ownat")):
+                return lambda: None
+            case _:
+                return self._renamed(call)
+
+    def _renamed(self, call: Call) -> Callable[[], None]:
+        """A call that changes names."""
+        here, name, there = self._find(call.paths[0])
+        match call.name:
+            case "mkdir" | "mkdirat":
+                return lambda: self._change((here, name, Folder()))
+            case "symlink" | "symlinkat":
+                return lambda: self._change((here, name, Link(call.data.decode("utf-8", "surrogateescape"))))
+            case "unlink" | "unlinkat" | "rmdir":
+                return lambda: self._change((here, name, None))
+            case "link" | "linkat":
+                return lambda: self._change((*self._find(call.paths[1])[:2], there))
+            case "rename" | "renameat" | "renameat2":
+                to, new, old = self._find(call.paths[1])
+                back = old if "RENAME_EXCHANGE" in call.words else None
+                return lambda: self._change((here, name, back), (to, new, there))
+        raise NotFollowed(f"{call.name} of {call.paths[0]} is not followed here; teach it here")
+
+    def _opened(self, call: Call) -> Callable[[], None] | None:
+        above, name, there = self._find(call.paths[0], follow="O_NOFOLLOW" not in call.words)
+        if "O_TMPFILE" in call.words:
+            raise NotFollowed(f"a file without a name in {call.paths[0]}")
+        if call.name != "creat" and not any(flag in call.words for flag in ("O_CREAT", "O_WRONLY", "O_RDWR")):
+            return None
+        at = None if "O_APPEND" in call.words else 0
+        if there is None:
+            return lambda: self._change((above, name, File(at=at)))
+        if not isinstance(there, File):
+            return None
+        there.at = at
+        if there.data and (call.name == "creat" or "O_TRUNC" in call.words):
+            return lambda: setattr(there, "data", b"")
+        return None
+
+    def _written(self, call: Call) -> Callable[[], None] | None:
+        file, n = self._at(call.paths[0]), call.result
+        assert n is not None
+        if not isinstance(file, File) or not n:
+            return None  # it has no name any more
+
+        def write() -> None:
+            alone = call.name == "pwrite64"
+            at = int(call.words.rsplit(", ", 1)[1]) if alone else len(file.data) if file.at is None else file.at
+            file.data = file.data[:at].ljust(at, b"\0") + call.data[:n] + file.data[at + n :]
+            if not alone and file.at is not None:
+                file.at = at + n
+
+        return write
+
+    def _resized(self, call: Call) -> Callable[[], None] | None:
+        file, size = self._at(call.paths[0]), int(call.words.rsplit(", ", 1)[1])
+        return (lambda: setattr(file, "data", file.data[:size].ljust(size, b"\0"))) if isinstance(file, File) else None
+
+    def _inside(self, path: str) -> bool:
+        return PurePosixPath(path).is_relative_to(self._path)
+
+    def _find(self, path: str, follow: bool = False, depth: int = 0) -> tuple[Folder, str, Inode | None]:
+        """The folder that `path` stands in, its name there, and what it is. Symlinks on the way are followed; at its
+        end only where that is wanted.
+        """
+        if depth > 40 or not self._inside(path):
+            raise NotFollowed(f"{path} leads out of {self._path}")
+        folder, done = self._root, self._path
+        *way, last = (PurePosixPath(path).relative_to(self._path)).parts or (".",)
+        for i, name in enumerate((*way, last)):
+            there = folder.names.get(name)
+            if isinstance(there, Link) and (follow or i < len(way)):
+                rest = (*way, last)[i + 1 :]
+                return self._find(os.path.normpath(done.joinpath(there.target, *rest)), follow, depth + 1)
+            if i < len(way):
+                if not isinstance(there, Folder):
+                    raise NotFollowed(f"{path} goes through {name}, which is no folder")
+                folder, done = there, done / name
+        return folder, last, folder.names.get(last)
+
+    def _at(self, path: str) -> Inode | None:
+        """What `path` is."""
+        return self._root if Path(path) == self._path else self._find(path)[2]
+
+    def _change(self, *change: tuple[Folder, str, Inode | None]) -> None:
+        for folder, name, inode in change:
+            _set(folder.names, name, inode)
+        self._open.append(change)
+
+    def _sync(self, inode: Inode | None) -> None:
+        if isinstance(inode, File):
+            inode.synced = inode.data
+        elif isinstance(inode, Folder):
+            touched, forced, later = {id(inode)}, [], []
+            for change in reversed(self._open):
+                folders = {id(folder) for folder, _, _ in change}
+                if touched & folders:
+                    touched |= folders
+                    forced.insert(0, change)
+                else:
+                    later.insert(0, change)
+            self._open = later
+            _settle(forced)
+
+    def _sync_all(self) -> None:
+        _settle(self._open)
+        self._open = []
+        for _, inode in _walk(self._root, {}):
+            self._sync(inode)
+
+    def seen(self) -> Tree:
+        """The folder as programs see it."""
+        return {path: _held(inode, "all") for path, inode in _walk(self._root, _overlay(self._open))}
+
+    def left(self) -> Iterator[Tree]:
+        """Each folder that may be found if the power goes now, once."""
+        told = set()
+        for happened in self._happened():
+            there = list(_walk(self._root, _overlay(happened)))
+            unsure = [
+                inode for path, inode in there
+                if isinstance(inode, File) and inode.data != inode.synced and not self._apart.fullmatch(path)
+            ]  # fmt: skip
+            ways = [dict.fromkeys(map(id, unsure), how) for how in ("all", "synced", "none", "half", "zeros")]
+            for one in unsure if len(unsure) > 1 else ():
+                ways += [ways[0] | {id(one): "synced"}, ways[1] | {id(one): "all"}]
+            for way in ways if unsure else [{}]:
+                found: Tree = {path: _held(inode, way.get(id(inode), "all")) for path, inode in there}
+                if (name := digest(found, self._apart)) not in told:
+                    told.add(name)
+                    yield found
+
+    def _happened(self) -> list[tuple[Change, ...]]:
+        """Each set of the changes not synced yet that may have reached the disk: none without those before it that have
+        a folder in common with it.
+        """
+        sets: list[tuple[int, ...]] = [()]
+        for i, change in enumerate(self._open):
+            folders = {id(folder) for folder, _, _ in change}
+            before = [j for j in range(i) if any(id(folder) in folders for folder, _, _ in self._open[j])]
+            sets += [(*there, i) for there in sets if set(before) <= set(there)]
+            if len(sets) > MOST_STATES:
+                raise NotFollowed(f"{len(self._open)} names are not synced, too many to try what may be left")
+        return [tuple(self._open[i] for i in there) for there in sets]
+
+
+def _set(names: dict[str, Inode], name: str, inode: Inode | None) -> None:
+    if inode is None:
+        names.pop(name, None)
+    else:
+        names[name] = inode
+
+
+def _settle(changes: list[Change]) -> None:
+    """These names are on the disk for sure."""
+    for change in changes:
+        for folder, name, inode in change:
+            _set(folder.synced, name, inode)
+
+
+def _overlay(changes: list[Change] | tuple[Change, ...]) -> dict[int, dict[str, Inode | None]]:
+    over: dict[int, dict[str, Inode | None]] = {}
+    for change in changes:
+        for folder, name, inode in change:
+            over.setdefault(id(folder), {})[name] = inode
+    return over
+
+
+def _walk(folder: Folder, over: dict[int, dict[str, Inode | None]], at: str = "") -> Iterator[tuple[str, Inode]]:
+    """Paths and inodes below a folder: its synced names, and what lies over them."""
+    for name, inode in sorted({**folder.synced, **over.get(id(folder), {})}.items(), key=lambda entry: entry[0]):
+        if inode is not None:
+            yield f"{at}{name}", inode
+            if isinstance(inode, Folder):
+                yield from _walk(inode, over, f"{at}{name}/")
+
+
+def _held(inode: Inode, how: str) -> bytes | str | None:
+    match inode:
+        case Folder():
+            return None
+        case Link():
+            return inode.target
+    data = inode.data
+    ways = {"all": data, "synced": inode.synced, "none": b"", "half": data[: len(data) // 2], "zeros": bytes(len(data))}
+    return ways[how]

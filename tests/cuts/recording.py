@@ -1,0 +1,162 @@
+"""Recording, cut short. In: programs that record sweeps, the box's own and some that are wrong on purpose. Out: scenes,
+whose judge finds what is lost beyond the sweep in progress.
+
+`python -m cuts.recording WAY FOLDER SESSION` is such a program: it goes on in the folder, says what a robot would hear,
+and which sweep it is told to discard.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from appliance import disk
+from appliance.clock import SystemClock
+from appliance.errors import FormatError
+from appliance.record import Labels, Recording
+from appliance.sweep import Frames, Status, Sweep, SweepFormat, Verdict, load
+from cuts.scene import Found, Scene, Step
+
+FORMAT = SweepFormat(4, 4, 750, 40, "uint8")
+KEPT = "kept/sweeps"
+"""Below the folder of the scene, and not there at first: who makes it has to sync that, too."""
+HEARD = re.compile(
+    r",REC,\d+,stored,(?:[^,]*,){3}(?P<session>[^,]*),(?P<name>sweep-\d+)|^(?P<how>discard\w+) (?P<gone>\S+)",
+    re.MULTILINE,
+)
+Files = Mapping[Path, bytes]
+
+
+def record(way: str, folder: Path, session: str) -> None:
+    """Record two sweeps, discard the second, record a third; way: how the files get onto the disk."""
+    disk.put_all = WAYS[way]
+    running = recording(folder, session, lambda line: print(line.decode().strip(), flush=True), sys.exit)
+    running.keep(*taken(1))
+    running.keep(*taken(2))
+    print(f"discarding {max(folder.glob('*.npy')).stem}", flush=True)
+    print(f"discarded {running.commands['DISCARD']('')[-1]}", flush=True)
+    running.keep(*taken(3))
+    running.close()
+
+
+def recording(folder: Path, session: str, say: Callable[[bytes], None], log: Callable[[str], None]) -> Recording:
+    """The box's keeper of sweeps."""
+    labels = Labels("plastic rough", "1", session)
+    return Recording(folder, FORMAT, labels, SystemClock(), circumstances=dict, say=say, log=log)
+
+
+def taken(number: int) -> tuple[Sweep, Verdict]:
+    """A sweep and its answer."""
+    n = FORMAT.window
+    digits = np.full((n, FORMAT.rows, FORMAT.cols), number, np.uint8)
+    sweep = Sweep(number, 0, n, Status.OK, Frames(np.arange(n), np.arange(n), digits))
+    return sweep, Verdict(number, n, Status.OK, "steel", 0.9, 0.8, np.array([0.9, 0.1]), 1, 0, 0, "0" * 8)
+
+
+def _aside(files: Files, write: Callable[[Path, bytes], object], settle: Callable[[Path], object]) -> None:
+    """Write all files aside, then give them their names; settle: what is done with each name then."""
+    for path, data in files.items():
+        write(path.with_name(path.name + disk.PART), data)
+    for path in files:
+        path.with_name(path.name + disk.PART).replace(path)
+        settle(path)
+
+
+def _in_place(files: Files) -> None:
+    for path, data in files.items():
+        disk.write(path, data)
+        disk.sync(path.parent)
+
+
+def _late(path: Path) -> None:
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    disk.sync(path.parent)
+
+
+WAYS: dict[str, Callable[[Files], None]] = {
+    "right": disk.put_all,
+    "no sync of the file": lambda files: _aside(files, Path.write_bytes, lambda path: disk.sync(path.parent)),
+    "no sync of the folder": lambda files: _aside(files, disk.write, lambda path: None),
+    "sync after the rename": lambda files: _aside(files, Path.write_bytes, _late),
+    "under its own name": _in_place,
+    "description last": lambda files, put=disk.put_all: put(dict(reversed(files.items()))),
+}
+"""How files get onto the disk: all but the first are wrong on purpose, and the judge must find that."""
+
+
+def judge(found: Found) -> list[str]:
+    """What is wrong with the sweeps that were found, and with what the next run makes of them."""
+    folder = found.folder / KEPT
+    wrong, sessions = read(folder)
+    owed, gone = told(found.heard)
+    for name, session in owed.items():
+        if name not in sessions:
+            wrong.append(f"{name} was stored and is gone")
+        elif sessions[name] != session:
+            wrong.append(f"{name} was stored in session {session} and is one of {sessions[name]}")
+    wrong += [f"{name} was discarded and is there" for name in gone & sessions.keys()]
+    return wrong or _goes_on(folder)
+
+
+def read(folder: Path) -> tuple[list[str], dict[str, str]]:
+    """Which sweeps cannot be read; the session of each that can."""
+    wrong, sessions = [], {}
+    for path in sorted(folder.glob("*.npy")):
+        try:
+            sessions[path.stem] = load(path)[0].session
+        except FormatError as e:
+            wrong.append(str(e).replace(f"{folder}/", ""))
+    return wrong, sessions
+
+
+def told(said: str) -> tuple[dict[str, str], set[str]]:
+    """What a robot has heard: sessions of the sweeps that are stored, and the discarded ones. What is being discarded is
+    neither.
+    """
+    owed: dict[str, str] = {}
+    gone: set[str] = set()
+    for heard in HEARD.finditer(said):
+        name = heard["name"] or heard["gone"]
+        owed.pop(name, None)
+        gone.discard(name)
+        if heard["name"]:
+            owed[name] = heard["session"]
+        elif heard["how"] == "discarded":
+            gone.add(name)
+    return owed, gone
+
+
+def _goes_on(folder: Path) -> list[str]:
+    """What the next run does wrong in the folder."""
+    before = {path: path.read_bytes() for path in folder.glob("*.npy")}
+    wrong: list[str] = []
+    running = recording(folder, "later", lambda line: None, wrong.append)
+    for number in (1, 2):
+        running.keep(*taken(number))
+    running.close()
+    broken, sessions = read(folder)
+    wrong += broken
+    if list(sessions.values()).count("later") != 2:
+        wrong.append("the next run does not store its two sweeps")
+    wrong += [f"the next run leaves {path.name}" for path in folder.glob(f"*{disk.PART}")]
+    wrong += [f"the next run changes {path.name}" for path, data in before.items() if path.read_bytes() != data]
+    return wrong
+
+
+def scene(way: str = "right") -> Scene:
+    """Two runs that record, the second one in what the first has left."""
+
+    def session(name: str) -> Step:
+        return Step(name, lambda folder: [sys.executable, "-m", "cuts.recording", way, folder / KEPT, name])
+
+    return Scene("recording", lambda folder: None, (session("first"), session("second")), judge)
+
+
+if __name__ == "__main__":
+    record(sys.argv[1], Path(sys.argv[2]), sys.argv[3])

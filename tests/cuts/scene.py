@@ -1,0 +1,204 @@
+"""Plays a scene and cuts it short. In: commands that change a folder, one after another, and a judge of what may be found
+in it. Out: one point for each moment, with all that the judge has found wrong.
+
+The scene is first played to its end, and its calls are noted. A moment lies before each call that changes the folder or
+syncs something in it, and after the last one of each command: after a call is before the next one. At each moment the
+command is killed there, or the power is cut there. What is found then goes to the judge.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from cuts import calls, tree
+from cuts.calls import Call, NotFollowed, Run
+from cuts.disk import Disk
+
+ROOT = Path(__file__).parents[2]
+MEMORY = Path("/dev/shm")
+"""Where scenes are best played: what a sync does is known here, and on a real disk it takes its time."""
+ENVIRONMENT = {"PYTHONPATH": f"{ROOT / 'tests'}:{ROOT}"}
+
+
+def stage() -> TemporaryDirectory[str]:
+    """A folder to play in."""
+    return TemporaryDirectory(prefix="cuts-", dir=MEMORY if MEMORY.is_dir() else None)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a judge gets: the folder, which it may change; the command that was cut; what it hears of all that was said."""
+
+    folder: Path
+    step: str
+    heard: str
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A command, for the folder that it gets. code: how it ends, None for any way. killed: the call that it does not get
+    beyond.
+    """
+
+    name: str
+    command: Callable[[Path], Sequence[str | Path]]
+    code: int | None = 0
+    killed: Call | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """prepare: makes the folder as it is before the first command. judge: what is wrong. apart: paths that it does not
+    look at. hears: what it needs of what was said.
+    """
+
+    name: str
+    prepare: Callable[[Path], None]
+    steps: tuple[Step, ...]
+    judge: Callable[[Found], list[str]]
+    apart: re.Pattern[str] = tree.NOTHING
+    hears: Callable[[str], str] = str
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A scene that was cut at one moment. how: a method of Play. call: the one that was not carried out any more. states:
+    how many different folders it may have left. wrong: what the judge said of them.
+    """
+
+    scene: str
+    step: str
+    how: str
+    moment: int
+    call: str
+    states: int
+    wrong: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Before a call that changes something; call None: after the last one."""
+
+    step: int
+    number: int
+    call: Call | None
+    said: str
+    disk: Disk
+
+
+@dataclass(slots=True)
+class Play:
+    """A scene that was played to its end in `work`. said: what had been said before. before: what was in the folder before
+    each command. runs: how these went. Raises NotFollowed where the folder is not what the calls must have made of it.
+    """
+
+    scene: Scene
+    work: Path
+    said: str = ""
+    before: list[tree.Tree] = field(default_factory=list)
+    runs: list[Run] = field(default_factory=list)
+    judged: dict[tuple[str, str, str], tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.work = self.work.resolve()
+        self.folder.mkdir()
+        self.scene.prepare(self.folder)
+        for step in self.scene.steps:
+            self.before.append(tree.read(self.folder))
+            run = self._run(step, step.killed)
+            if not step.killed and step.code not in (None, run.code):
+                raise NotFollowed(f"{step.name} ended with {run.code}: {run.said[-2000:]}")
+            self.runs.append(run)
+
+    @property
+    def folder(self) -> Path:
+        """The folder that the commands change."""
+        return self.work / "folder"
+
+    def moments(self) -> Iterator[Moment]:
+        """All moments in their order. What the command before the last one has done is on the disk by then."""
+        said = self.said
+        for i, run in enumerate(self.runs):
+            disk = Disk(self.folder, self.before[max(i - 1, 0)], self.scene.apart)
+            disk.follow(self.runs[i - 1].calls if i else ())
+            number = 0
+            for call in run.calls:
+                if calls.speaks(call):
+                    said += call.data.decode("utf-8", "replace")
+                if effect := disk.effect(call):
+                    yield Moment(i, number, call, said, disk)
+                    effect()
+                    number += 1
+            yield Moment(i, number, None, said, disk)
+
+    def power(self, moment: Moment) -> Point:
+        """The power goes: each folder that may be left is judged."""
+        step, wrong, states = self.scene.steps[moment.step], [], 0
+        for left in moment.disk.left():
+            states += 1
+            wrong += self._judged(left, step, moment.said)
+        return self._point("power", moment, states, wrong)
+
+    def kill(self, moment: Moment) -> Point:
+        """The command is killed as it enters the moment's call. Raises NotFollowed."""
+        step = self.scene.steps[moment.step]
+        self._restore(self.before[moment.step])
+        run = self._run(step, moment.call)
+        said = "".join(run.said for run in (*self.runs[: moment.step], run))
+        return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, said))
+
+    def kill_then_power(self, moment: Moment) -> Point:
+        """The command is killed there, and started again: it goes on with what is left, and at each of its moments the
+        power goes. Raises NotFollowed.
+        """
+        step, before = self.scene.steps[moment.step], self.before[moment.step]
+        steps = replace(step, killed=moment.call), replace(step, code=None)
+        twice = replace(self.scene, prepare=lambda folder: tree.write(before, folder), steps=steps)
+        wrong, states = [], 0
+        with stage() as work:
+            play = Play(
+                twice, Path(work), said="".join(run.said for run in self.runs[: moment.step]), judged=self.judged
+            )
+            for point in (play.power(later) for later in play.moments() if later.step):
+                states += point.states
+                wrong += [f"{text} (before its {point.call}, when it was started again)" for text in point.wrong]
+        return self._point("kill_then_power", moment, states, wrong)
+
+    def _run(self, step: Step, at: Call | None) -> Run:
+        """Run a command, and compare what it leaves with what its calls must have made of the folder."""
+        disk = Disk(self.folder, tree.read(self.folder))
+        run = calls.run(step.command(self.folder), self.work / "log", at, ENVIRONMENT)
+        disk.follow(run.calls)
+        if (seen := disk.seen()) != (there := tree.read(self.folder)):
+            differ = sorted(name for name in seen | there if seen.get(name, "") != there.get(name, ""))
+            raise NotFollowed(f"{step.name}: {', '.join(differ)} not as its calls must have left it")
+        return run
+
+    def _restore(self, held: tree.Tree) -> None:
+        shutil.rmtree(self.folder)
+        self.folder.mkdir()
+        tree.write(held, self.folder)
+
+    def _judged(self, left: tree.Tree, step: Step, said: str) -> tuple[str, ...]:
+        """What is wrong with a folder; each is looked at once."""
+        heard = self.scene.hears(said)
+        key = tree.digest(left, self.scene.apart), step.name, heard
+        if key not in self.judged:
+            with TemporaryDirectory(dir=self.work) as aside:
+                folder = Path(aside) / "folder"
+                folder.mkdir()
+                tree.write(left, folder)
+                self.judged[key] = tuple(self.scene.judge(Found(folder, step.name, heard)))
+        return self.judged[key]
+
+    def _point(self, how: str, moment: Moment, states: int, wrong: Sequence[str]) -> Point:
+        call = moment.call
+        names = [str(Path(path).relative_to(self.folder)) for path in call.paths] if call else []
+        told = " ".join([call.name, *names]) if call else "the end"
+        step = self.scene.steps[moment.step].name
+        return Point(self.scene.name, step, how, moment.number, told, states, tuple(dict.fromkeys(wrong)))
