@@ -30,16 +30,24 @@ class BlackBox:
         self._circumstances, self._log = circumstances, log
         self._folder: SweepFolder | None = None
         self._trouble = ""
+        self._try(lambda folder: None)  # while there is time: it waits for the disk several times
 
     def keep(self, sweep: Sweep, verdict: Verdict) -> None:
         """Write the sweep if it has a window, and take away what is one too many."""
-        if not len(sweep.frames):
-            return
+        if len(sweep.frames):
+            self._try(lambda folder: self._put(folder, sweep, verdict))
+
+    def close(self) -> None:
+        """Give the folder back."""
+        if self._folder:
+            self._folder.close()
+
+    def _try(self, what: Callable[[SweepFolder], None]) -> None:
         trouble = ""
         try:
             # a folder that cannot be used at the start may be usable later, and must not keep the box from its work
             self._folder = self._folder or SweepFolder(self._place, self._format)
-            self._put(self._folder, sweep, verdict)
+            what(self._folder)
         except OSError as e:
             trouble = str(e.strerror)
         if trouble != self._trouble:
@@ -48,11 +56,6 @@ class BlackBox:
                 self._log(f"{WARNING}black box: no sweep is kept: {trouble}; see to {self._place}")
             else:
                 self._log("black box: sweeps are kept again")
-
-    def close(self) -> None:
-        """Give the folder back."""
-        if self._folder:
-            self._folder.close()
 
     def _put(self, folder: SweepFolder, sweep: Sweep, verdict: Verdict) -> None:
         about = self._circumstances()

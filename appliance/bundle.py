@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import graph
 from .errors import BundleError
 from .manifest import (
     GOLDEN,
@@ -158,6 +159,7 @@ def made(files: Mapping[str, bytes], where: str) -> Bundle:
     """The bundle that `files` are, checked; `where` they come from. Raises BundleError as `load`."""
     manifest = Manifest.parse(files[MANIFEST])
     model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
+    graph.check(model, manifest)
     samples, logits = _golden(golden, manifest)
     classes = _classes(_checked(files, manifest, MEANS, where), manifest) if manifest.known else None
     return Bundle(manifest, identity(files[MANIFEST]), model, samples, logits, classes)

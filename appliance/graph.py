@@ -18,12 +18,12 @@ import numpy as np
 from . import onnx_file, onnx_messages, operators
 from .errors import BundleError
 from .operators import OPERATORS
-from .shapes import KINDS, PLACE, Call, Out, Value, need
+from .shapes import KINDS, MOST_RANK, PLACE, Call, Out, Value, need
 
 if TYPE_CHECKING:
     from .manifest import Manifest
 
-VERSIONS = {"": range(17, 19), "ai.onnx": range(17, 19), "ai.onnx.ml": range(3, 4), "com.microsoft": range(1, 2)}
+VERSIONS = {"": range(17, 19), "ai.onnx.ml": range(3, 4), "com.microsoft": range(1, 2)}
 """Of the operators of each domain: what train/ writes, and the next, by which the operators here differ little."""
 FORMATS = range(8, 10)
 """Of the file (IR version), likewise."""
@@ -31,10 +31,8 @@ NOTES = ("onnx.infer", "onnx.quant.pre_process")
 """What onnxruntime's quantization writes about a model."""
 MOST_NODES, MOST_CONSTANTS = 1000, 2000
 """Three times MiniRocket's, the longest of our own; onnxruntime takes a kilobyte or two for each."""
-MOST_RANK = 8
-"""Dimensions of a tensor. Our own have up to five; onnxruntime reserves room for few."""
 MOST_TENSOR = 64 << 20
-"""Bytes of one tensor. The largest of our own are the weights of the paper's CNN, 63 MB as floats."""
+"""Bytes of one tensor. The largest of our own are the weights of the paper's CNN in int8, 63 MB once they are floats."""
 MOST_MEMORY = 160 << 20
 """Bytes of all of a model by the account of `_Bill`. Our own largest: the paper's CNN in int8 151 MB, MiniRocket 93 MB.
 onnxruntime never took more than this account, and 9 MB for itself; so the box stays below 256 MB whatever it is given."""
@@ -45,6 +43,8 @@ MOST_WORK = 2_000_000_000
 needs 0.96e9, the paper's CNN in int8 0.88e9."""
 TOUCH = 8
 """Products that take as long as reading or writing a number, in the slowest operators."""
+MOST_LETTERS = 400
+"""Of what is wrong: names and lists come from the file."""
 CONSTANTS = ("float32", "uint8", "int8", "int32", "int64")
 """Types of constants; the others only come in by the sweep, or out of a comparison."""
 OUTPUTS = {"logits": 2, "early": 3, "embedding": 2}
@@ -94,7 +94,7 @@ def check(model: bytes, manifest: Manifest) -> None:
             _agree(declared, known)
         _outputs([declared.name for declared in graph.output], known, manifest)
     except BundleError as e:
-        raise BundleError(f"the model must not be opened: {e}; export the bundle again") from e
+        raise BundleError(f"the model must not be opened: {str(e)[:MOST_LETTERS]}; export the bundle again") from e
 
 
 def _bytes(value: Value) -> int:
@@ -163,8 +163,7 @@ def _bounded(name: str, value: Value) -> Value:
 
 def _follow(node: onnx_messages.Node, known: dict[str, Value], bill: _Bill) -> None:
     """What a node gives is known then, and paid."""
-    domain = "" if node.domain == "ai.onnx" else node.domain
-    operator = OPERATORS.get((domain, node.op_type))
+    operator = OPERATORS.get((node.domain, node.op_type))
     if operator is None:
         raise BundleError(f"there is no such operator of domain {node.domain[:80]!r} for a bundle")
     need(operator.least <= len(node.input) <= operator.most, f"it has {len(node.input)} inputs")

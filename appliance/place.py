@@ -7,7 +7,6 @@ the skin's middle than it is. So far off a distance is told too small, never wit
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 
 from .errors import BundleError
 
-MOST_POSITIONS = 1000
-"""A bundle may name so many; each sweep is compared with all of them."""
+MOST_POSITIONS, MOST_MM = 1000, 1e6
+"""A bundle may name so many positions, since each sweep is compared with all of them; and no length above a kilometre."""
 LEAST_PART = 0.25
 """A direction whose share of the distance is smaller is not named: it changes the distance by under 3 %."""
 IN_PLACE = "in place"
@@ -42,12 +41,12 @@ class Place:
     def __post_init__(self) -> None:
         for name in ("pitch_mm", "limit_mm"):
             value = getattr(self, name)
-            if not _finite(value) or value <= 0:
-                raise BundleError(f"place.{name} {value!r} must be a number above 0; export the bundle again")
+            if not _length(value) or value <= 0:
+                raise BundleError(f"place.{name} {value!r} must be mm above 0; export the bundle again")
         for name in ("rows_mm", "cols_mm"):
             values = getattr(self, name)
-            if type(values) is not tuple or not 1 <= len(values) <= MOST_POSITIONS or not all(map(_finite, values)):
-                raise BundleError(f"place.{name} must be 1 to {MOST_POSITIONS} finite numbers; export the bundle again")
+            if type(values) is not tuple or not 1 <= len(values) <= MOST_POSITIONS or not all(map(_length, values)):
+                raise BundleError(f"place.{name} must be 1 to {MOST_POSITIONS} places in mm; export the bundle again")
         if len(self.rows_mm) != len(self.cols_mm):
             raise BundleError(
                 f"place has {len(self.rows_mm)} rows_mm and {len(self.cols_mm)} cols_mm, where each position has one of "
@@ -66,8 +65,8 @@ class Place:
         return bool(np.hypot(*offset) <= self.limit_mm)
 
 
-def _finite(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= sys.float_info.max
+def _length(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= MOST_MM
 
 
 def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> Point | None:

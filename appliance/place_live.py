@@ -103,10 +103,8 @@ class Placing:
 
     def _judged(self, load: NDArray[np.float64], found: Point | None) -> View:
         """The View of a skin that streams, with this load [R, C] and contact."""
-        place, shown = (
-            self._model.manifest.place,
-            {"load": tuple(map(tuple, load.round(1).tolist())), "full": self._full},
-        )
+        place = self._model.manifest.place
+        shown: dict[str, Any] = {"load": tuple(map(tuple, load.round(1).tolist())), "full": self._full}
         least = self._lowest[np.isfinite(self._lowest)].max(initial=-np.inf)
         if least >= self._model.manifest.thresholds.contact:
             todo = f"a taxel has not read less than {least:.0f} digits yet: something lies on the skin"
@@ -120,10 +118,8 @@ class Placing:
         at = found[0] * place.pitch_mm, found[1] * place.pitch_mm
         shown |= {"centre": at, "nearest": (at[0] - offset[0], at[1] - offset[1])}
         if place.within(offset):
-            todo = (
-                f"{np.hypot(*offset):.1f} mm from the nearest trained position; up to {place.limit_mm:.1f} mm is fine"
-            )
-            return self._view("in-place", IN_PLACE, todo, **shown)
+            away = f"{np.hypot(*offset):.1f} mm from the nearest trained position"
+            return self._view("in-place", IN_PLACE, f"{away}; up to {place.limit_mm:.1f} mm is fine", **shown)
         todo = "move the skin on the finger as far the same way, then look again"
         return self._view("off", advice(offset, self._shape), todo, **shown)
 

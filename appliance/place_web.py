@@ -65,19 +65,19 @@ class Handler(BaseHTTPRequestHandler):
         self.connection.settimeout(DEADLINE_NS / 1e9)  # of the whole answer, as `sendall` counts it
 
     def _head(self) -> bytes:
-        """Up to the empty line and what came with it; nothing where that has not come by the deadline or within the limit."""
+        """Up to the empty line and what came with it; nothing where the limit or the other side's end comes first. Raises
+        TimeoutError at the deadline."""
         clock, head = self.server.clock, b""
         until_ns = clock.now_ns() + DEADLINE_NS
-        while b"\r\n\r\n" not in head and len(head) < MOST_HEAD and (left := until_ns - clock.now_ns()) > 0:
-            self.connection.settimeout(left / 1e9)
-            try:
-                more = self.connection.recv(MOST_HEAD - len(head))
-            except TimeoutError:
-                break
-            if not more:
-                break
+        while b"\r\n\r\n" not in head:
+            left_ns, room = until_ns - clock.now_ns(), MOST_HEAD - len(head)
+            if left_ns <= 0:
+                raise TimeoutError
+            self.connection.settimeout(left_ns / 1e9)
+            if not room or not (more := self.connection.recv(room)):
+                return b""
             head += more
-        return head if b"\r\n\r\n" in head else b""
+        return head
 
     def parse_request(self) -> bool:
         """Refuse what is meant for another site."""

@@ -1,8 +1,8 @@
 """The room of shapes. In: a node's inputs and settings. Out: type and shape of what it gives.
 
-These are the rules of the operators that move, choose and compare numbers; operators.py has those that add up products,
-and says which rule is whose. What decides a size must be a constant of the file. The rules are those of the ONNX operator
-documents, with the bounds under which onnxruntime neither reads beside an array nor divides by zero.
+These are the rules of the operators that work number by number or along an axis, and what all rules share; moves.py and
+operators.py have the others. They are those of the ONNX operator documents, with the bounds under which onnxruntime neither
+reads beside an array nor divides by zero. What decides a size must be a constant of the file.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from .errors import BundleError
 
 KINDS = {1: "float32", 2: "uint8", 3: "int8", 4: "uint16", 5: "int16", 6: "int32", 7: "int64", 9: "bool"}
 """Types of tensors by ONNX's code; there are no others in a bundle's model."""
+MOST_RANK = 8
+"""Dimensions of a tensor. Our own have up to five; onnxruntime reserves room for few."""
 MOST_STEP = 1 << 16
 """Largest stride, dilation and kernel."""
 PLACE = "place"
@@ -53,6 +55,7 @@ class Call:
         value = self.inputs[at]
         if value.numbers is None:
             raise BundleError(f"input {at + 1} decides a size, but is no constant of the file")
+        need(value.numbers.size <= MOST_RANK, f"input {at + 1} has {value.numbers.size} numbers (limit {MOST_RANK})")
         need(rank in (None, len(value.shape)), f"input {at + 1} has {len(value.shape)} dimensions instead of {rank}")
         found: list[int] = value.numbers.ravel().tolist()
         return found
@@ -104,19 +107,19 @@ def together(*shapes: Shape) -> Shape:
 
 
 def same(call: Call) -> Out:
-    """What it is given, with other numbers."""
+    """Abs, Cos, Identity, Log, Neg, Not, Relu, Sin, Sqrt."""
     return call.inputs[0].kind, call.inputs[0].shape
 
 
 def spread(call: Call) -> Out:
-    """Number by number."""
+    """Add, Div, Max, Mul, Sub: number by number of tensors that are spread over each other."""
     kinds = {x.kind for x in call.inputs}
     need(len(kinds) == 1, f"types {sorted(kinds)} do not go together")
     return kinds.pop(), together(*(x.shape for x in call.inputs))
 
 
 def compare(call: Call) -> Out:
-    """Number by number, yes or no."""
+    """And, Equal, Greater, Less."""
     return "bool", spread(call)[1]
 
 
@@ -151,7 +154,7 @@ def along(call: Call) -> Out:
 
 
 def reduce(call: Call) -> Out:
-    """Sums, means, extremes along axes; up to opset 17 most have them as a setting."""
+    """ReduceMax and its like; up to opset 17 most have the axes as a setting."""
     x = call.inputs[0]
     need(len(call.inputs) == 1 or "axes" not in call.given, "axes are given twice")
     named = call.constant(1) if len(call.inputs) == 2 else call.given.get("axes", range(len(x.shape)))

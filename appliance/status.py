@@ -31,6 +31,7 @@ SOON_NS = 100_000_000
 STALE_NS = 10_000_000_000
 """A file that has not changed for so long is of a program that hangs: it is the unit's watchdog time."""
 MOST_BYTES = 1 << 20
+_START = "systemctl start palpate, then journalctl -u palpate tells more"
 WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
 
 
@@ -121,9 +122,6 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
     elif age_ns > STALE_NS:
         why = f"process {pid} has told nothing for {_span(age_ns)}, it hangs; the service's watchdog starts it again"
     return told | {"running": not why, "why": why}
-
-
-_START = "systemctl start palpate, then journalctl -u palpate tells more"
 
 
 def _alive(pid: int) -> bool:

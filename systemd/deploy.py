@@ -83,9 +83,10 @@ def deliver(box: Box, parcel: Parcel, shadow: bool) -> str:
     # what an earlier one left there goes, too
     fresh = f"umask 077; mkdir -p {incoming} && find {incoming} -mindepth 1 -delete && mkdir {incoming}/{parcel.sha}"
     box.run("copying", f"{fresh} && tar -x -C {incoming}/{parcel.sha}", user="palpate", stdin=file)
+    box.run("tidying up", f"rm {file}")
     accept = f"{PALPATE} accept {incoming}/{parcel.sha}{' --shadow' if shadow else ''}"
     box.run("checking it there", accept, user="palpate", limit_s=120)
-    box.run("tidying up", f"rm -f {file}; sudo -n -u palpate rm -rf {incoming}/{parcel.sha}")
+    box.run("tidying up", f"rm -r {incoming}/{parcel.sha}", user="palpate")
     return told(box, parcel, ready=box.restart(READY_S, STARTS), shadow=shadow)
 
 
@@ -114,6 +115,8 @@ def told(box: Box, parcel: Parcel, *, ready: bool, shadow: bool) -> str:
     if shadow != (entry["role"] == "candidate"):
         raise Failed(f"the bundle is {entry['role']} there; somebody else was at work, too")
     role = f"{entry['role']}: {entry['detail']}" if entry["detail"] else entry["role"]
+    if not ready and box.told["waits"].startswith("skin mismatch"):
+        raise Failed(f"the bundle is {role}, but {box.told['waits']}; palpate rollback goes back")
     if not ready:
         return f"{parcel.name} is {role}; READY waits: {box.told['waits']}"
     lost = f"{box.told['lost_s']} s without classifying; " if "lost_s" in box.told else ""

@@ -31,6 +31,7 @@ from pyinfra.context import ctx_state
 from pyinfra_cli.inventory import make_inventory_from_files
 
 BEGAN_S = time.monotonic()
+"""When the command began, but for Python's own start."""
 PALPATE = "/opt/palpate/bin/palpate"
 NAME = re.compile(r"(?:(?P<ssh_user>[^@]+)@)?(?P<ssh_hostname>[^@:\[\]]+|\[[^\]]+\])(?::(?P<ssh_port>\d+))?")
 """USER@HOST:PORT; user and port may be missing, an IPv6 address stands in brackets."""
@@ -164,13 +165,16 @@ def each(args: argparse.Namespace, work: Callable[[Box], str]) -> int:
         except (Failed, OSError, EOFError, SSHException, PyinfraError) as e:
             why[box.name] = str(e) or type(e).__name__
 
-    gevent.joinall([state.pool.spawn(one, host) for host in inventory], raise_error=True)
+    try:
+        gevent.joinall([state.pool.spawn(one, host) for host in inventory], raise_error=True)
+    except KeyboardInterrupt:
+        sys.exit("palpate: interrupted; each box is as it was or as it should be, run it again to finish")
     for name, reason in why.items():
         print(f"{name}: FAILED: {reason}", flush=True)
     if len(inventory) > 1:
         print(f"{len(inventory) - len(why)} of {len(inventory)} boxes done")
     if args.json:
-        args.json.write_text(json.dumps({"boxes": told, "failed": why}, indent=1) + "\n")
+        args.json.write_text(json.dumps({"began_s": BEGAN_S, "boxes": told, "failed": why}, indent=1) + "\n")
     return 1 if why else 0
 
 

@@ -44,10 +44,12 @@ LINKS = {place: f"{HERE}/share/palpate/{Path(name).name}" for name, place in PLA
 """What leads from these places into the release."""
 PIP = "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index --root-user-action=ignore"
 SELF_TEST = """
-import sys; from pathlib import Path; from appliance import bundle, classifier, clock
-for folder in (bundle.DEFAULT, *map(Path, sys.argv[1:])):
-    classifier.Classifier(bundle.load(folder), clock.SystemClock()).self_test()
+import sys; from pathlib import Path; from appliance import bundle, classifier, clock, config, tasks
+settings = config.load(None, folder=Path(sys.argv[1]))
+for held in (bundle.load(bundle.DEFAULT), tasks.model(settings)):
+    classifier.Classifier(held, clock.SystemClock()).self_test()
 """
+"""The settings are understood, and the bundle that is packaged and the one in use do what they should."""
 PACKAGES_S = BUILD_S = 600
 """For packages, and for the environment, on a slow card."""
 READY_S, STARTS = 40, 2
@@ -87,14 +89,16 @@ def install(box: Box, parcels: Parcels, board: str, signers: str) -> str:
         box.say("building its environment")
         box.run("building the environment", build(release), user="root", stdin=f".palpate-{name}.tar", limit_s=BUILD_S)
         box.run("tidying up", f"rm -f .palpate-{name}.tar")
-    box.run("users, folders and settings", prepare(release, board, signers), user="root")
+    kept = box.run("users, folders and settings", prepare(release, board, signers), user="root")
+    if kept:
+        box.say(f"{' '.join(kept.split())} stays as it is there: a file, not the link to the release's")
     box.run("self-test", self_test(release), user="root", limit_s=120)
     return switch(box, name, release)
 
 
 def survey(box: Box) -> str:
     """Python's name of the box's architecture. Raises Failed where Palpate does not run on such a box."""
-    said = box.run("looking at its system", '. /etc/os-release; echo "$PRETTY_NAME"; dpkg --print-architecture')
+    said = box.run("looking at its system", '. /etc/os-release; echo "$PRETTY_NAME"; dpkg --print-architecture || true')
     system, _, arch = said.partition("\n")
     if arch not in MACHINES:
         raise Failed(f"its system is {system}, {arch or 'not Debian'}; Palpate needs Debian 12 for arm64 or amd64")
@@ -115,7 +119,7 @@ def packages(box: Box) -> None:
     if not missing:
         return
     box.say(f"installing {missing}")
-    get = f"DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends {missing}"
+    get = f"DEBIAN_FRONTEND=noninteractive apt-get -q -y -o DPkg::Lock::Timeout=120 install --no-install-recommends {missing}"
     try:
         box.run("apt-get", f"{get} || {{ apt-get update -q && {get}; }}", user="root", limit_s=PACKAGES_S)
     except Failed as e:
@@ -130,7 +134,7 @@ def build(release: str) -> str:
     Those of an install whose desktop died may be at it still: they are waited for.
     """
     return f"""set -e; umask 022
-exec 9> /run/lock/palpate-install; flock -w {BUILD_S} 9; ! [ -e {release}/stamp ] || exit 0
+exec 9> /run/palpate-install.lock; flock -w {BUILD_S} 9; ! [ -e {release}/stamp ] || exit 0
 rm -rf {release}; mkdir {release}; tar -x --no-same-owner -C {release}
 python3 -m venv {release}
 {release}/bin/python {PIP} --find-links {release}/wheels --require-hashes -r {release}/wheels/requirements.lock
@@ -160,7 +164,8 @@ def prepare(release: str, board: str, signers: str) -> str:
         text = shlex.quote(f'board = "{board}"\n')
         lines += [f"if [ ! -e {file} ]; then {_put(file, text)}; fi"]
     for place, target in LINKS.items():
-        own = "true" if place.startswith("/etc/palpate/") else f"echo {place} is a file there, not a link >&2; exit 1"
+        settings = place.startswith("/etc/palpate/")
+        own = f"echo {place}" if settings else f"echo '{place} is a file there, not a link; move it away' >&2; exit 1"
         lines += [
             f"mkdir -p {Path(place).parent}",
             f"if [ -e {place} ] && [ ! -L {place} ]; then {own}; else ln -sfn {target} {place}; fi",
@@ -173,12 +178,9 @@ def _put(file: str, text: str) -> str:
 
 
 def self_test(release: str) -> str:
-    """The commands that try the new runtime, as the service's user, with the settings and bundles of the box."""
-    python, share = f"{release}/bin/python -I", f"{release}/share/palpate"
-    return f"""set -e
-as_it="setpriv --reuid=palpate --regid=palpate --init-groups"
-$as_it {release}/bin/palpate config --config-dir {share} > /dev/null
-$as_it {python} -c {shlex.quote(SELF_TEST)} $(readlink -e /var/lib/palpate/current || true)"""
+    """The command that tries the new runtime, as the service's user, with the settings and bundles of the box."""
+    as_it = "setpriv --reuid=palpate --regid=palpate --init-groups"
+    return f"{as_it} {release}/bin/python -I -c {shlex.quote(SELF_TEST)} {release}/share/palpate"
 
 
 def switch(box: Box, name: str, release: str) -> str:
@@ -193,11 +195,7 @@ def switch(box: Box, name: str, release: str) -> str:
     try:
         ready = _start(box)
     except Failed as e:
-        if before in ("", Path(release).name):
-            raise
-        box.run("swapping back", swap(f"/opt/{before}", Path(release).name), user="root")
-        _start(box)
-        raise Failed(f"{e}; so {before} runs again") from e
+        raise Failed(f"{e}{_back(box, release)}") from e
     keep = f"$(readlink -e {HERE}) $(readlink -e {HERE}.previous || true)"
     tidy = f'for one in {HERE}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
     box.run("removing older releases", tidy, user="root", limit_s=120)
@@ -205,6 +203,19 @@ def switch(box: Box, name: str, release: str) -> str:
         return f"{name} installed; it waits: {box.told['waits']}"
     lost = f", {box.told['lost_s']} s without classifying" if "lost_s" in box.told else ""
     return f"{name} is READY {box.told['ready_s']} s after the command{lost}"
+
+
+def _back(box: Box, release: str) -> str:
+    """Have the release before run again, where there is one; how the sentence ends that says why."""
+    before = box.run("looking for the old release", f"readlink {HERE}.previous || true")
+    if before in ("", Path(release).name):
+        return ""
+    box.run("swapping back", swap(f"/opt/{before}", Path(release).name), user="root")
+    try:
+        _start(box)
+    except Failed as e:
+        return f"; it was swapped back, but {before}: {e}"
+    return f"; so {before} runs again"
 
 
 def swap(release: str, before: str) -> str:

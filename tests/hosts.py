@@ -228,8 +228,10 @@ def _measured(
         took_s = time.monotonic() - begin_s
         if done.returncode:
             raise RuntimeError(done.stdout + done.stderr)
-        boxes = json.loads((place.work / "told.json").read_text())["boxes"].values()
-        return {"command_s": round(took_s, 2), "boxes": [*boxes]}
+        told = json.loads((place.work / "told.json").read_text())
+        late_s = told["began_s"] - begin_s  # one clock for all processes of a machine
+        boxes = [box | {"ready_s": round(box["ready_s"] + late_s, 2)} for box in told["boxes"].values()]
+        return {"command_s": round(took_s, 2), "boxes": boxes}
 
     installed = timed("install", *install)
     rounds = [timed("deploy", bundle) for bundle in bundles]

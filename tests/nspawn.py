@@ -27,7 +27,7 @@ from machines import HOME, LOCK, PIP, ROOT, Missing, run, wheel
 CACHE = HOME.parent / "nspawn"
 SUITE, PYTHON = "bookworm", "3.11"
 """Debian 12, what the boards run, and its Python."""
-PACKAGES = ("systemd", "systemd-sysv", "python3-venv", "libstdc++6", "libusb-1.0-0", "openssh-client")
+PACKAGES = ("systemd", "systemd-sysv", "python3-venv", "libstdc++6", "libusb-1.0-0", "openssh-client", "udev")
 TOOLS = {
     "mmdebstrap": "mmdebstrap", "systemd-nspawn": "systemd-container", "nsenter": "util-linux", "setpriv": "util-linux",
 }  # fmt: skip

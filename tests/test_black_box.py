@@ -140,10 +140,13 @@ def test_a_folder_that_cannot_be_used_yet(tmp_path: Path):
     ]  # fmt: skip
 
 
-def test_closing_one_that_kept_nothing(tmp_path: Path):
-    """A box that saw no sweep has made no folder, and ends well."""
-    box(tmp_path / "b").close()
-    assert not (tmp_path / "b").exists()
+def test_its_folder_is_ready_before_the_first_sweep(tmp_path: Path):
+    """What takes the disk's time at the start is done before the box runs, and it is given back at the end."""
+    black = box(tmp_path / "b")
+    assert (tmp_path / "b").is_dir()
+    black.close()
+    box(tmp_path / "b").keep(*judged(1))
+    assert held(tmp_path / "b") == [1]
 
 
 def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tmp_path: Path):

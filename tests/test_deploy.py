@@ -50,10 +50,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
-    """One bare host, and a desktop that may log in there."""
+    """Two bare hosts, of which the second stays bare, and a desktop that may log in there."""
     if os.environ.get("PALPATE_SYSTEMD") != "1":
         pytest.skip("installs on real hosts take minutes; run make systemd")
-    with hosts.Hosts(1, tmp_path_factory.mktemp("hosts") / "work", "bare") as made:
+    with hosts.Hosts(2, tmp_path_factory.mktemp("hosts") / "work", "bare") as made:
         yield made
 
 
@@ -142,6 +142,17 @@ def test_signers_are_never_overwritten(
     assert done.returncode == 1
     assert "FAILED: users, folders and settings: /etc/palpate/allowed_signers is another one there" in done.stdout
     assert host.machine.get("cat", "/etc/palpate/allowed_signers") == before
+
+
+def test_a_box_without_packages_and_mirror_is_told_so(place: hosts.Hosts, wheel: Path):
+    """Nothing is begun there before they are to be had."""
+    machine = place.hosts[1].machine
+    machine.get("find", "/var/cache/apt/archives", "-name", "*.deb", "-delete")
+    done = place.desktop("install", "--host", f"{hosts.USER}@{place.hosts[1].address}", "--wheel", wheel, limit_s=120)
+    assert done.returncode == 1
+    assert "FAILED: python3-venv libusb-1.0-0 cannot be installed: apt-get: E: " in done.stdout
+    assert "give the box a way to Debian's mirrors" in done.stdout
+    assert machine.get("ls", "/opt") == ""
 
 
 @pytest.fixture(scope="session")
@@ -342,27 +353,25 @@ def test_a_candidate_is_delivered_beside(place: hosts.Hosts, host: hosts.Host, a
 
 
 def test_boxes_that_fail_do_not_stop_the_others(place: hosts.Hosts, host: hosts.Host, sender: Sender, tmp_path: Path):
-    """One refuses, one never says a word, one answers and then hangs: each has its reason, and the good one is READY."""
+    """One refuses, one never speaks, one hangs, one has no Palpate: each has its reason, and the good one is READY."""
     with socket.create_server(("127.0.0.1", 0)) as dumb, stalling(host) as hangs:
         shared = {"ssh_user": hosts.USER, "ssh_key": str(place.work / ".ssh/id_ed25519")}
-        boxes = [
-            ("refuses", {"ssh_port": 1}),
-            ("dumb", {"ssh_port": dumb.getsockname()[1]}),
-            ("hangs", {"ssh_port": hangs}),
+        there = {"refuses": 1, "dumb": dumb.getsockname()[1], "hangs": hangs}
+        boxes = [(name, {"ssh_hostname": "127.0.0.1", "ssh_port": port}) for name, port in there.items()]
+        boxes += [
+            (name, {"ssh_hostname": one.address}) for name, one in zip(("good", "bare"), place.hosts, strict=True)
         ]
-        boxes = [(name, {"ssh_hostname": "127.0.0.1"} | data) for name, data in boxes]
-        (tmp_path / "fleet.py").write_text(
-            f"boxes = ({[*boxes, ('good', {'ssh_hostname': host.address})]!r}, {shared!r})\n"
-        )
+        (tmp_path / "fleet.py").write_text(f"boxes = ({boxes!r}, {shared!r})\n")
         done = place.desktop("deploy", "--hosts", tmp_path / "fleet.py", sender.made(), "--limit", "40", limit_s=100)
     assert done.returncode == 1
     lines = dict(line.split(": ", 1) for line in done.stdout.splitlines() if ": " in line)
     assert "is READY" in lines["good"]
     assert lines["refuses"].startswith("FAILED: cannot be reached: Could not connect")
     assert lines["dumb"].startswith("FAILED: cannot be reached: SSH error")
+    assert lines["bare"].startswith("FAILED: asking for its settings: no Palpate is installed there")
     assert lines["hangs"].startswith("FAILED: ")
     assert "no answer within" in lines["hangs"] or "not done within 40 s" in lines["hangs"]
-    assert done.stdout.splitlines()[-1] == "1 of 4 boxes done"
+    assert done.stdout.splitlines()[-1] == "1 of 5 boxes done"
 
 
 @contextmanager

@@ -336,6 +336,20 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
     context.close()
 
 
+def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypatch: pytest.MonkeyPatch):
+    """It takes the question and never answers: the page does not wait for it."""
+    context, held = browser.new_context(), threading.Event()
+    seen = Seen(context, page.address)
+    seen.state("off")
+    monkeypatch.setattr(place_web.Handler, "do_GET", lambda self: held.wait(3 * WAIT_S))
+    try:
+        seen.state("no-connection")
+    finally:
+        held.set()
+    assert "tunnel" in seen.text("#todo")
+    context.close()
+
+
 @pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, height: int, scheme: str):

@@ -16,8 +16,11 @@ from conftest import Rigged
 
 from appliance import bundle, config
 from appliance.black_box import BlackBox
+from appliance.classifier import Classifier
+from appliance.early import Decider
 from appliance.errors import FormatError
 from appliance.manifest import Early
+from appliance.record import told
 from appliance.replay import replay
 from appliance.sim import rig, script, skin, stage
 from appliance.sweep import Frames, Status, Sweep, load, save, sidecar
@@ -80,7 +83,8 @@ def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle: bundl
 def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundle: bundle.Bundle):
     """A single file is fused with the earlier ones beside it, and with no others."""
     folder, heard = in_service
-    for n in (1, 3, 11):
+    change(folder / "sweep-000002.npy", bundle="0badcafe")  # of the first object; it would end the others' replay
+    for n in (1, 11, 30):
         code, sentences, outcomes = played(folder / f"sweep-{n:06d}.npy", default_bundle)
         assert (code, sentences) == (0, [heard[n - 1]])
         assert outcomes == [f"sweep-{n:06d}.npy: the same"]
@@ -89,14 +93,15 @@ def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundl
 def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, default_bundle: bundle.Bundle):
     """The ring has dropped an object's first sweep: the others' own scores are compared, and that is said."""
     folder, _ = in_service
-    for n in (4, 5, 8):  # of the second object two are gone, of the third the middle one
+    counts = {n: sidecar(folder / f"sweep-{n:06d}.npy")["verdict"]["fused"] for n in range(1, SWEEPS + 1)}
+    threes = [n for n in counts if counts[n] == PER_OBJECT]  # the last sweeps of objects of which all were fused
+    for n in (threes[0] - 2, threes[1] - 1):  # of one the first is gone, of another the second
         (folder / f"sweep-{n:06d}.npy").unlink()
+    fused = [threes[0] - 1, threes[0], threes[1]]
     code, _, outcomes = played(folder, default_bundle)
     assert code == 0
     alone = [line.split(":")[0] for line in outcomes if "the same by itself (earlier sweeps" in line]
-    fused = [n for n in (6, 9) if sidecar(folder / f"sweep-{n:06d}.npy")["verdict"]["fused"] > 1]
     assert alone == [f"sweep-{n:06d}.npy" for n in fused]
-    assert fused
     own = sidecar(folder / f"sweep-{fused[0]:06d}.npy")["verdict"]
     change(
         folder / f"sweep-{fused[0]:06d}.npy", verdict=own | {"own": [np.nextafter(own["own"][0], 2), *own["own"][1:]]}
@@ -104,6 +109,25 @@ def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, d
     code, _, outcomes = played(folder, default_bundle)
     assert code == 1
     assert next(line for line in outcomes if "DIFFERENT" in line).startswith(f"sweep-{fused[0]:06d}.npy")
+
+
+def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
+    """By itself it would not have been given: its own scores are compared all the same, and no sentence is made up."""
+    model = toy.load(tmp_path / "bundle", early=Early((0.5,) * 3, 1), outputs=("logits", "embedding", "early"))
+    classifier = Classifier(model, rig.VirtualClock(), sure=0.97)
+    whole = toy.sweep(2.5, 0.5, object=1)
+    frames = Frames(*(values[:10] for values in (whole.frames.t_ns, whole.frames.seq, whole.frames.taxels)))
+    early = replace(whole, id=2, frames=frames, share=0.5)
+    verdicts = classifier(whole), Decider(classifier)(early)
+    assert [(str(v.status), v.fused) for v in verdicts] == [("unsure", 1), ("ok", 2)]
+    for sweep, verdict in zip((whole, early), verdicts, strict=True):
+        about = {"rule": classifier.rule, "bundle": model.id, "verdict": told(verdict)}
+        save(tmp_path / f"sweep-{sweep.id:06d}.npy", sweep, toy.FORMAT, about)
+    assert played(tmp_path, model)[2][-1] == "2 sweeps: 2 the same"
+    (tmp_path / "sweep-000001.npy").unlink()
+    code, sentences, outcomes = played(tmp_path, model)
+    assert (code, sentences) == (0, [])
+    assert outcomes[-1] == "1 sweeps: 1 the same by itself"
 
 
 def test_every_other_bit_is_told(in_service, default_bundle: bundle.Bundle):

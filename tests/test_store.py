@@ -338,6 +338,7 @@ def test_a_candidate_waits_and_is_promoted(box: Delivery):
     candidate = box.store.candidate()
     assert candidate
     assert candidate.id == two[:8]
+    assert [(e.role, e.sha) for e in catalogue.entries(box.store)][-1] == ("candidate", two)
     assert box.store.promote() == two == box.start()
     assert box.store.candidate() is None
     with pytest.raises(BundleError, match="no candidate"):

@@ -8,6 +8,7 @@ import time
 
 import nspawn
 import pytest
+from machines import ROOT
 from nspawn import CABLED, PALPATE, SIM, SITE, STREAMS, WAIT_S, Machine, Service
 
 pytest_plugins = ["units"]
@@ -35,9 +36,20 @@ def test_the_unit_is_sound_and_hardened(machine: Machine, before: list[bool]):
     wanted = {"Type": "notify", "NotifyAccess": "main", "Restart": "always", "RestartUSec": "2s"}
     wanted |= {"TimeoutStartUSec": "1min", "TimeoutStopUSec": "10s", "StartLimitIntervalUSec": "0"}
     assert {name: shown[name] for name in wanted} == wanted
-    done = machine.run("systemd-analyze", "security", "--threshold=15", "palpate")
+    done = machine.run(
+        "systemd-analyze", "security", "--offline=true", "--threshold=15", nspawn.PLACES["palpate.service"]
+    )
     print(done.stdout.splitlines()[-1])
     assert done.returncode == 0, done.stdout
+
+
+def test_the_udev_rules_are_sound(machine: Machine, before: list[bool]):
+    """udev reads them and finds nothing to complain about: each key, operator and group is known to it."""
+    rules = "70-palpate.rules"
+    machine.put(f"/etc/udev/rules.d/{rules}", (ROOT / "firmware_config" / rules).read_text())
+    said = machine.run("udevadm", "test", "/sys/class/mem/null").stderr
+    assert f"Reading rules file: /etc/udev/rules.d/{rules}" in said
+    assert f"{rules}:" not in said
 
 
 def test_the_boot_does_not_wait_for_a_skin(machine: Machine, service: Service):

@@ -84,6 +84,7 @@ def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
             ", position 3, session mon" if svg is small else ""
         )
         assert all(link.startswith(("#", "data:image/png;base64,")) for link in re.findall(r'href="([^"]*)"', svg))
+        assert ("data:image/png;base64," in svg) == (svg is not small)  # one image, not a shape for each of its pixels
         assert "<style" not in svg
         assert all("fill: var(--" in text.get("style") for text in root.iter(f"{SVG}text"))
         assert not any(re.search(f"(?<!, ){colour}", svg) for colour in ink.ROLES.values())
@@ -151,7 +152,7 @@ def test_a_silent_skin_can_be_drawn(tmp_path: Path, digits: int):
 
 
 @pytest.mark.parametrize("grid", [(2, 2), (9, 9)])
-def test_missing_frames_are_marked(tmp_path: Path, grid: tuple[int, int]):
+def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: tuple[int, int]):
     """Where the numbers jump there is a bar, as wide as the gap lasted; the spectrum is of the longest run without one."""
     fmt = SweepFormat(*grid, 100.0, 400, "uint8")
     whole = drawn(tmp_path / "a.npy", fmt)
@@ -161,7 +162,10 @@ def test_missing_frames_are_marked(tmp_path: Path, grid: tuple[int, int]):
     seen.span(axes)
     (bar,) = axes.patches
     assert (bar.get_x(), bar.get_width()) == (pytest.approx(3.99), pytest.approx(0.51))
+    heard = []
+    monkeypatch.setattr(view, "_spectrum", lambda axes, taxels, form: heard.append(len(taxels)))
     assert "grey bars: frames are missing" in words(view.draw(seen))
+    assert heard == [300]
     assert "grey bars" not in words(whole)
 
 

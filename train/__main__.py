@@ -26,11 +26,12 @@ from . import (
     methods,
     options,
     pack,
+    place,
     pull,
     score,
     shows,
     sign,
-)  # fmt: skip
+)
 from .fold import whole
 from .ladder import LADDER, USUAL
 
@@ -68,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_evaluate(add)
     _add_fit(add)
     _add_bundles(add)
-    for room in (contents, pull, export, sign, shows, frontier, choose, certainty, calibrate):
+    for room in (contents, pull, export, sign, place, shows, frontier, choose, certainty, calibrate):
         room.register(add)
     return parser
 
@@ -121,6 +122,9 @@ def _add_bundles(add: Add) -> None:
         command.add_argument("--name", required=True)
         command.add_argument("--version", required=True)
         command.add_argument("--full-scale", type=float, help="the sensor's highest digit (default: its type's)")
+        command.add_argument(
+            "--pitch-mm", type=float, help="from taxel to taxel; without it `palpate place` knows no mm"
+        )
     three = add("yardsticks", run_yardsticks, "write the models that palpate bench times beside the bundle")
     three.add_argument("--out", type=Path, required=True, metavar="DIR")
 
@@ -187,8 +191,8 @@ def run_pack(args: argparse.Namespace) -> None:
     _told(pack.pack(export.checked(content, content.reference), *_packing(args)), args.out)
 
 
-def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None]:
-    return args.out, args.name, args.version, commit(), args.full_scale
+def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None, float | None]:
+    return args.out, args.name, args.version, commit(), args.full_scale, args.pitch_mm
 
 
 def _told(manifest: Manifest, out: Path) -> None:

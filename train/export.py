@@ -54,8 +54,9 @@ behind it."""
 
 
 def export(
-    fit: Fit, target: Path, name: str, version: str, commit: str, full_scale: float | None = None
-) -> bundle.Manifest:
+    fit: Fit, target: Path, name: str, version: str, commit: str, full_scale: float | None = None,
+    pitch_mm: float | None = None,
+) -> bundle.Manifest:  # fmt: skip
     """Quantize `fit`, check it, and pack it; see pack.pack. Raises ExportRefused where a check fails."""
     reference, model = graphs(fit)
     with torch.no_grad():
@@ -68,7 +69,7 @@ def export(
         )
     about = fit.about | {"torch_difference": apart}
     content = Content(model, "raw", fit.train, fit.held, fit.about["held_out_by"], about, made=fit)
-    return pack(checked(content, reference), target, name, version, commit, full_scale)
+    return pack(checked(content, reference), target, name, version, commit, full_scale, pitch_mm)
 
 
 def graphs(fit: Fit) -> tuple[onnx.ModelProto, onnx.ModelProto]:

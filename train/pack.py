@@ -31,6 +31,7 @@ from .fit import Fit
 from .graphs import run
 from .heads import hold_out
 from .methods import Method, given
+from .place import place_of
 from .score import figure
 from .sets import SweepSet
 
@@ -38,6 +39,8 @@ Array = NDArray[Any]
 MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
 """Shares of held-out sweeps that the box may refuse (stuck taxels, say), and call unknown, of which its limit makes some
 .05; more means that thresholds or limit do not fit."""
+RUNTIME = "0.2.0"
+"""The first version of the box that reads such a manifest."""
 REFUSED, UNKNOWN = -1, -2
 """What `score` gives instead of a label."""
 
@@ -71,11 +74,13 @@ class Content:
 
 
 def pack(
-    content: Content, target: Path, name: str, version: str, commit: str, full_scale: float | None = None
-) -> bundle.Manifest:
+    content: Content, target: Path, name: str, version: str, commit: str, full_scale: float | None = None,
+    pitch_mm: float | None = None,
+) -> bundle.Manifest:  # fmt: skip
     """Check `content` and put it at `target`, whole or not at all; an older bundle there is replaced.
 
-    commit: of the code, for the manifest. full_scale: the sensor's highest digit where it is not its type's.
+    commit: of the code, for the manifest. full_scale: the sensor's highest digit where it is not its type's. pitch_mm: from
+    taxel to taxel; where it is not known, the box cannot say how far a skin has moved.
     Raises ExportRefused where a check fails, and BundleError where a label or the target cannot be used.
     """
     content = completed(content)
@@ -84,9 +89,10 @@ def pack(
     golden = golden_sweeps(train, logits, named_by_means(content, train) if content.known else logits)
     files = {bundle.MODEL: content.model.SerializeToString(), bundle.GOLDEN: golden}
     files |= {bundle.MEANS: content.means} if content.known else {}
+    limits = thresholds(train, full_scale)
     manifest = bundle.Manifest(
         name=name, version=version, format=train.format, input=content.input, labels=train.materials,
-        thresholds=thresholds(train, full_scale), early=content.early, known=content.known, files={k: bundle.file_entry(v) for k, v in files.items()},
+        thresholds=limits, place=place_of(train, limits.contact, pitch_mm), runtime=RUNTIME, early=content.early, known=content.known, files={k: bundle.file_entry(v) for k, v in files.items()},
         made={"commit": commit, "set": train.source, "machine": platform.machine(), "cpus": os.cpu_count(),
               "torch": torch.__version__, "onnxruntime": onnxruntime.__version__} | content.about,
     )  # fmt: skip

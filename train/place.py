@@ -36,7 +36,7 @@ Array = NDArray[Any]
 Json = dict[str, Any]
 LEAST = 1 / 8
 """The limit is never below this share of the pitch: by so much another taping of the skin in the same place moves the
-centre (0.5 of 4 mm hold 95 % of the simulated ones), whatever few or equal positions say."""
+centre (0.5 of 4 mm hold over 95 % of the simulated ones), whatever few or equal positions say."""
 OFF_MM = tuple(np.arange(0.5, 6.25, 0.5).tolist())
 """How far the skin is moved."""
 WAYS = {"rows": "dx_mm", "columns": "dy_mm"}
@@ -44,14 +44,12 @@ FALL = 0.05
 """Accuracy counts as lost where it is so far below that of a skin in its place."""
 
 
-def place_of(
-    sweeps: SweepSet, contact: float, pitch_mm: float | None = None, tare: Array | None = None
-) -> Place | None:
+def place_of(sweeps: SweepSet, contact: float, pitch_mm: float | None = None) -> Place | None:
     """Where the contact lay at each position of a training set (else at each recording); None where nothing says how
     far apart the taxels are, or nothing touched them.
 
-    contact: the bundle's threshold. pitch_mm: of the skin; a simulated one's is known. tare: the unloaded skin [R, C]
-    where digits are not counted from it.
+    contact: the bundle's threshold. pitch_mm: of the skin; a simulated one's is known. The digits are taken as the box
+    takes them without a TARE: counted from the unloaded skin.
     The limit keeps 97 % of positions whose own sweeps were left out (their farthest one counts), as known.limit takes
     it; of 33 and less all.
     """
@@ -59,7 +57,7 @@ def place_of(
         pitch_mm = skin.PITCH_MM
     if pitch_mm is None:
         return None
-    tare = np.zeros(sweeps.samples.shape[2:]) if tare is None else tare
+    tare = np.zeros(sweeps.samples.shape[2:])
     found = [centre(window, tare, contact) for window in sweeps.samples]
     touched = np.array([point is not None for point in found])
     if not touched.any():

@@ -12,7 +12,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,11 +23,12 @@ from cuts.scene import ROOT, Play, Point, Scene, stage
 
 SCENES: dict[str, Callable[[Path], Scene]] = {
     "recording": lambda beside: recording.scene(),
-    "black box": lambda beside: black_box.scene(),
+    "palpate-record": lambda beside: recording.palpate(),
+    "black-box": lambda beside: black_box.scene(),
     "delivery": lambda beside: delivery.Shop.opened(beside).scene(),
 }
 """Each gets an empty folder for what it needs."""
-HOWS = ("power", "kill", "kill_then_power")
+HOWS = ("kill", "power", "kill_then_power")
 
 
 def main() -> int:
@@ -35,13 +36,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="cuts", description=__doc__.split("\n\n")[0])
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"from {', '.join(SCENES)}; all by default")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "cuts.jsonl", help="points (%(default)s)")
+    parser.add_argument(
+        "--twice", action="store_true", help="also kill each command and start it again, and then cut the power (hours)"
+    )
     given = parser.parse_args()
     if wrong := set(given.scenes) - set(SCENES):
         parser.error(f"no scene {', '.join(sorted(wrong))}; there are {', '.join(SCENES)}")
     ledger = Ledger(given.out)
     for name in given.scenes or SCENES:
         with TemporaryDirectory(prefix="cuts-") as beside:
-            for point in cut(SCENES[name](Path(beside)), ledger):
+            for point in cut(SCENES[name](Path(beside)), ledger, HOWS if given.twice else HOWS[:2]):
                 print(".", end="", flush=True)
                 for wrong in point.wrong:
                     print(f"\n{point.scene}: {point.step}: {point.how} before {point.call}: {wrong}", flush=True)
@@ -88,12 +92,12 @@ def _head() -> dict[str, str]:
     }  # fmt: skip
 
 
-def cut(scene: Scene, ledger: Ledger) -> Iterator[Point]:
-    """All points of a scene that are not in the ledger yet; each is written down."""
+def cut(scene: Scene, ledger: Ledger, hows: Sequence[str] = HOWS) -> Iterator[Point]:
+    """All points of a scene that are not in the ledger yet, cut in these ways; each is written down."""
     done = {(point.step, point.how, point.moment) for point in ledger.points(scene.name)}
     with stage() as work:
         play = Play(scene, Path(work))
-        for how in HOWS:
+        for how in hows:
             for moment in play.moments():
                 at = scene.steps[moment.step].name, how, moment.number
                 if at not in done and (moment.call or how == "power"):

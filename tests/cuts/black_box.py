@@ -59,7 +59,7 @@ def scene() -> Scene:
     def step(name: str) -> Step:
         return Step(name, lambda folder: [sys.executable, "-m", "cuts.black_box", folder / recording.KEPT])
 
-    return Scene("black box", lambda folder: None, (step("first"), step("second")), judge)
+    return Scene("black-box", lambda folder: None, (step("first"), step("second")), judge)
 
 
 if __name__ == "__main__":

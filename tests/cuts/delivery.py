@@ -1,8 +1,7 @@
 """Delivery, cut short. In: signed bundles that are copied to the box, taken, started, committed and left again. Out: a
 scene, whose judge finds each box that does not come back with the old bundle or the new one, whole.
 
-`python -m cuts.delivery copy FROM TO` is what copies a bundle to the box: it syncs nothing. `python -m cuts.delivery WAY
-ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is wrong on purpose.
+`python -m cuts.delivery WAY ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is wrong on purpose.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from subprocess import run
 
 from appliance import bundle, disk, signature
 from appliance.__main__ import main
-from appliance.ledger import Ledger
 from appliance.manifest import SCHEMA
 from appliance.shelf import Shelf, Signed
 from appliance.trial import Trial
@@ -34,7 +32,14 @@ ANSWER = re.compile(r"\$PPLP,RES,\d+,[\d.]+,(?:ok|unsure|undecided),(?:[^,]*,){6
 PROMISE = re.compile(r"bundle ([0-9a-f]{8}) (?:is accepted; it )?runs (?:on trial )?from the next start on.*")
 DIED = 3
 NAMES = ("packaged", "first", "second", "third", "fourth", "last")
-SIMULATED = ("--sim", "skin", "--virtual", "--sweeps")
+START = ("run", "--sim", "skin", "--virtual", "--sweeps", "1")
+START_AND_COMMIT = (*START[:-1], str(PROBATION))
+COPY = """
+import shutil, sys; from pathlib import Path; old, new = map(Path, sys.argv[1:])
+shutil.rmtree(new, ignore_errors=True); new.mkdir()
+for path in sorted(old.iterdir()): (new / path.name).write_bytes(path.read_bytes())
+"""
+"""Somebody's program that copies a bundle to the box, in place of what an earlier attempt left; it syncs nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,36 +80,43 @@ class Shop:
 
     def copy(self, name: str) -> Step:
         """Somebody copies a bundle to the box."""
-        command = [sys.executable, "-m", "cuts.delivery", "copy", self.at(name)]
+        command = [sys.executable, "-S", "-c", COPY, self.at(name)]
         return Step(f"copy {name}", lambda folder: [*command, folder / INCOMING / name])
 
     def story(self) -> Iterator[tuple[str, Step]]:
         """What happens to a box; before each command, which bundles may run if that is cut short."""
-        do, once, often = self.palpate, ("run", *SIMULATED, "1"), ("run", *SIMULATED, str(PROBATION))
+        do = self.palpate
         yield "packaged", self.copy("first")
         yield "packaged first", do("accept the first ever", "accept", "@first")
-        yield "first", do("start and commit it", *often)
+        yield "first", do("start and commit it", *START_AND_COMMIT)
         yield "first", self.copy("second")
         yield "first second", do("accept another", "accept", "@second")
-        yield "second", do("start it, end in order", *once)
-        yield "second", do("start and commit it again", *often)
+        yield "second", do("start it, end in order", *START)
+        yield "second", do("start and commit it again", *START_AND_COMMIT)
         yield "second", self.copy("third")
         yield "second third", do("accept one that will crash", "accept", "@third")
-        yield "third", do("start it, crash", *once, way="crash")
-        yield "third", do("start it, crash again", *once, way="crash")
-        yield "second third", do("start it, crash a third time", *once, way="crash")
-        yield "second", do("start a fourth time", *once)
+        yield "third", do("start it, crash", *START, way="crash")
+        yield "third", do("start it, crash again", *START, way="crash")
+        yield "second third", do("start it, crash a third time", *START, way="crash")
+        yield "second", do("start a fourth time", *START)
         yield "second first", do("roll back", "rollback")
-        yield "first", do("start after rolling back", *once)
+        yield "first", do("start after rolling back", *START)
         yield "first second", do("roll forward", "rollback")
         yield "second", self.copy("fourth")
         yield "second", do("accept as the candidate", "accept", "--shadow", "@fourth")
         yield "second fourth", do("promote the candidate", "promote")
         yield "fourth", do("commit it by hand", "commit")
 
-    def scene(self, way: str = "") -> Scene:
-        """The story, each command of which is cut short; way: no more of it than an accept, in one of WAYS."""
-        told = list(self.story())
+    def scene(self) -> Scene:
+        """The story, each command of which is cut short."""
+        return self._scene(_bare, list(self.story()))
+
+    def alone(self, way: str) -> Scene:
+        """Nothing but an accept, in one of WAYS, on a box that runs the first bundle."""
+        step = self.palpate("accept another", "accept", str(self.at("second")), way=way)
+        return self._scene(self._delivered, [("first second", step)])
+
+    def _scene(self, prepare: Callable[[Path], None], told: list[tuple[str, Step]]) -> Scene:
         may = {step.name: names.split() for names, step in told}
         ids = {name: bundle.load(self.at(name)).id for name in NAMES}
 
@@ -112,15 +124,12 @@ class Shop:
             ran = {found.heard} if found.heard else {ids[name] for name in may[found.step]}
             return self._comes_back(found.folder, ran) or self._takes_another(found.folder, ids["last"])
 
-        if way:
-            steps: tuple[Step, ...] = (self.palpate("accept another", "accept", str(self.at("second")), way=way),)
-            return Scene("delivery", self._delivered, steps, judge, APART, _promised)
-        return Scene("delivery", _bare, tuple(step for _, step in told), judge, APART, _promised)
+        return Scene("delivery", prepare, tuple(step for _, step in told), judge, APART, _promised)
 
     def _delivered(self, folder: Path) -> None:
         """A box that runs the first bundle."""
         _bare(folder)
-        for words in (("accept", self.at("first")), ("run", *SIMULATED, str(PROBATION))):
+        for words in (("accept", self.at("first")), START_AND_COMMIT):
             code, said = _apart(self.words(folder, *words))
             if code:
                 raise NotFollowed(f"{words[0]} ended with {code}: {_end(said)}")
@@ -130,10 +139,10 @@ class Shop:
         return [wrong for time in ("first", "second") for wrong in self._answers(folder, f"{time} start", ids)]
 
     def _answers(self, folder: Path, when: str, ids: set[str]) -> list[str]:
-        code, said = _apart(self.words(folder, "run", *SIMULATED, str(PROBATION)))
+        code, said = _apart(self.words(folder, *START))
         names = ANSWER.findall(said)
-        if code or len(names) != PROBATION or not set(names) <= ids:
-            return [f"{when}: exit code {code}, answers by {set(names)} instead of {ids}: {_end(said)}"]
+        if code or len(names) != 1 or not set(names) <= ids:
+            return [f"{when}: exit code {code}, answers by {names} instead of {sorted(ids)}: {_end(said)}"]
         return []
 
     def _takes_another(self, folder: Path, last: str) -> list[str]:
@@ -179,14 +188,6 @@ def _apart(words: list[str]) -> tuple[int, str]:
         return os.waitstatus_to_exitcode(status), file.read().decode("utf-8", "replace")
 
 
-def copy(from_: Path, to: Path) -> None:
-    """Copy a bundle with plain writes, in place of what is left of an earlier attempt."""
-    shutil.rmtree(to, ignore_errors=True)
-    to.mkdir()
-    for path in sorted(from_.iterdir()):
-        (to / path.name).write_bytes(path.read_bytes())
-
-
 def _gone_for_a_moment(path: Path, target: str) -> None:
     path.unlink(missing_ok=True)
     path.symlink_to(target)
@@ -204,7 +205,6 @@ WAYS: dict[str, tuple[object, str, Callable[..., object]]] = {
     "right": (disk, "put", disk.put),
     "the link is gone for a moment": (disk, "link", _gone_for_a_moment),
     "the ledger in place": (disk, "put", Path.write_bytes),
-    "the link first": (Ledger, "activated", lambda self, sha, counter, now: self),
     "nothing synced": (disk, "sync", lambda path: None),
     "bundles copied": (Shelf, "put", _copied),
 }
@@ -212,9 +212,5 @@ WAYS: dict[str, tuple[object, str, Callable[..., object]]] = {
 
 
 if __name__ == "__main__":
-    way, *words = sys.argv[1:]
-    if way == "copy":
-        copy(Path(words[0]), Path(words[1]))
-    else:
-        setattr(*WAYS[way])
-        sys.exit(main(words))
+    setattr(*WAYS[sys.argv[1]])
+    sys.exit(main(sys.argv[2:]))

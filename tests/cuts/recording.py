@@ -26,7 +26,7 @@ FORMAT = SweepFormat(4, 4, 750, 40, "uint8")
 KEPT = "kept/sweeps"
 """Below the folder of the scene, and not there at first: who makes it has to sync that, too."""
 HEARD = re.compile(
-    r",REC,\d+,stored,(?:[^,]*,){3}(?P<session>[^,]*),(?P<name>sweep-\d+)|^(?P<how>discard\w+) (?P<gone>\S+)",
+    r",REC,(?P<id>\d+),stored,(?:[^,]*,){3}(?P<session>[^,]*),(?P<name>sweep-\d+)|^(?P<how>discard\w+) (?P<gone>\S+)",
     re.MULTILINE,
 )
 Files = Mapping[Path, bytes]
@@ -35,19 +35,21 @@ Files = Mapping[Path, bytes]
 def record(way: str, folder: Path, session: str) -> None:
     """Record two sweeps, discard the second, record a third; way: how the files get onto the disk."""
     disk.put_all = WAYS[way]
-    running = recording(folder, session, lambda line: print(line.decode().strip(), flush=True), sys.exit)
+    running = recording(folder, session, lambda line: print(line.decode().strip(), flush=True))
     running.keep(*taken(1))
     running.keep(*taken(2))
     print(f"discarding {max(folder.glob('*.npy')).stem}", flush=True)
     print(f"discarded {running.commands['DISCARD']('')[-1]}", flush=True)
     running.keep(*taken(3))
+    if running.stored != 2:
+        sys.exit(f"{running.stored} sweeps are stored instead of 2")
     running.close()
 
 
-def recording(folder: Path, session: str, say: Callable[[bytes], None], log: Callable[[str], None]) -> Recording:
+def recording(folder: Path, session: str, say: Callable[[bytes], None]) -> Recording:
     """The box's keeper of sweeps."""
     labels = Labels("plastic rough", "1", session)
-    return Recording(folder, FORMAT, labels, SystemClock(), circumstances=dict, say=say, log=log)
+    return Recording(folder, FORMAT, labels, SystemClock(), circumstances=dict, say=say, log=lambda line: None)
 
 
 def taken(number: int) -> tuple[Sweep, Verdict]:
@@ -93,56 +95,54 @@ WAYS: dict[str, Callable[[Files], None]] = {
 def judge(found: Found) -> list[str]:
     """What is wrong with the sweeps that were found, and with what the next run makes of them."""
     folder = found.folder / KEPT
-    wrong, sessions = read(folder)
+    wrong, there = read(folder)
     owed, gone = told(found.heard)
-    for name, session in owed.items():
-        if name not in sessions:
-            wrong.append(f"{name} was stored and is gone")
-        elif sessions[name] != session:
-            wrong.append(f"{name} was stored in session {session} and is one of {sessions[name]}")
-    wrong += [f"{name} was discarded and is there" for name in gone & sessions.keys()]
+    for name, which in owed.items():
+        if there.get(name) != which:
+            wrong.append(f"{name}, {which} was stored, and {there.get(name, 'nothing')} is there")
+    wrong += [f"{name}, {which} was discarded and is there" for name, which in gone.items() if there.get(name) == which]
     return wrong or _goes_on(folder)
 
 
 def read(folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Which sweeps cannot be read; the session of each that can."""
-    wrong, sessions = [], {}
+    """Which sweeps cannot be read; session and number of each that can."""
+    wrong, there = [], {}
     for path in sorted(folder.glob("*.npy")):
         try:
-            sessions[path.stem] = load(path)[0].session
+            sweep = load(path)[0]
         except FormatError as e:
             wrong.append(str(e).replace(f"{folder}/", ""))
-    return wrong, sessions
+        else:
+            there[path.stem] = f"{sweep.session} {sweep.id}"
+    return wrong, there
 
 
-def told(said: str) -> tuple[dict[str, str], set[str]]:
-    """What a robot has heard: sessions of the sweeps that are stored, and the discarded ones. What is being discarded is
-    neither.
+def told(said: str) -> tuple[dict[str, str], dict[str, str]]:
+    """What a robot has heard: session and number of the sweeps that are stored, and of the discarded ones. What is being
+    discarded is neither.
     """
     owed: dict[str, str] = {}
-    gone: set[str] = set()
+    gone: dict[str, str] = {}
+    leaving = ""
     for heard in HEARD.finditer(said):
-        name = heard["name"] or heard["gone"]
-        owed.pop(name, None)
-        gone.discard(name)
         if heard["name"]:
-            owed[name] = heard["session"]
-        elif heard["how"] == "discarded":
-            gone.add(name)
+            owed[heard["name"]] = f"{heard['session']} {heard['id']}"
+        elif heard["how"] == "discarding":
+            leaving = owed.pop(heard["gone"])
+        else:
+            gone[heard["gone"]] = leaving
     return owed, gone
 
 
 def _goes_on(folder: Path) -> list[str]:
     """What the next run does wrong in the folder."""
     before = {path: path.read_bytes() for path in folder.glob("*.npy")}
-    wrong: list[str] = []
-    running = recording(folder, "later", lambda line: None, wrong.append)
+    running = recording(folder, "later", lambda line: None)
     for number in (1, 2):
         running.keep(*taken(number))
     running.close()
-    broken, sessions = read(folder)
-    wrong += broken
-    if list(sessions.values()).count("later") != 2:
+    wrong, there = read(folder)
+    if not {"later 1", "later 2"} <= set(there.values()):
         wrong.append("the next run does not store its two sweeps")
     wrong += [f"the next run leaves {path.name}" for path in folder.glob(f"*{disk.PART}")]
     wrong += [f"the next run changes {path.name}" for path, data in before.items() if path.read_bytes() != data]
@@ -151,11 +151,20 @@ def _goes_on(folder: Path) -> list[str]:
 
 def scene(way: str = "right") -> Scene:
     """Two runs that record, the second one in what the first has left."""
+    return _sessions("recording", lambda kept, name: ["cuts.recording", way, kept, name])
 
+
+def palpate() -> Scene:
+    """The same with the box's command."""
+    words = ("appliance", "record", "--sim", "skin", "--virtual", "--sweeps", "2", "--out")
+    return _sessions("palpate-record", lambda kept, name: [*words, kept, "--session", name])
+
+
+def _sessions(title: str, words: Callable[[Path, str], list[str | Path]]) -> Scene:
     def session(name: str) -> Step:
-        return Step(name, lambda folder: [sys.executable, "-m", "cuts.recording", way, folder / KEPT, name])
+        return Step(name, lambda folder: [sys.executable, "-m", *words(folder / KEPT, name)])
 
-    return Scene("recording", lambda folder: None, (session("first"), session("second")), judge)
+    return Scene(title, lambda folder: None, (session("first"), session("second")), judge)
 
 
 if __name__ == "__main__":
