@@ -56,26 +56,25 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
         command.set_defaults(run=runs[name])
         return command
 
+    _at_work(add, world, some)
+    _by_hand(add, world, some)
+    _of_bundles(add)
+    return parser
+
+
+def _at_work(add: Callable[..., Any], world: argparse.ArgumentParser, some: argparse.ArgumentParser) -> None:
+    """The commands that answer a robot."""
     run = add("run", "classify sweeps until SIGTERM", world, some)
     record = add("record", "the same, and keep each sweep with its label, for training", world, some)
     for command in (run, record):
         command.add_argument("--capture", type=Path, metavar="FILE", help="write all that comes in to FILE, for replay")
         command.add_argument(
-        "--shadow", nargs="?", const="", metavar="DIR",
-        help="classify with the bundle in DIR beside, by default the store's candidate; its answers go nowhere",
-    )  # fmt: skip
+            "--shadow", nargs="?", const="", metavar="DIR",
+            help="classify with the bundle in DIR beside, by default the store's candidate; its answers go nowhere",
+        )  # fmt: skip
     record.add_argument("--out", type=Path, metavar="DIR", help="where to (default: sweeps/ in the store's folder)")
     for name in ("material", "position", "session"):
         record.add_argument(f"--{name}", default="", metavar="TEXT", help="until the serial line says otherwise")
-    place = add("place", "show where the contact lies on the skin, and where it should", world)
-    place.add_argument(
-        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
-        help=f"as a page on localhost as well (default port {WEB_PORT})",
-    )  # fmt: skip
-    place.set_defaults(sweeps=None)
-    demo = add("demo", "watch simulated sweeps being classified", world, some)
-    demo.add_argument("--raw", action="store_true", help="print the sentences alone")
-    add("check", "self-test: bundle, golden sweeps, devices", world, some)
     enrol = add("enrol", "learn one more material from a few sweeps, without training; write a new bundle", world)
     enrol.add_argument("label", metavar="LABEL", help="its name; every sweep from now on is of it")
     enrol.add_argument("--out", type=Path, required=True, metavar="DIR", help="the new bundle's folder")
@@ -85,14 +84,35 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
         help=f"how many good sweeps it takes, 1 to {MOST_SWEEPS} (default 5)",
     )  # fmt: skip
     enrol.set_defaults(sweeps=None)
-    add("replay", "play a capture, a kept sweep or a folder of them through the same rooms").add_argument(
-        "file", type=Path
+
+
+def _by_hand(add: Callable[..., Any], world: argparse.ArgumentParser, some: argparse.ArgumentParser) -> None:
+    """The commands for a person who sets the box up, or looks at it."""
+    add("demo", "watch simulated sweeps being classified", world, some).add_argument(
+        "--raw", action="store_true", help="print the sentences alone"
     )
+    place = add("place", "show where the contact lies on the skin, and where it should", world)
+    place.add_argument(
+        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        help=f"as a page on localhost as well (default port {WEB_PORT})",
+    )  # fmt: skip
+    place.set_defaults(sweeps=None)
+    add("check", "self-test: bundle, golden sweeps, devices", world, some)
+    add("status", "how the service is, and its last verdicts").add_argument("--json", action="store_true")
+    add("replay", "judge a capture, a kept sweep or a folder of them again").add_argument("file", type=Path)
     add("config", "print each value with its source")
-    status = add("status", "how the service is, and its last verdicts")
+    bench = add("bench", "measure latency, memory, start and processor share on this machine")
+    bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
+    bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")
+    bench.add_argument("--yardsticks", type=Path, default=Path("build/yardsticks"), help="fp32.onnx, paper_int8.onnx")
+    bench.add_argument("--part", choices=("memory", "stream"), help="one part alone, as JSON, playing --acts")
+    bench.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
+
+
+def _of_bundles(add: Callable[..., Any]) -> None:
+    """The commands for the bundles in the store."""
     listed = add("bundles", "the bundles on this box: which one runs, and what it goes back to")
-    for command in (status, listed):
-        command.add_argument("--json", action="store_true", help="as JSON")
+    listed.add_argument("--json", action="store_true")
     accept = add("accept", "check the signed bundle in DIR, and have it run on trial from the next start on")
     accept.add_argument("--shadow", action="store_true", help="as the candidate of `run --shadow` instead")
     for command in (accept, add("verify", "check the signed bundle in DIR, and change nothing")):
@@ -100,10 +120,3 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
     add("commit", "end the trial of the bundle that runs: it stays")
     add("rollback", "go back to the bundle before, from the next start on")
     add("promote", "have the candidate run on trial from the next start on")
-    bench = add("bench", "measure latency, memory, start and processor share on this machine")
-    bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
-    bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")
-    bench.add_argument("--yardsticks", type=Path, default=Path("build/yardsticks"), help="fp32.onnx, paper_int8.onnx")
-    bench.add_argument("--part", choices=("memory", "stream"), help="one part alone, as JSON, playing --acts")
-    bench.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
-    return parser

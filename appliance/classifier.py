@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from . import features
@@ -20,6 +19,7 @@ from .errors import BundleError
 from .known import Means
 from .manifest import MEANS, Thresholds
 from .place import moved
+from .session import check_signature, run, session
 from .sweep import Status, Sweep, Verdict
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class Classifier:
         f = bundle.format
         self.tare: NDArray[np.float64] = np.zeros((f.rows, f.cols))
         self._session = session(bundle.model)
-        self._input = _check_signature(self._session, bundle)
+        self._input = check_signature(self._session, bundle)
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
         # onnxruntime computes them all, but makes arrays only of those that are asked for
@@ -211,7 +211,7 @@ class Classifier:
     def _run(self, outputs: list[str], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
         """These outputs of the graph for one window, without the leading 1."""
         given = features.given(self.bundle.manifest.input, taxels, self.bundle.format.rate_hz)
-        return [out[0] for out in self._session.run(outputs, {self._input: given[None]})]
+        return [out[0] for out in run(self._session, outputs, {self._input: given[None]})]
 
     def _look(self, taxels: NDArray[Any]) -> tuple[NDArray[np.float32], str]:
         """Logits [K] of one window, and how strange it is: "" where it looks like a material that is known."""
@@ -243,58 +243,3 @@ class Classifier:
             latency_ns=now - sweep.complete_ns, bundle=self.bundle.id,
             detail="; ".join(filter(None, (moved, finding.detail))), share=sweep.share, own=own, moved=moved,
         )  # fmt: skip
-
-
-def session(model: bytes) -> ort.InferenceSession:
-    """One thread, no spinning, errors only, telemetry off: a quiet session that leaves the core to the sensor."""
-    ort.disable_telemetry_events()
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 3
-    options.enable_cpu_mem_arena = False
-    try:
-        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as e:  # onnxruntime raises its own classes, which share no base but Exception
-        raise BundleError(f"onnxruntime {ort.__version__} refuses the model: {str(e).strip()[:200]}") from e
-
-
-def _check_signature(run: ort.InferenceSession, bundle: Bundle) -> str:
-    """The name of the one input, after all shapes and types were compared with the manifest."""
-    m, f = bundle.manifest, bundle.format
-    if m.input == "raw":
-        tensor = {
-            "uint8": "tensor(uint8)",
-            "int16": "tensor(int16)",
-            "uint16": "tensor(uint16)",
-            "float32": "tensor(float)",
-        }
-        want = [([1, f.window, f.rows, f.cols], tensor[f.dtype])]
-    else:
-        want = [([1, len(features.compute(m.input, bundle.golden[0], f.rate_hz))], "tensor(float)")]
-    have = [(i.shape, i.type) for i in run.get_inputs()]
-    if have != want:
-        raise BundleError(f"the model takes {have}; the manifest asks for {want}")
-    gives = {o.name: (o.shape, o.type) for o in run.get_outputs()}
-    trained = len(m.labels) - len(bundle.enrolled)
-    forms: dict[str, list[int | None]] = {  # None: any number
-        "logits": [1, trained],
-        "early": [1, len(m.early.least) if m.early else None, trained],
-        "embedding": [1, bundle.classes.means.shape[1] if bundle.classes else None],
-    }
-    needed = {"logits"} | ({"early"} if m.early else set()) | ({"embedding"} if m.known else set())
-    if not needed <= gives.keys() <= forms.keys() or not all(_fits(gives[name], forms[name]) for name in gives):
-        raise BundleError(
-            f"the model gives {gives}; the manifest asks for {', '.join(sorted(needed))} and allows "
-            f"{forms} of tensor(float): export the bundle again"
-        )
-    name: str = run.get_inputs()[0].name
-    return name
-
-
-def _fits(has: tuple[list[Any], str], form: list[int | None]) -> bool:
-    """Whether an output has this shape, None standing for any number."""
-    shape, kind = has
-    if kind != "tensor(float)" or len(shape) != len(form):
-        return False
-    return all(type(n) is int and n > 0 and want in (None, n) for n, want in zip(shape, form, strict=True))

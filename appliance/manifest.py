@@ -25,7 +25,7 @@ INPUTS = ("raw", *features.KINDS)
 LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
 """What a label may look like: it travels in a sentence, so no comma, star or dollar, and at most 24 characters."""
 MOST_BYTES = 64 << 20
-"""Of one file. The largest of our own, the paper's network in int8, takes 2 MB; the box's memory is limited to 128 MB."""
+"""Of one file. The largest of our own, the paper's network in int8, takes 16 MB; the box's memory is limited to 128 MB."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
 

@@ -50,10 +50,10 @@ class Failed(Exception):
 
 
 class Box:
-    """One box, while it is worked on. `told` is what the outcome is, beside its line."""
+    """One box, while it is worked on. `told` is what the outcome is, beside its line. verbose: tells each step."""
 
-    def __init__(self, host: Host) -> None:
-        self._host = host
+    def __init__(self, host: Host, verbose: bool) -> None:
+        self._host, self._verbose = host, verbose
         self.name: str = host.name
         self.told: dict[str, Any] = {}
 
@@ -69,6 +69,8 @@ class Box:
         """What a command prints, run by the shell of the login user or of `user`, with a file of the login user's home
         as its input. Raises Failed, with `what` and the last line that it said, where it does not succeed in time.
         """
+        if self._verbose:
+            self.say(what)
         if user:
             command = f"sudo -n -H -u {user} -- sh -c {shlex.quote(command)}"
         if stdin:
@@ -136,6 +138,7 @@ def options(about: str, limit_s: int) -> argparse.ArgumentParser:
     parser.add_argument(
         "--limit", type=int, default=limit_s, metavar="SECONDS", help=f"for all of one box (default {limit_s})"
     )
+    parser.add_argument("-v", "--verbose", action="store_true", help="tell each step")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what became of each box to FILE")
     return parser
 
@@ -151,7 +154,7 @@ def each(args: argparse.Namespace, work: Callable[[Box], str]) -> int:
     told: dict[str, dict[str, Any]] = {}
 
     def one(host: Host) -> None:
-        box = Box(host)
+        box = Box(host, args.verbose)
         try:
             with gevent.Timeout(args.limit):  # no Exception: nothing on the way takes it for one that it may try again
                 host.connect(show_errors=False, raise_exceptions=True)

@@ -27,8 +27,8 @@ from mutants import Own, mutated, own_models
 
 from appliance import disk, graph
 from appliance.bundle import Manifest, Thresholds
-from appliance.classifier import session
 from appliance.errors import BundleError
+from appliance.session import session
 from train.score import provenance
 
 DEADLINE_S = 10.0

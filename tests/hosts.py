@@ -175,13 +175,13 @@ class Hosts:
             env=os.environ | {"HOME": str(self.work)}, capture_output=True, text=True, timeout=limit_s, check=False,
         )  # fmt: skip
 
-    def cut(self, command: str, *args: str | Path, said: str = "", after_s: float = 0.0) -> None:
+    def cut(self, command: str, *args: str | Path, said: str, after_s: float) -> None:
         """The same, killed so long after it has said something."""
         with subprocess.Popen(
             [sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
             env=os.environ | {"HOME": str(self.work)}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         ) as process:  # fmt: skip
-            while said and said not in (line := process.stderr.readline()):
+            while said not in (line := process.stderr.readline()):
                 if not line:
                     raise AssertionError(f"ended without {said!r}")
             time.sleep(after_s)

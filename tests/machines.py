@@ -167,7 +167,7 @@ def work(given: Path, told: Path) -> None:
     """
     import numpy as np
 
-    from appliance import bundle, classifier, clock
+    from appliance import bundle, classifier, clock, session
 
     said = {}
     for path in sorted(given.iterdir()):
@@ -177,7 +177,7 @@ def work(given: Path, told: Path) -> None:
             said[f"{path.name}/golden"] = np.stack([box.logits(sweep) for sweep in box.bundle.golden])
             said[f"{path.name}/sweeps"] = np.stack([box.logits(sweep) for sweep in sweeps])
         if (path / "shown.onnx").exists():
-            shown = classifier.session((path / "shown.onnx").read_bytes())
+            shown = session.session((path / "shown.onnx").read_bytes())
             each = [shown.run(None, {shown.get_inputs()[0].name: sweep[None]}) for sweep in sweeps]
             said[f"{path.name}/shown"] = np.stack([np.concatenate([x.ravel() for x in one]) for one in each])
     np.savez(told, **said)

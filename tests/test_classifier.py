@@ -228,7 +228,7 @@ def test_altered_and_missing_files_are_named(tmp_path: Path, name: str):
         ({"files": {}, "early": None, "known": None}, "does not name model.onnx"),
         ({"format": {"rows": 4}}, "manifest cannot be read"),
         ({"extra": 1}, "extra"),
-        ({"labels": ["a", "b"]}, "logits"),
+        ({"labels": ["a", "b"]}, "6 materials apart, the manifest has 2 labels"),
     ],
 )
 def test_broken_manifests_are_named(tmp_path: Path, changes: dict, hint: str):

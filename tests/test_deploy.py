@@ -310,13 +310,23 @@ def test_a_bundle_of_a_stranger_is_refused(
     assert sha(bundle) not in listed(host)
 
 
-@pytest.mark.parametrize("after_s", [0.7, 1.0, 1.3, 1.6, 1.9])
+@pytest.mark.parametrize(
+    ("said", "after_s"),
+    [
+        ("settings", 0.0),
+        ("copying", 0.0),
+        ("checking", 0.0),
+        ("checking", 0.3),
+        ("restarting", 0.0),
+        ("restarting", 0.5),
+    ],
+)
 def test_a_delivery_that_is_cut_leaves_old_or_new(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, after_s: float
+    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, said: str, after_s: float
 ):
     """The desktop dies at any time and the box is started again: it serves the one or the other; then the same again."""
     bundle, before = sender.made(), serves(host)
-    place.cut("deploy", *at, bundle, after_s=after_s)
+    place.cut("deploy", *at, bundle, "--verbose", said=said, after_s=after_s)
     start_again(host)
     assert serves(host) in (before, sha(bundle)[:8])
     done = place.desktop("deploy", *at, bundle)

@@ -24,8 +24,8 @@ from grown import FORM, grown
 
 from appliance import bundle, graph, onnx_file
 from appliance.bundle import Manifest, Thresholds
-from appliance.classifier import session
 from appliance.errors import BundleError
+from appliance.session import session
 
 HOSTILE = hostile.every()
 MANIFEST = Manifest("hostile", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255), {})

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from test_sets import easy
 
-from appliance.classifier import session, softmax
+from appliance.classifier import softmax
 from appliance.errors import FormatError
+from appliance.session import session
 from appliance.sweep import SweepFormat
 from train import graphs, headed, minirocket
 from train.sets import SweepSet

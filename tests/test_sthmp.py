@@ -9,8 +9,9 @@ import pytest
 from sklearn.linear_model import orthogonal_mp
 from test_sets import easy
 
-from appliance.classifier import session, softmax
+from appliance.classifier import softmax
 from appliance.errors import FormatError
+from appliance.session import session
 from appliance.sweep import SweepFormat
 from train import graphs, sthmp
 from train.sets import SweepSet

@@ -123,7 +123,9 @@ def _add_bundles(add: Add) -> None:
         command.add_argument("--version", required=True)
         command.add_argument("--full-scale", type=float, help="the sensor's highest digit (default: its type's)")
         command.add_argument(
-            "--pitch-mm", type=float, help="from taxel to taxel; without it `palpate place` knows no mm"
+            "--pitch-mm",
+            type=float,
+            help="from taxel to taxel; without it `palpate place` knows no mm (a simulated skin's is known)",
         )
     three = add("yardsticks", run_yardsticks, "write the models that palpate bench times beside the bundle")
     three.add_argument("--out", type=Path, required=True, metavar="DIR")

@@ -29,8 +29,9 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from appliance.classifier import LEAST_PROBABILITY, session
+from appliance.classifier import LEAST_PROBABILITY
 from appliance.errors import FormatError
+from appliance.session import session
 
 from .graphs import IR, OPSET, Graph
 from .heads import temperature

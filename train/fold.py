@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance import features, related, series
-from appliance.classifier import session
 from appliance.errors import FormatError
+from appliance.session import session
 
 from . import methods
 from .sets import SweepSet

@@ -14,7 +14,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from appliance.classifier import session
+from appliance.session import session
 from appliance.sweep import SweepFormat
 
 TENSOR = {

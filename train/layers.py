@@ -14,7 +14,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import numpy_helper
 
-from appliance.classifier import session
+from appliance.session import session
 
 Array = NDArray[Any]
 PERCENTILES = (0.1, 50.0, 99.9, 100.0)

@@ -24,9 +24,10 @@ import numpy as np
 import onnxruntime as ort
 
 from ..bundle import Bundle
-from ..classifier import Classifier, session
+from ..classifier import Classifier
 from ..clock import Clock, SystemClock
 from ..errors import BundleError
+from ..session import session
 from ..sweep import Status, Sweep, SweepFormat, Verdict
 from . import parts, rig, script, skin, stage
 from .parts import Build, drain
