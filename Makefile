@@ -7,7 +7,7 @@ RUNTIME := $(VENV)/runtime.done
 DESKTOP := $(VENV)/desktop.done
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz \
+.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile \
   wheel lock clean
 
 help: ## this list
@@ -32,10 +32,10 @@ rig-shell: rig-tools ## a shell in the virtual box
 test-rig: rig-tools ## the tests on the virtual box; COUNTS=full: as often as the report says (hours), ONLY=FILE: a part
 	PALPATE_RIG=$(or $(COUNTS),quick) $(BIN)/python -m pytest -q $(or $(ONLY),tests/rig)
 
-systemd: $(DESKTOP) ## the unit under a real systemd, in a container (as root; gets a Debian of 370 MB, once)
+systemd: $(DESKTOP) ## the unit under a real systemd, in a container (as root; gets a Debian of 380 MB, once)
 	@{ command -v systemd-nspawn && command -v mmdebstrap; } >/dev/null || \
 	  apt-get install -y -q --no-install-recommends systemd-container mmdebstrap
-	PALPATE_SYSTEMD=1 $(BIN)/python -m pytest -q -rP tests/test_systemd.py
+	PALPATE_SYSTEMD=1 $(BIN)/python -m pytest -q -rP tests/test_systemd.py tests/test_systemd_trial.py
 
 soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box and on this machine: docs/soak/
 	$(RIG) build
@@ -51,6 +51,10 @@ rig-ground: rig-tools
 rig-tools: $(DESKTOP)
 	@lacking=`$(RIG) lacking`; [ -z "$$lacking" ] || { echo "installing $$lacking"; \
 	  $$( [ `id -u` = 0 ] || echo sudo ) apt-get install -y -q --no-install-recommends $$lacking; }
+
+hostile: $(DESKTOP) ## models that mean harm, COUNT=10000 of them, through the box's check and onnxruntime
+	@mkdir -p build
+	PYTHONPATH=tests:. nice $(BIN)/python tests/hostile_fuzz.py --count $(or $(COUNT),10000) --seed 1 --out build/hostile.json
 
 fuzz: $(DESKTOP) ## fuzz all that comes from outside: MINUTES=10 of processor time each, TARGETS= some of them
 	$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install atheris==3.0.0

@@ -115,12 +115,12 @@ def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
     sound(box)
     before, used = files(box), used_k(box)
     pages = (used - empty) // 4  # of a whole sweep; with one less it does not fit
-    rooms = [*(range(pages) if HOW == "full" else [pages - 1]), -1]
+    rooms, first = [*(range(pages) if HOW == "full" else [pages - 1]), -1], 0
     for n in rooms:
         room = (f"{used + 4 * n}k", 1000) if n >= 0 else ("1m", 1 + len(before))
         box.machine.run(ROOM.format(*room, KEPT), check=True)
         answer = sound(box)
-        first = answer.sweep if n == rooms[0] else first
+        first = first or answer.sweep
         assert said(box, f"record: sweep {first} is not stored: ") == 1
         assert files(box) == before
     box.machine.run(ROOM.format("1m", 1000, KEPT), check=True)
