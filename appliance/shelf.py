@@ -68,6 +68,7 @@ class Shelf:
         """Have a bundle on the disk, whole or not at all. Raises OSError."""
         folder = self.at(held.sha)
         if folder.exists() and _holds(folder, held.files):
+            disk.sync(self.folder)  # who gave it its name may have been killed before this
             return
         with disk.folder(folder) as new:
             for name, data in held.files.items():
