@@ -4,11 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 RUNTIME := $(VENV)/runtime.done
+FLEET := $(VENV)/fleet.done
 DESKTOP := $(VENV)/desktop.done
+WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile \
-  wheel lock clean
+  deploy install wheel lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -85,7 +87,14 @@ chart: $(DESKTOP) ## speed against accuracy: docs/chart/ (goes on where it was i
 paper: $(DESKTOP) ## the paper's experiment, run again: docs/paper/ (goes on where it was interrupted)
 	$(BIN)/palpate-train paper $(PAPER)
 
-wheel: $(DESKTOP) ## build the wheel of the box into dist/
+deploy: $(FLEET) ## put a signed BUNDLE= on a box, HOST=user@box, or on many, HOSTS=inventory.py; SHADOW=1: as the candidate
+	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(SIGNERS)) $(if $(SHADOW),--shadow) \
+	  $(or $(BUNDLE),$(error name the bundle with BUNDLE=its folder))
+
+install: $(FLEET) wheel ## install or upgrade bare Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE of whose bundles it takes
+	$(BIN)/python systemd/install.py $(WHERE) $(if $(BOARD),--board $(BOARD)) $(if $(SIGNERS),--signers $(SIGNERS))
+
+wheel: $(RUNTIME) ## build the wheel of the box into dist/
 	rm -rf build/lib build/bdist.* # setuptools would put what an older build left behind into the wheel
 	$(PIP) wheel --no-deps -w dist .
 
@@ -104,6 +113,11 @@ $(RUNTIME): appliance/requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install --require-hashes -r appliance/requirements.lock
 	$(PIP) install --no-deps -e .
+	@touch $@
+
+# The same with what reaches boxes.
+$(FLEET): $(RUNTIME)
+	$(PIP) install -e '.[deploy]'
 	@touch $@
 
 # The same with the desktop's pinned tools: tests, training, export.

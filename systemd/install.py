@@ -34,6 +34,7 @@ PLACES = {
     },
     "docs/manual.md": "/usr/share/doc/palpate/manual.md",
     "docs/manual": "/usr/share/doc/palpate/manual",
+    "docs/place/page.png": "/usr/share/doc/palpate/place/page.png",
     "firmware_config/PROTOCOL.md": "/usr/share/doc/palpate/PROTOCOL.md",
 }
 """Files of this checkout, and where a box looks for them."""
@@ -105,7 +106,7 @@ def survey(box: Box) -> str:
     # systemd reads units before it mounts anything, and the unit lies in the release
     if box.run("looking at /opt", "stat -c %m /opt") != "/":
         raise Failed("/opt is a file system of its own there; it must be part of the root file system")
-    if box.run("looking at /opt", f"test -e {HERE} && test ! -L {HERE} && echo folder || true"):
+    if box.run(f"looking at {HERE}", f"test -e {HERE} && test ! -L {HERE} && echo folder || true"):
         raise Failed(f"{HERE} is a folder there, not the link that this command swaps; move it away first")
     return MACHINES[arch]
 

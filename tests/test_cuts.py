@@ -4,13 +4,15 @@ finds what is wrong on purpose.
 
 from __future__ import annotations
 
+import re
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from cuts import __main__ as campaign
-from cuts import black_box, calls, recording, scene, tree
+from cuts import black_box, calls, delivery, recording, scene, tree
 from cuts.calls import NotFollowed
 from cuts.scene import Found, Play, Point, Scene, Step
 
@@ -162,6 +164,43 @@ def test_the_black_box_loses_no_more_than_the_sweep_in_progress(work: Path):
     assert wrong([played.power(moment) for moment in played.moments()]) == []
 
 
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory: pytest.TempPathFactory) -> delivery.Shop:
+    """Signed bundles, and a file of whom the box believes."""
+    if not shutil.which("ssh-keygen"):
+        pytest.skip("needs ssh-keygen (apt-get install openssh-client)")
+    return delivery.Shop.opened(tmp_path_factory.mktemp("shop"))
+
+
+def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: delivery.Shop, work: Path):
+    """Killed, or the power cut, before each renaming of an accept: the box starts, answers, and takes the next bundle."""
+    played = Play(shop.alone("right"), work)
+    points = [
+        how(moment) for moment in played.moments() if moment.call and moment.call.name.startswith("rename")
+        for how in (played.power, played.kill)
+    ]  # fmt: skip
+    assert [point.call.split("/")[-1] for point in points[::2]][1:] == ["ledger.json", "current"]
+    assert wrong(points) == []
+
+
+@pytest.mark.parametrize(
+    ("way", "call", "what"),
+    [
+        ("the link is gone for a moment", "symlink", r"first start: exit code 0, answers by \['\w+'\] instead"),
+        ("the ledger in place", "write", r"first start: exit code 78, .*ledger.json cannot be read"),
+    ],
+    ids=["link", "ledger"],
+)
+def test_deliveries_that_are_wrong_are_found(shop: delivery.Shop, work: Path, way: str, call: str, what: str):
+    """A store that is neither old nor new for a moment: a kill there finds it."""
+    played = Play(shop.alone(way), work)
+    (moment,) = [
+        m for m in played.moments()
+        if m.call and m.call.name == call and m.call.paths[0].endswith(("/current", "/ledger.json"))
+    ]  # fmt: skip
+    assert re.search(what, str(played.kill(moment).wrong))
+
+
 def test_a_campaign_goes_on_where_it_was_broken_off(work: Path, monkeypatch: pytest.MonkeyPatch):
     """Points that are in the file are not cut again, half a line there is; after a change of the box all of them are."""
     code = "import sys; from pathlib import Path; (Path(sys.argv[1]) / 'a').write_bytes(b'1')"
@@ -172,13 +211,14 @@ def test_a_campaign_goes_on_where_it_was_broken_off(work: Path, monkeypatch: pyt
     file = work / "cuts.jsonl"
     points = list(campaign.cut(lines, campaign.Ledger(file)))
     assert [(p.how, p.moment, p.states, bool(p.wrong)) for p in points] == [
-        ("power", 0, 1, True), ("power", 1, 2, True), ("power", 2, 4, True), ("kill", 0, 1, True), ("kill", 1, 1, False),
+        ("kill", 0, 1, True), ("kill", 1, 1, False), ("power", 0, 1, True), ("power", 1, 2, True), ("power", 2, 4, True),
         ("kill_then_power", 0, 7, True), ("kill_then_power", 1, 6, True),
     ]  # fmt: skip
     assert list(campaign.cut(lines, campaign.Ledger(file))) == []
     assert campaign.Ledger(file).points() == points
     file.write_text(file.read_text()[:-9])
     assert list(campaign.cut(lines, campaign.Ledger(file))) == points[-1:]
+    assert campaign.Ledger(file).points() == points
     monkeypatch.setattr(campaign, "_head", lambda: {"source": "another"})
     assert campaign.Ledger(file).points() == []
-    assert list(campaign.figures(points))[-1].startswith("all: power at 3 moments, 7 folders, wrong 3; kill at 2")
+    assert list(campaign.figures(points))[-1].startswith("all: kill at 2 moments, 2 folders, wrong 1; power at 3")

@@ -155,6 +155,24 @@ def test_a_box_without_packages_and_mirror_is_told_so(place: hosts.Hosts, wheel:
     assert machine.get("ls", "/opt") == ""
 
 
+def test_what_a_person_put_there_stays(place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
+    """Settings of their own go before the release's, and are named; a program in the way ends it, before anything else."""
+    settings, program, pid = "/etc/palpate/sensor.toml", "/usr/local/bin/palpate", host.service["MainPID"]
+    for path in (settings, program):
+        host.machine.get("rm", path)
+        host.machine.put(path, "# mine\n")
+    done = place.desktop("install", *at, "--wheel", wheel)
+    assert done.returncode == 1
+    assert f"FAILED: users, folders and settings: {program} is a file there, not a link; move it away" in done.stdout
+    host.machine.get("rm", program)
+    done = place.desktop("install", *at, "--wheel", wheel)
+    assert done.returncode == 0
+    assert f"{settings} stays as it is there" in done.stderr
+    assert host.machine.get("cat", settings) == "# mine"
+    assert host.service["MainPID"] == pid
+    host.machine.get("rm", settings)
+
+
 @pytest.fixture(scope="session")
 def upgraded(
     place: hosts.Hosts, installed: str, wheel: Path, tmp_path_factory: pytest.TempPathFactory
@@ -420,38 +438,35 @@ def test_a_user_who_needs_a_password_for_sudo_is_told(
 
 
 def test_another_system_is_told_what_is_needed():
-    """Not Debian, another architecture, an old Python, no sudo, an /opt of its own: a line that says what to do."""
+    """Not Debian, another architecture, an /opt of its own, an old Python: a line that says what to do."""
     code = """
 import install
 class Box:
     def __init__(self, **said): self.said = {"looking at its system": "Debian\\namd64", "looking at /opt": "/"} | said
     def run(self, what, command, **how): return self.said.get(what, "")
+    def say(self, text): pass
 for said in ({"looking at its system": "Alpine Linux v3.19\\n"}, {"looking at its system": "Raspbian 11\\narmhf"},
-             {"looking at /opt": "/opt"}):
-    try: install.survey(Box(**said))
+             {"looking at /opt": "/opt"}, {"asking for Python": "3.9.2"}):
+    try: install.install(Box(**said), None, "", "")
     except install.Failed as e: print(e)
 """
     assert desk(code).splitlines() == [
         "its system is Alpine Linux v3.19, not Debian; Palpate needs Debian 12 for arm64 or amd64",
         "its system is Raspbian 11, armhf; Palpate needs Debian 12 for arm64 or amd64",
         "/opt is a file system of its own there; it must be part of the root file system",
+        "its Python is 3.9.2; Palpate needs 3.11 or later, which Debian 12 has",
     ]
 
 
-@pytest.mark.parametrize(
-    ("text", "data"),
-    [
-        ("pi@box", "{'ssh_user': 'pi', 'ssh_hostname': 'box'}"),
-        ("Box.lab:2222", "{'ssh_hostname': 'Box.lab', 'ssh_port': '2222'}"),
-        ("pi@[fe80::1]:22", "{'ssh_user': 'pi', 'ssh_hostname': '[fe80::1]', 'ssh_port': '22'}"),
-        ("pi@", "None"),
-        ("a@b@c", "None"),
-    ],
-)
-def test_a_box_is_named_as_for_ssh(text: str, data: str):
-    """USER@HOST:PORT."""
-    code = "import sys, fleet; f = fleet.NAME.fullmatch(sys.argv[1]); print(f and {k: v for k, v in f.groupdict().items() if v})"
-    assert desk(code.replace("sys.argv[1]", repr(text))) == data
+def test_a_box_is_named_as_for_ssh():
+    """USER@HOST:PORT, user and port as one likes; what is no name is none."""
+    code = """
+import fleet
+for text in ("pi@box", "Box.lab:2222", "pi@[fe80::1]:22", "pi@", "a@b@c"):
+    found = fleet.NAME.fullmatch(text)
+    print(found and "|".join(value or "" for value in found.groups()))
+"""
+    assert desk(code).splitlines() == ["pi|box|", "|Box.lab|2222", "pi|[fe80::1]|22", "None", "None"]
 
 
 def test_the_lock_is_read_for_the_box_not_for_the_desktop():

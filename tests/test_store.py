@@ -397,11 +397,11 @@ def test_a_link_out_of_the_store_is_refused(box: Delivery):
 
 def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
     """One line a bundle: role, id, name, counter, signer, trial."""
-    one, two = box.committed(1), box.accepted(2)
+    one, two = box.committed(1), box.store.accept(box.made(2, name="tubes", version="7"))
     box.start()
     lines = catalogue.lines(catalogue.entries(box.store))
     assert [line.split()[0] for line in lines] == ["role", "on", "previous", "kept"]
-    assert f"on trial  {two[:8]}  default 1" in lines[1]
+    assert f"on trial  {two[:8]}  tubes 7" in lines[1]
     assert "2        anna@lab   start 1 of 3, 0 of 5 sweeps, 0 of 600 s" in lines[1]
     assert one[:8] in lines[2]
 

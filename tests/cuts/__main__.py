@@ -59,11 +59,10 @@ class Ledger:
     def __init__(self, path: Path) -> None:
         self._path, head = path, json.dumps(_head())
         path.parent.mkdir(parents=True, exist_ok=True)
-        lines = path.read_text().splitlines() if path.exists() else []
-        if lines[:1] != [head]:
-            lines = [head]
-            path.write_text(head + "\n")
-        self._points = [_point(json.loads(line)) for line in lines[1:] if line.endswith("}")]
+        first, *lines = path.read_text().splitlines() if path.exists() else [""]
+        lines = [line for line in lines if first == head and line.endswith("}")]  # the last one may be cut off
+        path.write_text("".join(f"{line}\n" for line in (head, *lines)))
+        self._points = [_point(json.loads(line)) for line in lines]
 
     def points(self, scene: str = "") -> list[Point]:
         """Those of a scene, or all."""

@@ -96,13 +96,13 @@ def run(command: Sequence[str | Path], log: Path, at: Call | None = None, env: d
     calls = tuple(_calls(log.read_text("ascii").splitlines(), str(log.parent)))
     if at and not any(c.result is None and (c.process, c.name, c.nth) == (at.process, at.name, at.nth) for c in calls):
         raise NotFollowed(f"was not killed at its {at.name} number {at.nth}: it ended with {done.returncode}")
-    said = b"".join(call.data for call in calls if call.result and speaks(call))
-    return Run(calls, said.decode("utf-8", "replace"), done.returncode)
+    return Run(calls, "".join(map(said, calls)), done.returncode)
 
 
-def speaks(call: Call) -> bool:
-    """True where a command says something: what it writes to standard output or standard error."""
-    return call.name in ("write", "writev") and call.descriptor in (1, 2)
+def said(call: Call) -> str:
+    """What the command writes to standard output or standard error by this call; its children do not count."""
+    heard = call.process == 0 and call.name in ("write", "writev") and call.descriptor in (1, 2) and call.result
+    return call.data[: call.result].decode("utf-8", "replace") if heard else ""
 
 
 def _calls(lines: list[str], folder: str) -> Iterator[Call]:

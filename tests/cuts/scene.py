@@ -128,8 +128,7 @@ class Play:
             disk.follow(self.runs[i - 1].calls if i else ())
             number = 0
             for call in run.calls:
-                if calls.speaks(call):
-                    said += call.data.decode("utf-8", "replace")
+                said += calls.said(call)
                 if effect := disk.effect(call):
                     yield Moment(i, number, call, said, disk)
                     effect()
