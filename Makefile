@@ -9,7 +9,7 @@ DESKTOP := $(VENV)/desktop.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile \
+.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
   deploy install wheel lock clean
 
 help: ## this list
@@ -37,7 +37,7 @@ test-rig: rig-tools ## the tests on the virtual box; COUNTS=full: as often as th
 systemd: $(DESKTOP) ## the unit under a real systemd, in a container (as root; gets a Debian of 380 MB, once)
 	@{ command -v systemd-nspawn && command -v mmdebstrap; } >/dev/null || \
 	  apt-get install -y -q --no-install-recommends systemd-container mmdebstrap
-	PALPATE_SYSTEMD=1 $(BIN)/python -m pytest -q -rP tests/test_systemd.py tests/test_systemd_trial.py
+	PALPATE_SYSTEMD=1 $(BIN)/python -m pytest -q -rP tests/test_systemd.py tests/test_systemd_trial.py tests/test_deploy.py
 
 soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box and on this machine: docs/soak/
 	$(RIG) build
@@ -57,6 +57,12 @@ rig-tools: $(DESKTOP)
 hostile: $(DESKTOP) ## models that mean harm, COUNT=10000 of them, through the box's check and onnxruntime
 	@mkdir -p build
 	PYTHONPATH=tests:. nice $(BIN)/python tests/hostile_fuzz.py --count $(or $(COUNT),10000) --seed 1 --out build/hostile.json
+
+cuts: $(DESKTOP) ## kill and cut the power at every call that changes a file, while recording and delivering: build/cuts.json
+	PYTHONPATH=tests nice $(BIN)/python -m cuts --out build/cuts.json
+
+flips: $(DESKTOP) ## alter a signed bundle in every way and count what a box accepts: build/flips.json
+	PYTHONPATH=tests nice $(BIN)/python -m flips
 
 fuzz: $(DESKTOP) ## fuzz all that comes from outside: MINUTES=10 of processor time each, TARGETS= some of them
 	$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install atheris==3.0.0

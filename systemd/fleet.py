@@ -149,7 +149,10 @@ def each(args: argparse.Namespace, work: Callable[[Box], str]) -> int:
     args: of a parser that `options` made. Gives the exit code: 1 where any box failed.
     """
     inventory = _inventory(args)
-    state = State(inventory, Config())
+    try:
+        state = State(inventory, Config())
+    except PyinfraError as e:
+        sys.exit(f"palpate: {args.hosts or args.host}: {e}")
     why: dict[str, str] = {}
     told: dict[str, dict[str, Any]] = {}
 
@@ -190,7 +193,9 @@ def _inventory(args: argparse.Namespace) -> Inventory:
         found = NAME.fullmatch(args.host)
         if not found:
             sys.exit(f"palpate: HOST={args.host} is not understood; use user@box or user@box:2222")
-        data = {key: value.strip("[]") for key, value in found.groupdict().items() if value}
+        data: dict[str, Any] = {key: value.strip("[]") for key, value in found.groupdict().items() if value}
+        if "ssh_port" in data:
+            data["ssh_port"] = int(data["ssh_port"])
         return Inventory(([(args.host, data)], {}))
     if not args.hosts.is_file():
         sys.exit(f"palpate: no inventory {args.hosts}; systemd/inventory.example.py shows one")

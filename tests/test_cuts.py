@@ -8,6 +8,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,7 @@ def test_what_is_overwritten_may_be_the_old_or_nothing(play: Makes):
     """Written over in place, and not synced: what was there may still be there, and half of the new."""
     played = play("(f / 'a').write_bytes(b'NEW.')", "(f / 'a').write_bytes(b'old')")
     assert [found["a"] for found in left(played, None)] == [b"NEW.", b"old", b"", b"NE", bytes(4)]
+    assert [found["a"] for found in left(played, "write")] == [b"", b"old"]
 
 
 def test_a_renaming_is_never_half_done(play: Makes):
@@ -88,6 +90,12 @@ def test_names_of_two_folders_come_in_any_order(play: Makes):
     played = play("[(f / name).mkdir() for name in ('x/1', 'x/2', 'y/3')]", "(f / 'x').mkdir(); (f / 'y').mkdir()")
     found = [" ".join(sorted(found.keys() - {"x", "y"})) for found in left(played, None)]
     assert found == ["", "x/1", "x/1 x/2", "y/3", "x/1 y/3", "x/1 x/2 y/3"]
+
+
+def test_a_sync_takes_with_it_what_came_before(play: Makes):
+    """A folder's new name came from another folder, where it was not synced: it is in one of the two, not in both."""
+    played = play("(f / 'a').mkdir(); (f / 'a').rename(f / 'x' / 'a'); disk.sync(f / 'x')", "(f / 'x').mkdir()")
+    assert left(played, None) == [{"x": None, "x/a": None}]
 
 
 def test_a_symlink_is_swapped_in_one_step(play: Makes):
@@ -109,6 +117,8 @@ def test_a_kill_comes_before_its_call(play: Makes):
     played.kill(moment)
     assert told == [({"a": b""}, "now\n")]
     assert (moment.call.name, end.call, end.said) == ("rename", None, "now\nthen\n")
+    with pytest.raises(NotFollowed, match="was not killed at its rename number 2"):
+        played.kill(replace(moment, call=replace(moment.call, nth=2)))
 
 
 @pytest.mark.parametrize(
@@ -173,13 +183,15 @@ def shop(tmp_path_factory: pytest.TempPathFactory) -> delivery.Shop:
 
 
 def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: delivery.Shop, work: Path):
-    """Killed, or the power cut, before each renaming of an accept: the box starts, answers, and takes the next bundle."""
+    """Killed before it names the bundle's folder and the ledger, and without power before the link is swapped: the box
+    starts, answers, and takes the next bundle.
+    """
     played = Play(shop.alone("right"), work)
-    points = [
-        how(moment) for moment in played.moments() if moment.call and moment.call.name.startswith("rename")
-        for how in (played.power, played.kill)
-    ]  # fmt: skip
-    assert [point.call.split("/")[-1] for point in points[::2]][1:] == ["ledger.json", "current"]
+    points = []
+    for moment in played.moments():
+        if moment.call and moment.call.name.startswith("rename"):
+            points.append((played.power if moment.call.paths[1].endswith("/current") else played.kill)(moment))
+    assert [point.states for point in points] == [1, 1, 4]
     assert wrong(points) == []
 
 

@@ -78,7 +78,7 @@ def host(place: hosts.Hosts, installed: str) -> hosts.Host:
 @pytest.fixture
 def at(host: hosts.Host) -> tuple[str, str]:
     """The options that name it."""
-    return ("--host", f"{hosts.USER}@{host.address}")
+    return ("--host", f"{hosts.USER}@{host.address}:22")
 
 
 def changed(wheel: Path, folder: Path, name: str, text: str) -> Path:

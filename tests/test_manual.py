@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,9 @@ DOCS = ROOT / "docs"
 MANUAL = (DOCS / "manual.md").read_text()
 CHANGES = (ROOT / "CHANGELOG.md").read_text()
 SECTIONS = {title: text for title, text in re.findall(r"(?ms)^## \d+\. (.+?)$(.*?)(?=^## |\Z)", MANUAL)}
+BLOCKS = re.findall(r"(?m)^    (\S.*)$", MANUAL)
+"""The lines of all code blocks."""
+PARSER = arguments.parser(RUNS)
 PICTURES = sorted(DOCS.glob("manual/*.svg"))
 
 
@@ -40,21 +44,10 @@ def named(section: str, column: str) -> list[str]:
     return [re.match(r"`?([^`]*)`?", cells[0])[1] for cells in rows(section, column)]
 
 
-def blocks(text: str) -> list[str]:
-    """The lines of all code blocks, without their indent and the comment behind a command."""
-    found = re.findall(r"(?m)^    (\S.*)$", text)
-    return [re.sub(r"\s{2,}# .*", "", line) for line in found]
-
-
-def parser() -> Any:
-    """The parser of `palpate`."""
-    return arguments.parser(RUNS)
-
-
 def spoken() -> list[list[str]]:
-    """The arguments of each `palpate` command of the manual's code blocks."""
-    found = (re.fullmatch(r"(?:sudo -u palpate )?palpate ([a-z].*)", line) for line in blocks(MANUAL))
-    return [[word.strip('"') for word in re.findall(r'"[^"]*"|\S+', m[1])] for m in found if m and "   " not in m[1]]
+    """The arguments of each `palpate` command of the manual's code blocks; what it prints has wide gaps."""
+    found = (re.fullmatch(r"(?:sudo -u palpate )?palpate ([a-z].*)", line) for line in BLOCKS)
+    return [shlex.split(m[1]) for m in found if m and "   " not in m[1]]
 
 
 def test_every_status_is_explained():
@@ -86,7 +79,7 @@ def test_sentences_are_as_the_box_forms_and_reads_them():
 
 def test_every_command_is_named_and_there():
     """Section 10 lists the parser's commands; a command of the text is one of them."""
-    assert parser().parse_args(["bench"]).run is RUNS["bench"]
+    assert PARSER.parse_args(["bench"]).run is RUNS["bench"]
     listed = [name.removeprefix("palpate ") for name in named("Commands and exit codes", "command")]
     assert sorted(listed) == sorted(RUNS)
     assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= {*RUNS}
@@ -95,7 +88,7 @@ def test_every_command_is_named_and_there():
 @pytest.mark.parametrize("words", spoken(), ids=" ".join)
 def test_commands_can_be_copied(words: list[str]):
     """Each `palpate` command of a code block is one that the parser takes."""
-    assert parser().parse_args(words).run
+    assert PARSER.parse_args(words).run
 
 
 def test_commands_to_be_copied_are_many():
@@ -107,7 +100,7 @@ def test_training_commands_are_there():
     """What the manual calls of palpate-train: commands and options stand in its parsers."""
     code = "\n".join(path.read_text() for path in sorted(ROOT.glob("train/*.py")))
     commands = set(re.findall(r'\badd(?:_parser)?\(\s*"([a-z]+)"', code))
-    lines = [*blocks(MANUAL), *re.findall(r"`([^`]+)`", MANUAL.replace("\n", " "))]
+    lines = [*BLOCKS, *re.findall(r"`([^`]+)`", MANUAL.replace("\n", " "))]
     called = [line.split()[1:] for line in lines if line.startswith("palpate-train ")]
     assert len(called) >= 6
     for first, *more in called:
@@ -169,7 +162,7 @@ def test_exit_codes_are_those_of_the_code():
 
 @pytest.mark.parametrize("board", ["rpi4", "rpi5"])
 def test_wiring_is_that_of_the_board_files(board: str):
-    """Each line's kernel name and pin as in the board file, and the header drawn as there."""
+    """Each line's kernel name and pin as in the board file, the header drawn as there, the kernel's settings too."""
     text = (ROOT / "firmware_config" / f"board-{board}.toml").read_text()
     settings = config.load(board)
     lines = {
@@ -186,6 +179,9 @@ def test_wiring_is_that_of_the_board_files(board: str):
     header = ["    " + line[2:].rstrip() for line in text.splitlines() if re.search(r"\(\d+\) \(\d+\)", line)]
     assert len(header) == 20
     assert "\n".join(header) in MANUAL
+    boot = re.findall(r"(?m)^#     ((?:dt|enable)\S+)$", text)
+    assert len(boot) >= 2
+    assert "".join(f"\n    {line}" for line in boot) + "\n\n" in MANUAL
 
 
 def test_links_and_pictures_are_there():
@@ -259,8 +255,7 @@ def test_samples_are_what_the_box_prints():
         catalogue.Entry("5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""),
         catalogue.Entry("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
     ])  # fmt: skip
-    printed = [line.rstrip() for line in blocks(MANUAL)]
-    assert [line for line in told if line not in printed] == []
+    assert [line for line in told if line not in BLOCKS] == []
 
 
 def test_the_trial_is_told_as_it_is():

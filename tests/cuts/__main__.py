@@ -18,7 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cuts import black_box, delivery, recording, tree
+from cuts import black_box, calls, delivery, recording, tree
 from cuts.scene import ROOT, Play, Point, Scene, stage
 
 SCENES: dict[str, Callable[[Path], Scene]] = {
@@ -42,6 +42,8 @@ def main() -> int:
     given = parser.parse_args()
     if wrong := set(given.scenes) - set(SCENES):
         parser.error(f"no scene {', '.join(sorted(wrong))}; there are {', '.join(SCENES)}")
+    if lack := calls.lacking():
+        sys.exit(f"cuts: needs {lack}")
     ledger = Ledger(given.out)
     for name in given.scenes or SCENES:
         with TemporaryDirectory(prefix="cuts-") as beside:

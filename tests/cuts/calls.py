@@ -32,10 +32,6 @@ STRING = re.compile(r'"((?:\\x[0-9a-f]{2})*)"(\.\.\.)?')
 DESCRIPTOR = re.compile(r"(AT_FDCWD|\d+)<((?:\\x[0-9a-f]{2})*)>")
 
 
-class Missing(Exception):
-    """What is needed to see a command's calls is not there; says what to install."""
-
-
 class NotFollowed(Exception):
     """The command did something to its files that is not followed here."""
 
@@ -82,10 +78,8 @@ def lacking() -> str:
 def run(command: Sequence[str | Path], log: Path, at: Call | None = None, env: dict[str, str] | None = None) -> Run:
     """Run a command under strace, in the folder of the log; `at`: kill it when it enters this call.
 
-    env: what is added to the environment. Raises Missing, NotFollowed, and subprocess.TimeoutExpired.
+    env: what is added to the environment. Raises NotFollowed, and subprocess.TimeoutExpired.
     """
-    if lack := lacking():
-        raise Missing(f"needs {lack}")
     how = [f"--inject={at.name}:signal=SIGKILL:when={at.nth}"] if at else ["--seccomp-bpf"]
     done = subprocess.run(
         ["strace", "-f", "-y", "-xx", "-s", str(MOST_BYTES), "-e", "signal=none", "-e", f"trace=/^({WATCHED})",

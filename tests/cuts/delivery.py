@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,8 +19,9 @@ from subprocess import run
 from appliance import bundle, disk, signature
 from appliance.__main__ import main
 from appliance.manifest import SCHEMA
+from appliance.shelf import SHA
 from appliance.trial import Trial
-from cuts.calls import NotFollowed
+from cuts.calls import DEADLINE_S, NotFollowed
 from cuts.scene import Found, Scene, Step
 
 STORE, INCOMING = "store", "store/incoming"
@@ -151,7 +153,8 @@ class Shop:
         code, said = _apart(self.words(folder, "accept", again))
         if code:
             return [f"the next delivery ends with {code}: {_end(said)}"]
-        left = [path.name for path in (folder / STORE).rglob("*.part*")]
+        left = [path.name for path in (folder / STORE).iterdir() if path.suffix == disk.PART]
+        left += [path.name for path in (folder / STORE / "bundles").iterdir() if not SHA.fullmatch(path.name)]
         return [f"{name} is left" for name in left] + self._answers(folder, "after the next delivery", {last})
 
 
@@ -175,6 +178,7 @@ def _apart(words: list[str]) -> tuple[int, str]:
     sys.stdout.flush()  # or the child says it, too
     child = os.fork()
     if not child:
+        signal.alarm(DEADLINE_S)
         sys.stdout = sys.stderr = os.fdopen(told, "w", 1)
         try:
             os._exit(main(words))

@@ -132,8 +132,6 @@ class Disk:
 
     def _opened(self, call: Call) -> Callable[[], None] | None:
         above, name, there = self._find(call.paths[0], follow="O_NOFOLLOW" not in call.words)
-        if "O_TMPFILE" in call.words:
-            raise NotFollowed(f"a file without a name in {call.paths[0]}")
         if call.name != "creat" and not any(flag in call.words for flag in ("O_CREAT", "O_WRONLY", "O_RDWR")):
             return None
         at = None if "O_APPEND" in call.words else 0

@@ -67,3 +67,8 @@ def test_check_names_each_part(cell: Cell):
     finally:
         run("systemctl start --no-block palpate", check=True)
     cell.until_ready()
+
+
+def test_the_skin_has_its_name(cell: Cell):
+    """udev calls the skin's node by its name."""
+    assert cell.machine.run("readlink -f /dev/palpate-skin", check=True).out.startswith("/dev/bus/usb/")
