@@ -58,8 +58,8 @@ hostile: $(DESKTOP) ## models that mean harm, COUNT=10000 of them, through the b
 	@mkdir -p build
 	PYTHONPATH=tests:. nice $(BIN)/python tests/hostile_fuzz.py --count $(or $(COUNT),10000) --seed 1 --out build/hostile.json
 
-cuts: $(DESKTOP) ## kill and cut the power at every call that changes a file, while recording and delivering: build/cuts.json
-	PYTHONPATH=tests nice $(BIN)/python -m cuts --out build/cuts.json
+cuts: $(DESKTOP) ## kill and cut the power at every call that changes a file, while recording and delivering: build/cuts.jsonl
+	PYTHONPATH=tests nice $(BIN)/python -m cuts $(SCENES)
 
 flips: $(DESKTOP) ## alter a signed bundle in every way and count what a box accepts: build/flips.json
 	PYTHONPATH=tests nice $(BIN)/python -m flips

@@ -100,7 +100,9 @@ class Box:
         systemd measured them. Raises Failed where it is neither within the limit, or fails for the `starts`-th time.
         """
         before, waits_s = self.service(), 0.0
-        self.run("restarting the service", "systemctl --no-block restart palpate", user="root")
+        # the reset is that of the count of restarts
+        again = "systemctl reset-failed palpate; systemctl --no-block restart palpate"
+        self.run("restarting the service", again, user="root")
         end_s = time.monotonic() + limit_s
         while True:
             now = self.service()
@@ -123,7 +125,8 @@ class Box:
         return True
 
     def _last_words(self, service: dict[str, str]) -> str:
-        command = "journalctl -q _SYSTEMD_UNIT=palpate.service -n 20 -o cat"
+        # -t: not what lowers the lines after it
+        command = "journalctl -q -t palpate _SYSTEMD_UNIT=palpate.service -n 20 -o cat"
         said = self.run("reading the journal", command, user="root").splitlines()
         own = [line for line in said if not line.startswith("sweep ")] or ["no word in its journal"]
         return f"{own[-1]} ({service['ActiveState']}, {service['NRestarts']} restarts)"

@@ -205,7 +205,10 @@ def test_a_release_that_does_not_start_gives_way_to_the_old_one(
     broken = changed(wheel, tmp_path, "appliance/notify.py", "\ndel Manager.turn\n")
     done = place.desktop("install", *at, "--wheel", broken)
     assert done.returncode == 1
-    assert f"so {before} runs again" in done.stdout
+    assert (
+        "FAILED: the service does not come up: AttributeError: 'Manager' object has no attribute 'turn'" in done.stdout
+    )
+    assert done.stdout.endswith(f"; so {before} runs again\n")
     assert (release(host), host.service["ActiveState"]) == (before, "active")
 
 

@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 ROOMS = sorted([*ROOT.glob("appliance/**/*.py"), *ROOT.glob("train/**/*.py")])
-GROUNDS = [p for room in ("rig", "undersides", "fuzz") for p in sorted(ROOT.glob(f"tests/{room}/**/*.py"))]
+GROUNDS = [p for room in ("rig", "undersides", "fuzz", "cuts") for p in sorted(ROOT.glob(f"tests/{room}/**/*.py"))]
 BOX = [p for p in ROOMS if p.is_relative_to(ROOT / "appliance") and "sim" not in p.parts]
 ALLOWED = {"numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2"}  # the last is Python's own from 3.12 on
 

@@ -32,7 +32,7 @@ PROBATION = 2
 ANSWER = re.compile(r"\$PPLP,RES,\d+,[\d.]+,(?:ok|unsure|undecided),(?:[^,]*,){6}([0-9a-f]{8}),")
 PROMISE = re.compile(r"bundle ([0-9a-f]{8}) (?:is accepted; it )?runs (?:on trial )?from the next start on.*")
 DIED = 3
-NAMES = ("packaged", "first", "second", "third", "fourth", "last")
+NAMES = ("packaged", "first", "second", "third", "fourth", "fifth", "last")
 START = ("run", "--sim", "skin", "--virtual", "--sweeps", "1")
 START_AND_COMMIT = (*START[:-1], str(PROBATION))
 COPY = """
@@ -106,7 +106,11 @@ class Shop:
         yield "second", self.copy("fourth")
         yield "second", do("accept as the candidate", "accept", "--shadow", "@fourth")
         yield "second fourth", do("promote the candidate", "promote")
-        yield "fourth", do("commit it by hand", "commit")
+        yield "fourth", self.copy("fifth")
+        yield "fourth fifth", do("accept one more while that is on trial", "accept", "@fifth")
+        yield "fifth second", do("roll back from the trial", "rollback")
+        yield "second fifth", do("accept it again", "accept", "@fifth")
+        yield "fifth", do("commit it by hand", "commit")
 
     def scene(self) -> Scene:
         """The story, each command of which is cut short."""
