@@ -19,7 +19,7 @@ demo: $(RUNTIME) ## watch simulated sweeps being classified, live
 	$(BIN)/palpate demo
 
 test: $(DESKTOP) ## run the tests (set PALPATE_DATA to the folder of real sweeps to run those as well)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
 check: lint types test ## lint, types and tests
 

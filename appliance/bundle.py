@@ -159,9 +159,9 @@ def made(files: Mapping[str, bytes], where: str) -> Bundle:
     """The bundle that `files` are, checked; `where` they come from. Raises BundleError as `load`."""
     manifest = Manifest.parse(files[MANIFEST])
     model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
-    graph.check(model, manifest)
     samples, logits = _golden(golden, manifest)
     classes = _classes(_checked(files, manifest, MEANS, where), manifest) if manifest.known else None
+    graph.check(model, manifest)
     return Bundle(manifest, identity(files[MANIFEST]), model, samples, logits, classes)
 
 

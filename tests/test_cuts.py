@@ -115,8 +115,8 @@ def test_a_kill_comes_before_its_call(play: Makes):
                   lambda found: told.append((tree.read(found.folder), found.heard)) or [])  # fmt: skip
     (moment, end) = played.moments()
     played.kill(moment)
-    assert told == [({"a": b""}, "now\n")]
-    assert (moment.call.name, end.call, end.said) == ("rename", None, "now\nthen\n")
+    assert told == [({"a": b""}, "\nnow\n")]
+    assert (moment.call.name, end.call, end.said) == ("rename", None, "\nnow\nthen\n")
     with pytest.raises(NotFollowed, match="was not killed at its rename number 2"):
         played.kill(replace(moment, call=replace(moment.call, nth=2)))
 

@@ -18,7 +18,7 @@ def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, befo
     """User, groups and folders, with owners and modes; none of it was there before, and twice is as good as once."""
     assert before == [False, False, False]
     for _ in range(2):
-        assert set(machine.get("id", "-nG", "palpate").split()) == {"palpate"}
+        assert set(machine.get("id", "-nG", "palpate").split()) == {"palpate", "dialout", "gpio", "plugdev"}
         assert machine.get("getent", "passwd", "palpate").endswith(":/var/lib/palpate:/usr/sbin/nologin")
         assert len(machine.get("getent", "group", "gpio", "dialout", "plugdev").splitlines()) == 3
         own = [f"/var/lib/palpate{folder}" for folder in ("", "/incoming", "/bundles")]

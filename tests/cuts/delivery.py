@@ -167,8 +167,8 @@ def _bare(folder: Path) -> None:
 
 
 def _promised(said: str) -> str:
-    """The bundle that is to run from the next start on, where a command has ended by saying so."""
-    told = PROMISE.fullmatch(said.rstrip("\n").rpartition("\n")[2])
+    """The bundle that is to run from the next start on, where the command that is cut has just said so."""
+    told = PROMISE.fullmatch(said.splitlines()[-1])
     return told[1] if told else ""
 
 

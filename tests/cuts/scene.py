@@ -22,6 +22,8 @@ from cuts.disk import Disk
 ROOT = Path(__file__).parents[2]
 MEMORY = Path("/dev/shm")
 """Where scenes are best played: what a sync does is known here, and on a real disk it takes its time."""
+BETWEEN = "\n"
+"""Said before each command, so that the last line is its own."""
 ENVIRONMENT = {"PYTHONPATH": f"{ROOT / 'tests'}:{ROOT}"}
 
 
@@ -126,6 +128,7 @@ class Play:
         for i, run in enumerate(self.runs):
             disk = Disk(self.folder, self.before[max(i - 1, 0)], self.scene.apart)
             disk.follow(self.runs[i - 1].calls if i else ())
+            said += BETWEEN
             number = 0
             for call in run.calls:
                 said += calls.said(call)
@@ -148,7 +151,7 @@ class Play:
         step = self.scene.steps[moment.step]
         self._restore(self.before[moment.step])
         run = self._run(step, moment.call)
-        said = "".join(run.said for run in (*self.runs[: moment.step], run))
+        said = "".join(BETWEEN + run.said for run in (*self.runs[: moment.step], run))
         return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, said))
 
     def kill_then_power(self, moment: Moment) -> Point:
@@ -161,7 +164,10 @@ class Play:
         wrong, states = [], 0
         with stage() as work:
             play = Play(
-                twice, Path(work), said="".join(run.said for run in self.runs[: moment.step]), judged=self.judged
+                twice,
+                Path(work),
+                said="".join(BETWEEN + run.said for run in self.runs[: moment.step]),
+                judged=self.judged,
             )
             for point in (play.power(later) for later in play.moments() if later.step):
                 states += point.states
