@@ -121,7 +121,11 @@ def test_the_wheel_holds_the_appliance_alone(wheel: Path):
     """appliance with its bundle and licence; no train, no tests."""
     names = zipfile.ZipFile(wheel).namelist()
     assert {n.split("/")[0] for n in names if ".dist-info/" not in n} == {"appliance"}
-    assert {"appliance/default_bundle/model.onnx", "appliance/default_bundle/manifest.json", "appliance/place_page.html"} <= set(names)
+    assert {
+        "appliance/default_bundle/model.onnx",
+        "appliance/default_bundle/manifest.json",
+        "appliance/place_page.html",
+    } <= set(names)
     assert any(n.endswith("licenses/LICENSE") for n in names)
 
 
