@@ -89,6 +89,18 @@ def _inside(root: Path, *command: str) -> None:
     run("chroot", root, "env", "-i", nspawn.PATH, "DEBIAN_FRONTEND=noninteractive", *command)
 
 
+FETCH = """
+import platform, sys; from parcel import LOCK, fetch, locked
+fetch(locked(LOCK.read_text(), sys.argv[1], platform.machine()), sys.argv[1], platform.machine())
+"""
+
+
+def _fetch_wheels() -> None:
+    """Have the wheels for such a host here: a desktop inside a host's own network has no way to where they come from."""
+    python = f"{nspawn.PYTHON}.2"
+    run("env", f"PYTHONPATH={ROOT / 'systemd'}:{ROOT}", sys.executable, "-c", FETCH, python)
+
+
 class Host:
     """A host that has booted and answers on its ssh port.
 
@@ -150,6 +162,7 @@ class Hosts:
         (ssh / "known_hosts").touch()
         run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", ssh / "id_ed25519")
         root, first = set_up() / kind, 1 + os.getpid() * 8 % 240
+        _fetch_wheels()
         with self._stack:
             self.hosts = [
                 self._stack.enter_context(Host(root, number, work / f"host-{number}", ssh / "id_ed25519"))
