@@ -28,7 +28,7 @@ from typing import Any, Self
 
 import delivered
 import nspawn
-from machines import HOME, ROOT, Missing, run, wheel
+from machines import HOME, ROOT, Missing, run, wheel, whole
 
 from appliance.sim.bench import commit
 
@@ -56,23 +56,11 @@ def check() -> None:
 def set_up() -> Path:
     """The folder with the two Debians, `bare` and `ready`, made where it is not there. Raises Missing."""
     check()
-    target = folder()
-    if target.exists():
-        return target
-    CACHE.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f"{target.name}.", suffix=".part", dir=CACHE))
-    try:
-        _make(part / "bare", part / "ready")
-        with suppress(OSError):  # somebody else was quicker
-            part.rename(target)
-    except subprocess.CalledProcessError as e:
-        raise Missing(f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout).strip()[-500:]}") from e
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return target
+    return whole(folder(), _make)
 
 
-def _make(bare: Path, ready: Path) -> None:
+def _make(part: Path) -> None:
+    bare, ready = part / "bare", part / "ready"
     run("mmdebstrap", "--variant=minbase", f"--include={','.join(PACKAGES)}", "--aptopt=Acquire::Languages none",
         *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
         "--skip=cleanup/apt", "--format=directory", nspawn.SUITE, bare)  # fmt: skip

@@ -14,6 +14,8 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -76,34 +78,47 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
     return [*run, "-L", str(usr.parent), str(usr / "bin" / PYTHON), __file__, *map(str, args)], env
 
 
-def set_up() -> Path:
-    """The folder of the arm64 userland, made where it is not there. Raises Missing where apt or pip cannot."""
-    target = folder()
+def whole(target: Path, make: Callable[[Path], None]) -> Path:
+    """The folder `target`, made whole or not at all where it is not there: `make` fills an empty one beside it.
+
+    Raises Missing with what the failed command said.
+    """
     if target.exists():
         return target
-    part = target.with_suffix(f".{os.getpid()}.part")
-    for made in ("root/proc", "root/sys/devices/system/cpu", "qemu"):
-        (part / made).mkdir(parents=True)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=f"{target.name}.", suffix=".part", dir=target.parent))
+    part.chmod(0o755)
     try:
-        _unpack(part)
-        _install(part / "site")
-        (part / "root/proc/cpuinfo").write_text(CPUINFO)
-        for file in ("possible", "present"):
-            (part / "root/sys/devices/system/cpu" / file).write_text("0\n")
-        for rest in ("lists", "archives"):
-            shutil.rmtree(part / rest)
-        for other in (part / "qemu/usr/bin").glob("*"):  # 20 MB each
-            if "x86_64" not in other.name and "aarch64" not in other.name:
-                other.unlink()
+        make(part)
         with suppress(OSError):  # somebody else was quicker
             part.rename(target)
     except subprocess.CalledProcessError as e:
-        raise Missing(f"{' '.join(map(str, e.cmd[:3]))} failed: {(e.stderr or e.stdout).strip()[-300:]}") from e
+        raise Missing(f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout or '').strip()[-800:]}") from e
     except FileNotFoundError as e:
-        raise Missing(f"no {e.filename} here: this needs Debian's apt and dpkg") from e
+        raise Missing(f"no {e.filename} here: this needs Debian's tools") from e
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return target
+
+
+def set_up() -> Path:
+    """The folder of the arm64 userland, made where it is not there. Raises Missing where apt or pip cannot."""
+    return whole(folder(), _make)
+
+
+def _make(part: Path) -> None:
+    for made in ("root/proc", "root/sys/devices/system/cpu", "qemu"):
+        (part / made).mkdir(parents=True)
+    _unpack(part)
+    _install(part / "site")
+    (part / "root/proc/cpuinfo").write_text(CPUINFO)
+    for file in ("possible", "present"):
+        (part / "root/sys/devices/system/cpu" / file).write_text("0\n")
+    for rest in ("lists", "archives"):
+        shutil.rmtree(part / rest)
+    for other in (part / "qemu/usr/bin").glob("*"):  # 20 MB each
+        if "x86_64" not in other.name and "aarch64" not in other.name:
+            other.unlink()
 
 
 def _unpack(part: Path) -> None:

@@ -22,7 +22,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from machines import HOME, LOCK, PIP, ROOT, Missing, run, wheel
+from machines import HOME, LOCK, PIP, ROOT, Missing, run, wheel, whole
 
 CACHE = HOME.parent / "nspawn"
 SUITE, PYTHON = "bookworm", "3.11"
@@ -80,34 +80,21 @@ def check() -> None:
 def set_up() -> Path:
     """The folder of the Debian, made where it is not there. Raises Missing where mmdebstrap or pip cannot."""
     check()
-    target = folder()
-    if target.exists():
-        return target
-    CACHE.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f"{target.name}.", suffix=".part", dir=CACHE))
-    try:
-        _make(part / "root", part / "wheels")
-        with suppress(OSError):  # somebody else was quicker
-            (part / "root").rename(target)
-    except subprocess.CalledProcessError as e:
-        raise Missing(f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout).strip()[-500:]}") from e
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return target
+    return whole(folder(), _make)
 
 
-def _make(root: Path, wheels: Path) -> None:
+def _make(root: Path) -> None:
     run("mmdebstrap", "--variant=minbase", f"--include={','.join(PACKAGES)}", "--aptopt=Acquire::Languages none",
         *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
         "--format=directory", SUITE, root)  # fmt: skip
+    wheels = root / "wheels"
     run(*PIP, "download", "--no-deps", "--only-binary", ":all:", "--python-version", PYTHON,
         "--require-hashes", "-r", LOCK, "-d", wheels)  # fmt: skip
-    shutil.copytree(wheels, root / "wheels")
-    shutil.copy(LOCK, root / "wheels")
+    shutil.copy(LOCK, wheels)
     inside = ("chroot", root, "env", "-i", PATH)
     run(*inside, "python3", "-m", "venv", "/opt/palpate")
     run(*inside, *_pip("--find-links", "/wheels", "--require-hashes", "-r", f"/wheels/{LOCK.name}"))
-    shutil.rmtree(root / "wheels")
+    shutil.rmtree(wheels)
 
 
 def _pip(*args: str) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import machines
 import pytest
 from rig import image, notes
 from rig.lines import HOLD_NS, GuestLines
@@ -36,7 +37,7 @@ def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
         image.run("ls", part / "nothing here")
 
     with pytest.raises(image.Missing, match="nothing here"):
-        image._in_place_of(tmp_path / "made", fail)
+        machines.whole(tmp_path / "made", fail)
     assert list(tmp_path.iterdir()) == []
 
 

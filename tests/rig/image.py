@@ -12,13 +12,12 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import machines
-from machines import ROOT, Missing, run
+from machines import ROOT, Missing, run, whole
 
 HERE = Path(__file__).parent
 GUEST = HERE / "guest"
@@ -80,7 +79,7 @@ def ground(log: Callable[[str], None] = print) -> Path:
         if os.geteuid():
             raise Missing("the virtual box is made as root, since files of many owners are; use sudo")
         log(f"making the ground of the virtual box: Debian {SUITE} for arm64, about three minutes")
-        _in_place_of(target, _make_ground)
+        whole(target, _make_ground)
     return target
 
 
@@ -91,7 +90,7 @@ def box(on: Path, log: Callable[[str], None] = print) -> Image:
     if not target.exists():
         _need(["qemu-system-aarch64", "qemu-img", "mke2fs"])
         log("installing this checkout on it, about a minute")
-        _in_place_of(target, lambda part: _make_box(part, on))
+        whole(target, lambda part: _make_box(part, on))
     return made
 
 
@@ -127,20 +126,6 @@ def _hash(parts: Iterable[Path], said: str) -> str:
     for part in parts:
         total.update(hashlib.sha256(part.read_bytes()).digest() + part.name.encode())
     return total.hexdigest()[:16]
-
-
-def _in_place_of(target: Path, make: Callable[[Path], None]) -> None:
-    """Make a folder whole or not at all. Raises Missing with what the failed command said."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f"{target.name}.", suffix=".part", dir=target.parent))
-    try:
-        make(part)
-        if not target.exists():
-            part.rename(target)
-    except subprocess.CalledProcessError as e:
-        raise Missing(f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout or '').strip()[-800:]}") from e
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _make_ground(part: Path) -> None:
