@@ -50,7 +50,7 @@ except ImportError:  # Python 3.11
 
 __all__ = [
     "DEFAULT", "GOLDEN", "GOLDEN_TOLERANCE", "INPUTS", "LABEL", "MANIFEST", "MEANS", "MODEL", "SIGNATURE",
-    "Bundle", "Classes", "Early", "Known", "Manifest", "Thresholds", "file_entry", "files", "identity", "load", "made",
+    "Bundle", "Classes", "Early", "Known", "Manifest", "Thresholds", "digest", "file_entry", "files", "identity", "load", "made",
 ]  # fmt: skip
 DEFAULT = Path(__file__).with_name("default_bundle")
 SIGNATURE = MANIFEST + ".sig"
@@ -105,12 +105,17 @@ class Bundle:
 
 def file_entry(data: bytes) -> dict[str, Any]:
     """sha256 and size of one file, as the manifest holds them."""
-    return {"sha256": sha256(data).hexdigest(), "bytes": len(data)}
+    return {"sha256": digest(data), "bytes": len(data)}
+
+
+def digest(data: bytes) -> str:
+    """The sha256 in hexadecimal; of its manifest it is what a bundle goes by in a store."""
+    return str(sha256(data).hexdigest())
 
 
 def identity(manifest: bytes) -> str:
     """A bundle's id: the first eight hex digits of its manifest's sha256."""
-    return str(sha256(manifest).hexdigest()[:8])
+    return digest(manifest)[:8]
 
 
 def load(folder: Path) -> Bundle:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from math import sqrt
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from .health import Health
 from .journal import WARNING
 from .keys import typed
 from .record import SweepFolder, told
+from .share import wilson
 from .sweep import Status, Sweep, Verdict
 
 FILE = "agreement.json"
@@ -47,7 +47,8 @@ class Agreement:
 
     pairs: what the current one said -> what the candidate said -> sweeps. later: early answers to which the candidate
     would have waited for more of the sweep; these are not compared. failed: sweeps on which the candidate did. kept:
-    sweeps that lie beside. worst_ms: its longest computing; total_ms: of all. starts: begun in a row without an end in order, the present one included until it is older than PERIOD_NS.
+    sweeps that lie beside. worst_ms: its longest computing; total_ms: of all. starts: begun in a row without an end in
+    order, the present one included until it is older than PERIOD_NS.
     """
 
     candidate: str
@@ -99,13 +100,6 @@ class Agreement:
 def _answer(v: Verdict) -> str:
     """What a robot goes by: the label, behind the status where that is not ok."""
     return v.label if v.status is Status.OK else f"({v.status}) {v.label}".strip()
-
-
-def wilson(k: int, n: int) -> tuple[float, float]:
-    """The 95 % interval of a share of which k of n were seen (E. B. Wilson, 1927)."""
-    z = 1.959964
-    middle, half = (k + z * z / 2) / (n + z * z), z * sqrt(k * (n - k) / n + z * z / 4) / (n + z * z)
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def read(folder: Path) -> Agreement | None:

@@ -31,7 +31,7 @@ class Signed:
     @property
     def sha(self) -> str:
         """The sha256 of its manifest."""
-        return str(bundle.file_entry(self.files[bundle.MANIFEST])["sha256"])
+        return bundle.digest(self.files[bundle.MANIFEST])
 
 
 class Shelf:

@@ -7,7 +7,6 @@ new one; run the command again to finish.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import sys
@@ -69,7 +68,7 @@ def checked(folder: Path, signers: Path | None) -> Parcel:
             member.size = len(data)
             tar.addfile(member, io.BytesIO(data))
     m = held.manifest
-    sha = hashlib.sha256(files[bundle.MANIFEST]).hexdigest()
+    sha = bundle.digest(files[bundle.MANIFEST])
     return Parcel(sha, f"{m.name} {m.version} ({held.id})", archive.getvalue())
 
 

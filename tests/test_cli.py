@@ -17,12 +17,12 @@ import pytest
 import toy
 from conftest import numbered
 
-from appliance import bundle
+from appliance import bundle, share
 from appliance.__main__ import main
 from appliance.bundle import Early
 from appliance.classifier import softmax
 from appliance.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError
-from appliance.sim import bench, demo, parts, score, script, skin, terminal
+from appliance.sim import bench, demo, parts, script, skin, terminal
 from appliance.sweep import Frames, Status, Sweep, save
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
@@ -352,7 +352,7 @@ def test_bench_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_wilson():
     """The paper's 55 of 60 has the interval that is known for it."""
-    assert score.wilson(55, 60) == pytest.approx([0.819, 0.964], abs=5e-4)
+    assert share.wilson(55, 60) == pytest.approx([0.819, 0.964], abs=5e-4)
 
 
 def test_skin_format_is_the_default_bundles(default_bundle: bundle.Bundle):

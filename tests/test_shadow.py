@@ -15,7 +15,7 @@ import pytest
 import toy
 from conftest import SECOND, Rigged
 
-from appliance import bundle, disk, shadow, sweep
+from appliance import bundle, disk, shadow, share, sweep
 from appliance.bundle import Bundle
 from appliance.classifier import Classifier
 from appliance.errors import ApplianceError, BundleError
@@ -312,7 +312,7 @@ def test_the_interval_is_wilson_s():
     stats = pytest.importorskip("scipy.stats", reason="scipy comes with the desktop's tools (make test)")
     for k, n in ((0, 1), (118, 120), (7, 9), (20, 20)):
         want = stats.binomtest(k, n).proportion_ci(method="wilson")
-        assert shadow.wilson(k, n) == pytest.approx((want.low, want.high), abs=1e-6)
+        assert share.wilson(k, n) == pytest.approx((want.low, want.high), abs=1e-6)
 
 
 def test_the_robot_notices_nothing(rigged, default_bundle: Bundle, tmp_path: Path):

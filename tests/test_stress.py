@@ -15,8 +15,8 @@ from onnx import TensorProto, helper
 
 from appliance import bundle
 from appliance.errors import FormatError
+from appliance.share import wilson
 from appliance.sim import skin
-from appliance.sim.score import wilson
 from appliance.sweep import Status, SweepFormat
 from train import methods, stress, stresses
 from train.evaluate import Where

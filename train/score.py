@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.classifier import LEAST_PROBABILITY, softmax
+from appliance.share import wilson
 from appliance.sim.bench import commit
-from appliance.sim.score import wilson
 
 Array = NDArray[Any]
 DRAWS = 2000

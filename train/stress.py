@@ -20,8 +20,8 @@ from appliance.classifier import Classifier
 from appliance.config import SweepConfig
 from appliance.errors import FormatError
 from appliance.recorder import Recorder
+from appliance.share import wilson
 from appliance.sim.rig import VirtualClock
-from appliance.sim.score import wilson
 from appliance.sweep import Frames, SweepFormat, Verdict
 from appliance.trigger import Edge, EdgeKind
 

@@ -28,10 +28,10 @@ from ..classifier import Classifier
 from ..clock import Clock, SystemClock
 from ..errors import BundleError
 from ..session import session
+from ..share import wilson
 from ..sweep import Status, Sweep, SweepFormat, Verdict
 from . import parts, rig, script, skin, stage
 from .parts import Build, drain
-from .score import wilson
 
 SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
 

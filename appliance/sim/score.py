@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections import Counter
 from dataclasses import dataclass, field
 
+from ..share import wilson
 from ..sweep import Status
 from .rig import Act
-
-
-def wilson(right: int, total: int) -> tuple[float, float]:
-    """The 95 % Wilson interval of a share, `right` of `total` > 0."""
-    z, p = 1.96, right / total
-    middle, half = p + z * z / (2 * total), z * math.sqrt(p * (1 - p) / total + z * z / (4 * total * total))
-    low, high = ((middle + d) / (1 + z * z / total) for d in (-half, half))
-    return low, high
 
 
 @dataclass(frozen=True, slots=True)

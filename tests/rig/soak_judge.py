@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from appliance.sim.score import wilson
+from appliance.share import wilson
 from appliance.sweep import Status
 
 Json = Mapping[str, Any]
