@@ -23,7 +23,7 @@ test: $(DESKTOP) ## run the tests (set PALPATE_DATA to the folder of real sweeps
 
 check: lint types test ## lint, types and tests
 
-RIG := PYTHONPATH=tests $(BIN)/python -m rig
+RIG := $(BIN)/python -m tests.rig
 
 rig: rig-tools ## the virtual box: an arm64 Debian with skin, lines and serial port, and a robot around it, at work
 	$(RIG) show
@@ -37,15 +37,15 @@ test-rig: rig-tools ## the tests on the virtual box; COUNTS=full: as often as th
 systemd: $(DESKTOP) ## the unit under a real systemd, in a container (as root; gets a Debian of 380 MB, once)
 	@{ command -v systemd-nspawn && command -v mmdebstrap; } >/dev/null || \
 	  apt-get install -y -q --no-install-recommends systemd-container mmdebstrap
-	PALPATE_SYSTEMD=1 $(BIN)/python -m pytest -q -rP tests/test_systemd.py tests/test_systemd_trial.py tests/test_deploy.py
+	PALPATE_SYSTEMD=1 $(BIN)/python -m pytest -q -rP tests/systemd
 
 soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box and on this machine: docs/soak/
 	$(RIG) build
-	PYTHONPATH=tests $(BIN)/python -m rig.soak --hours $(or $(HOURS),1) --out docs/soak $(SOAK)
+	$(BIN)/python -m tests.rig.soak --hours $(or $(HOURS),1) --out docs/soak $(SOAK)
 
 test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/board-checklist.md)
 	$(PIP) install -e '.[board]'
-	PALPATE_UNDERSIDE=wired $(BIN)/python -m pytest -q -rs tests/test_contract.py
+	PALPATE_UNDERSIDE=wired $(BIN)/python -m pytest -q -rs tests/appliance/io/test_backends.py
 
 rig-ground: rig-tools
 	$(RIG) ground
@@ -56,24 +56,24 @@ rig-tools: $(DESKTOP)
 
 hostile: $(DESKTOP) ## models that mean harm, COUNT=10000 of them, through the box's check and onnxruntime
 	@mkdir -p build
-	PYTHONPATH=tests:. nice $(BIN)/python tests/hostile_fuzz.py --count $(or $(COUNT),10000) --seed 1 --out build/hostile.json
+	nice $(BIN)/python -m tests.campaigns.hostile_fuzz --count $(or $(COUNT),10000) --seed 1 --out build/hostile.json
 
 cuts: $(DESKTOP) ## kill and cut the power at every call that changes a file, while recording and delivering: build/cuts.jsonl
-	PYTHONPATH=tests nice $(BIN)/python -m cuts $(SCENES)
+	nice $(BIN)/python -m tests.cuts $(SCENES)
 
 flips: $(DESKTOP) ## alter a signed bundle in every way and count what a box accepts: build/flips.json
-	PYTHONPATH=tests nice $(BIN)/python -m flips
+	nice $(BIN)/python -m tests.campaigns.flips
 
 fuzz: $(DESKTOP) ## fuzz all that comes from outside: MINUTES=10 of processor time each, TARGETS= some of them
 	$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install atheris==3.0.0
-	PYTHONPATH=tests $(BIN)/python -m fuzz $(TARGETS) --minutes $(or $(MINUTES),10)
+	$(BIN)/python -m tests.fuzz $(TARGETS) --minutes $(or $(MINUTES),10)
 
 lint: $(DESKTOP) ## ruff
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
 machines: $(DESKTOP) ## the same bundles on older x86 and on arm64 (emulated; gets what that needs)
-	PALPATE_MACHINES=1 $(BIN)/python -m pytest -q -rP tests/test_machines.py
+	PALPATE_MACHINES=1 $(BIN)/python -m pytest -q -rP tests/campaigns/test_machines.py
 
 types: $(DESKTOP) ## mypy --strict on the appliance
 	$(BIN)/mypy

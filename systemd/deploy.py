@@ -17,10 +17,11 @@ from pathlib import Path
 
 from fleet import PALPATE, Box, Failed, each, options
 
-from appliance import bundle, signature
-from appliance.classifier import Classifier
-from appliance.clock import SystemClock
-from appliance.errors import ApplianceError, BundleError
+from appliance.bundle import bundle
+from appliance.core.clock import SystemClock
+from appliance.core.errors import ApplianceError, BundleError
+from appliance.deployment import signature
+from appliance.inference.classifier import Classifier
 
 READY_S, STARTS = 60, 5
 """After three starts in vain a box goes back by itself: one that does not come up then will not."""

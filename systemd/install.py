@@ -45,9 +45,11 @@ LINKS = {place: f"{HERE}/share/palpate/{Path(name).name}" for name, place in PLA
 """What leads from these places into the release."""
 PIP = "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index --root-user-action=ignore"
 SELF_TEST = """
-import sys; from pathlib import Path; from appliance import bundle, classifier, clock, config, tasks
+import sys; from pathlib import Path; from appliance.bundle import bundle
+from appliance.cli.commands import model; from appliance.core import clock, config
+from appliance.inference import classifier
 settings = config.load(None, folder=Path(sys.argv[1]))
-for held in (bundle.load(bundle.DEFAULT), tasks.model(settings)):
+for held in (bundle.load(bundle.DEFAULT), model(settings)):
     classifier.Classifier(held, clock.SystemClock()).self_test()
 """
 """The settings are understood, and the bundle that is packaged and the one in use do what they should."""

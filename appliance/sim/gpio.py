@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import gpiod
 from gpiod.line import Bias, Direction, Edge, Value
 
-from ..clock import Clock
+from appliance.core.clock import Clock
 
 Kind = gpiod.EdgeEvent.Type
 Config = Mapping[Iterable[int], gpiod.LineSettings]  # offsets of a chip -> how to request them

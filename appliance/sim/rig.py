@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import wire
-from ..clock import Clock
-from ..sweep import SweepFormat
+from appliance.core.clock import Clock
+from appliance.core.types import SweepFormat
+from appliance.io import packets
 
 PULSE_NS = 20_000_000
 """Length of the robot's pulses."""
@@ -154,8 +154,8 @@ class Board:
         self, fmt: SweepFormat, robot: Robot, clock: Clock, *, packet_frames: int = 6, fifo_frames: int = 750,
         ppm: float = 0.0, latency: Callable[[], int] = lambda: 150_000, serial: str = "SIM0001", first_seq: int = 0,
     ) -> None:  # fmt: skip
-        self.identity = wire.Identity(wire.VERSION, (1, 0, 0), "palpate-sim", serial)
-        self.skin = wire.SkinFormat(fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames)
+        self.identity = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-sim", serial)
+        self.skin = packets.SkinFormat(fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames)
         self.present = True
         self.running = False
         self._robot, self._clock, self._latency = robot, clock, latency
@@ -176,15 +176,15 @@ class Board:
         """Answer a control request; None where it is unknown."""
         now = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
         match request:
-            case wire.Request.IDENTITY:
-                return wire.pack_identity(self.identity)
-            case wire.Request.FORMAT:
-                return wire.pack_format(self.skin)
-            case wire.Request.START:
+            case packets.Request.IDENTITY:
+                return packets.pack_identity(self.identity)
+            case packets.Request.FORMAT:
+                return packets.pack_format(self.skin)
+            case packets.Request.START:
                 if not self.running:
                     self.running, self._next, self._arrival_ns = True, now, None
                 return b""
-            case wire.Request.STOP:
+            case packets.Request.STOP:
                 self.running = False
                 return b""
         return None
@@ -205,8 +205,8 @@ class Board:
         first = self._next + late
         self._next, self._arrival_ns = first + n, None
         device_us = round((self.frame_ns(first) - self._origin_ns) * self._rate / 1000)
-        flags = wire.Flag.OVERFLOW if late else 0
-        return wire.pack(self._first_seq + first, device_us, self._block(first, n), flags)
+        flags = packets.Flag.OVERFLOW if late else 0
+        return packets.pack(self._first_seq + first, device_us, self._block(first, n), flags)
 
     def _block(self, first: int, n: int) -> NDArray[Any]:
         """Frames `first` to `first + n` of the script; after its end nothing touches the skin."""

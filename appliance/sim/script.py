@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import ConfigError, FormatError
-from ..sweep import SweepFormat
-from . import skin
-from .rig import Act
-from .sets import SweepSet, load_file
+from appliance.core.errors import ConfigError, FormatError
+from appliance.core.sweep_set import SweepSet, load_file
+from appliance.core.types import SweepFormat
+from appliance.sim import skin
+from appliance.sim.rig import Act
 
 SETS = "replay:"
 PAUSE_S = 0.1, 0.14

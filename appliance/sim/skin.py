@@ -15,8 +15,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from ..errors import ConfigError
-from ..sweep import SweepFormat
+from appliance.core.errors import ConfigError
+from appliance.core.types import SweepFormat
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]

@@ -14,9 +14,9 @@ from types import SimpleNamespace
 import usb.backend
 import usb.core
 
-from .. import wire
-from ..clock import Clock
-from .rig import Board
+from appliance.core.clock import Clock
+from appliance.io import packets
+from appliance.sim.rig import Board
 
 VENDOR_ID, PRODUCT_ID = 0x1209, 0x7AC7
 MAX_PACKET = 64
@@ -171,7 +171,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         for request in bytes(data):
             reply = self.board.request(request)
             if reply:
-                self._pending += wire.pack_reply(wire.Request(request), reply)
+                self._pending += packets.pack_reply(packets.Request(request), reply)
         return len(data)
 
     def bulk_read(self, handle: str, ep: int, intf: int, buff: array[int], ms: int) -> int:

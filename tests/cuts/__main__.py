@@ -18,8 +18,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cuts import black_box, calls, delivery, recording, tree
-from cuts.scene import ROOT, Play, Point, Scene, stage
+from tests.cuts import black_box, calls, delivery, recording, tree
+from tests.cuts.scene import ROOT, Play, Point, Scene, stage
 
 SCENES: dict[str, Callable[[Path], Scene]] = {
     "recording": lambda beside: recording.scene(),

@@ -10,9 +10,9 @@ import re
 import sys
 from pathlib import Path
 
-from appliance.black_box import BlackBox
-from cuts import recording
-from cuts.scene import Found, Scene, Step
+from appliance.recording.black_box import BlackBox
+from tests.cuts import recording
+from tests.cuts.scene import Found, Scene, Step
 
 MOST = 2
 """Sweeps that are kept: so few that each run takes old ones away."""
@@ -55,7 +55,7 @@ def scene() -> Scene:
     """Two runs that keep sweeps, the second one in what the first has left."""
 
     def step(name: str) -> Step:
-        return Step(name, lambda folder: [sys.executable, "-m", "cuts.black_box", folder / recording.KEPT])
+        return Step(name, lambda folder: [sys.executable, "-m", "tests.cuts.black_box", folder / recording.KEPT])
 
     return Scene("black-box", lambda folder: None, (step("first"), step("second")), judge)
 

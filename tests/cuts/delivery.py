@@ -16,13 +16,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from subprocess import run
 
-from appliance import bundle, disk, signature
-from appliance.__main__ import main
-from appliance.manifest import SCHEMA
-from appliance.shelf import SHA
-from appliance.trial import Trial
-from cuts.calls import DEADLINE_S, NotFollowed
-from cuts.scene import Found, Scene, Step
+from appliance.bundle import bundle
+from appliance.bundle.manifest import SCHEMA
+from appliance.cli.main import main
+from appliance.core import storage
+from appliance.deployment import signature
+from appliance.deployment.shelf import SHA
+from appliance.deployment.trial import Trial
+from tests.cuts.calls import DEADLINE_S, NotFollowed
+from tests.cuts.scene import Found, Scene, Step
 
 STORE, INCOMING = "store", "store/incoming"
 APART = re.compile(r"store/(incoming/.+|bundles/\.[^/]+/.+)")
@@ -157,7 +159,7 @@ class Shop:
         code, said = _apart(self.words(folder, "accept", again))
         if code:
             return [f"the next delivery ends with {code}: {_end(said)}"]
-        left = [path.name for path in (folder / STORE).iterdir() if path.suffix == disk.PART]
+        left = [path.name for path in (folder / STORE).iterdir() if path.suffix == storage.PART]
         left += [path.name for path in (folder / STORE / "bundles").iterdir() if not SHA.fullmatch(path.name)]
         return [f"{name} is left" for name in left] + self._answers(folder, "after the next delivery", {last})
 
@@ -197,14 +199,14 @@ def _apart(words: list[str]) -> tuple[int, str]:
 def _gone_for_a_moment(path: Path, target: str) -> None:
     path.unlink(missing_ok=True)
     path.symlink_to(target)
-    disk.sync(path.parent)
+    storage.sync(path.parent)
 
 
 WAYS: dict[str, tuple[object, str, Callable[..., object]]] = {
     "crash": (Trial, "stopping", lambda self: os._exit(DIED)),
-    "right": (disk, "put", disk.put),
-    "the link is gone for a moment": (disk, "link", _gone_for_a_moment),
-    "the ledger in place": (disk, "put", Path.write_bytes),
+    "right": (storage, "put", storage.put),
+    "the link is gone for a moment": (storage, "link", _gone_for_a_moment),
+    "the ledger in place": (storage, "put", Path.write_bytes),
 }
 """What is put in place of what; after the first two wrong on purpose, and the judge must find that."""
 

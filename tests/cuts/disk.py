@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from cuts.calls import Call, NotFollowed
-from cuts.tree import NOTHING, Tree, digest
+from tests.cuts.calls import Call, NotFollowed
+from tests.cuts.tree import NOTHING, Tree, digest
 
 MOST_STATES = 4096
 """Of the names at one moment; who leaves more open should have synced long ago."""

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from appliance import disk
-from appliance.clock import SystemClock
-from appliance.errors import FormatError
-from appliance.record import Labels, Recording
-from appliance.sweep import Frames, Status, Sweep, SweepFormat, Verdict, load
-from cuts.scene import Found, Scene, Step
+from appliance.core import storage
+from appliance.core.clock import SystemClock
+from appliance.core.errors import FormatError
+from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load
+from appliance.recording.recording import Labels, Recording
+from tests.cuts.scene import Found, Scene, Step
 
 FORMAT = SweepFormat(4, 4, 750, 40, "uint8")
 KEPT = "kept/sweeps"
@@ -34,7 +34,7 @@ Files = Mapping[Path, bytes]
 
 def record(way: str, folder: Path, session: str) -> None:
     """Record two sweeps, discard the second, record a third; way: how the files get onto the disk."""
-    disk.put_all = WAYS[way]
+    storage.put_all = WAYS[way]
     running = recording(folder, session, lambda line: print(line.decode().strip(), flush=True))
     running.keep(*taken(1))
     running.keep(*taken(2))
@@ -63,31 +63,31 @@ def taken(number: int) -> tuple[Sweep, Verdict]:
 def _aside(files: Files, write: Callable[[Path, bytes], object], settle: Callable[[Path], object]) -> None:
     """Write all files aside, then give them their names; settle: what is done with each name then."""
     for path, data in files.items():
-        write(path.with_name(path.name + disk.PART), data)
+        write(path.with_name(path.name + storage.PART), data)
     for path in files:
-        path.with_name(path.name + disk.PART).replace(path)
+        path.with_name(path.name + storage.PART).replace(path)
         settle(path)
 
 
 def _in_place(files: Files) -> None:
     for path, data in files.items():
-        disk.write(path, data)
-        disk.sync(path.parent)
+        storage.write(path, data)
+        storage.sync(path.parent)
 
 
 def _late(path: Path) -> None:
     with path.open("rb") as file:
         os.fsync(file.fileno())
-    disk.sync(path.parent)
+    storage.sync(path.parent)
 
 
 WAYS: dict[str, Callable[[Files], None]] = {
-    "right": disk.put_all,
-    "no sync of the file": lambda files: _aside(files, Path.write_bytes, lambda path: disk.sync(path.parent)),
-    "no sync of the folder": lambda files: _aside(files, disk.write, lambda path: None),
+    "right": storage.put_all,
+    "no sync of the file": lambda files: _aside(files, Path.write_bytes, lambda path: storage.sync(path.parent)),
+    "no sync of the folder": lambda files: _aside(files, storage.write, lambda path: None),
     "sync after the rename": lambda files: _aside(files, Path.write_bytes, _late),
     "under its own name": _in_place,
-    "description last": lambda files, put=disk.put_all: put(dict(reversed(files.items()))),
+    "description last": lambda files, put=storage.put_all: put(dict(reversed(files.items()))),
 }
 """How files get onto the disk: all but the first are wrong on purpose, and the judge must find that."""
 
@@ -144,7 +144,7 @@ def _goes_on(folder: Path) -> list[str]:
     wrong, there = read(folder)
     if not {"later 1", "later 2"} <= set(there.values()):
         wrong.append("the next run does not store its two sweeps")
-    wrong += [f"the next run leaves {path.name}" for path in folder.glob(f"*{disk.PART}")]
+    wrong += [f"the next run leaves {path.name}" for path in folder.glob(f"*{storage.PART}")]
     wrong += [f"the next run changes {path.name}" for path, data in before.items() if path.read_bytes() != data]
     return wrong
 

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from cuts import calls, tree
-from cuts.calls import Call, NotFollowed, Run
-from cuts.disk import Disk
+from tests.cuts import calls, tree
+from tests.cuts.calls import Call, NotFollowed, Run
+from tests.cuts.disk import Disk
+from tests.factories.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 MEMORY = Path("/dev/shm")
 """Where scenes are best played: what a sync does is known here, and on a real disk it takes its time."""
 BETWEEN = "\n"

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from shutil import rmtree
 
-from fuzz import corpus, seeds
-from fuzz.targets import TARGETS
+from tests.fuzz import corpus, seeds
+from tests.fuzz.targets import TARGETS
 
 WORK = seeds.ROOT / "build" / "fuzz"
 LONGEST_INPUT = 5000
@@ -86,7 +86,7 @@ def _engine(target: str, seconds: float, *options: object) -> Run:
     found = WORK / target / "found"
     rmtree(found, ignore_errors=True)
     found.mkdir()
-    command = [sys.executable, "-m", "fuzz.engine", target, str(seconds), *OPTIONS, f"-artifact_prefix={found}/"]
+    command = [sys.executable, "-m", "tests.fuzz.engine", target, str(seconds), *OPTIONS, f"-artifact_prefix={found}/"]
     begin = _cpu_s()
     log = WORK / target / "log"
     with log.open("wb") as file:

@@ -17,8 +17,8 @@ from tempfile import TemporaryDirectory
 import atheris
 
 with atheris.instrument_imports(include=["appliance", "tomllib"]):
-    from fuzz import targets
-from fuzz.mutators import MUTATORS
+    from tests.fuzz import targets
+from tests.fuzz.mutators import MUTATORS
 
 MEMORY = 1 << 30
 """Bytes that a process may ask for; an input that makes the box ask for more ends in a MemoryError, which is a crash."""

@@ -17,8 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from appliance import bundle, capture, config, sink, sweep
-from appliance.errors import BundleError, ConfigError, FormatError
+from appliance.bundle import bundle
+from appliance.core import config, types
+from appliance.core.errors import BundleError, ConfigError, FormatError
+from appliance.io import robot_link
+from appliance.recording import capture
 
 BOARD = '[trigger]\nstart = "GPIO5"\nstop = "GPIO6"\n'
 NPY = b"\x93NUMPY"
@@ -110,7 +113,7 @@ def _usable(read: bundle.Manifest) -> None:
         assert isinstance(text, str)
         assert text.isprintable(), f"{text!r} cannot be shown"
     for label in read.labels:
-        assert f",{label},".encode("ascii") in sink.sentence("RES", 1, label, "")
+        assert f",{label},".encode("ascii") in robot_link.sentence("RES", 1, label, "")
     for entry in read.files.values():
         assert isinstance(entry, dict)
     assert isinstance(read.figures, dict)
@@ -125,7 +128,7 @@ def recording(data: bytes, folder: Path) -> None:
     (folder / "sweep.json").write_bytes(about)
     (folder / "sweep.npy").write_bytes(magic + table)
     try:
-        got, fmt = sweep.load(folder / "sweep.npy")
+        got, fmt = types.load(folder / "sweep.npy")
     except FormatError as e:
         message = one_line(e)
         assert "sweep.npy" in message
@@ -140,8 +143,8 @@ def recording(data: bytes, folder: Path) -> None:
         assert type(text) is str
         assert text.isprintable(), f"{text!r} cannot be shown"
     assert isinstance(got.share, (int, float))
-    sweep.save(folder / "again.npy", got, fmt)
-    again, form = sweep.load(folder / "again.npy")
+    types.save(folder / "again.npy", got, fmt)
+    again, form = types.load(folder / "again.npy")
     assert form == fmt
     assert again.frames.taxels.tobytes() == got.frames.taxels.tobytes()
     assert dataclasses.replace(again, frames=got.frames) == got
@@ -167,7 +170,7 @@ def played(data: bytes, folder: Path) -> None:
         for edge in play.edges(play.now_ns()):
             assert 0 <= edge.t_ns < 1 << 63, f"an edge at {edge.t_ns} ns"
         for told in play.commands():
-            assert told.name in sink.COMMANDS, f"{told.name!r} is no command"
+            assert told.name in robot_link.COMMANDS, f"{told.name!r} is no command"
         assert play.state.isprintable(), f"{play.state!r} cannot be shown"
         assert 0 <= play.now_ns() < 1 << 63
     assert play.finished, "it does not come to an end"

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from random import Random
 from typing import Any
 
-from appliance import sink, wire
+from appliance.io import packets as wire
+from appliance.io import robot_link
 
 Plain = Callable[[bytes], bytes]
 Mutator = Callable[[bytes, Random, Plain], bytes]
@@ -45,7 +46,7 @@ def sentences(data: bytes, random: Random, plain: Plain) -> bytes:
     """Bytes changed, and then most checksums made right again."""
 
     def seal(match: re.Match[bytes]) -> bytes:
-        right = sink.checksum(match[1].decode("latin-1").encode("ascii", "replace").decode())
+        right = robot_link.checksum(match[1].decode("latin-1").encode("ascii", "replace").decode())
         return match[0] if random.random() < 0.2 else b"$" + match[1] + b"*" + right.encode()
 
     return re.sub(rb"\$([^*\r\n]*)\*..", seal, plain(data))

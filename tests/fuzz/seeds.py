@@ -13,31 +13,35 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from appliance import bundle, config, sink, wire
-from appliance.capture import MAGIC, CaptureWriter
+from appliance.bundle import bundle
+from appliance.core import config
+from appliance.core.types import DIGITS, Frames, Status, Sweep, SweepFormat, save
+from appliance.io import packets, robot_link
+from appliance.io.trigger import Edge, EdgeKind
+from appliance.recording.capture import MAGIC, CaptureWriter
 from appliance.sim import script, skin
-from appliance.sweep import DIGITS, Frames, Status, Sweep, SweepFormat, save
-from appliance.trigger import Edge, EdgeKind
-from fuzz.files import NPY
+from tests.factories.paths import ROOT
+from tests.fuzz.files import NPY
 
-ROOT = Path(__file__).parents[2]
-ENDLESS = wire.HEADER.pack(wire.MAGIC, wire.VERSION, wire.Kind.REPLY, wire.MAX_PAYLOAD, 0, 1, 0, 0, 0, 0, 0)
+ENDLESS = packets.HEADER.pack(
+    packets.MAGIC, packets.VERSION, packets.Kind.REPLY, packets.MAX_PAYLOAD, 0, 1, 0, 0, 0, 0, 0
+)
 """The header of the largest packet there can be; what follows waits for its end."""
 
 
 def unpack() -> list[bytes]:
     """Packets of a simulated sweep, of other skins, of a board that starts anew, and broken ones."""
     frames = next(iter(script.tubes(1, 1))).frames[:60]
-    sent = [wire.pack(2**32 - 12 + 6 * i, 2**32 - 16_000 + 8000 * i, frames[6 * i : 6 * i + 6]) for i in range(5)]
-    others = [wire.pack(7, 9, np.arange(12).reshape(2, 2, 3).astype(d), wire.Flag.OVERFLOW) for d in DIGITS]
-    who = wire.pack_identity(wire.Identity(1, (1, 2, 3), "Palpate skin", "0042"))
-    form = wire.pack_format(wire.SkinFormat(4, 4, "uint8", 750, 750, 6))
-    replies = wire.pack_reply(wire.Request.IDENTITY, who) + wire.pack_reply(wire.Request.FORMAT, form)
-    restarted = wire.pack(900_000, 5, frames[:1]) + wire.pack(0, 6, frames[1:2])
+    sent = [packets.pack(2**32 - 12 + 6 * i, 2**32 - 16_000 + 8000 * i, frames[6 * i : 6 * i + 6]) for i in range(5)]
+    others = [packets.pack(7, 9, np.arange(12).reshape(2, 2, 3).astype(d), packets.Flag.OVERFLOW) for d in DIGITS]
+    who = packets.pack_identity(packets.Identity(1, (1, 2, 3), "Palpate skin", "0042"))
+    form = packets.pack_format(packets.SkinFormat(4, 4, "uint8", 750, 750, 6))
+    replies = packets.pack_reply(packets.Request.IDENTITY, who) + packets.pack_reply(packets.Request.FORMAT, form)
+    restarted = packets.pack(900_000, 5, frames[:1]) + packets.pack(0, 6, frames[1:2])
     swapped = sent[0] + sent[2] + sent[1] + sent[1]
     broken = sent[0][:60] + sent[1] + b"\x50" + sent[2][:-1] + b"\0" + sent[3]
-    newer = wire.pack_reply(wire.Request.IDENTITY, b"\x09", version=9)
-    largest = wire.pack(1, 2, np.zeros((wire.MAX_FRAMES, 4, 4), np.uint8))
+    newer = packets.pack_reply(packets.Request.IDENTITY, b"\x09", version=9)
+    largest = packets.pack(1, 2, np.zeros((packets.MAX_FRAMES, 4, 4), np.uint8))
     return [
         b"".join(sent),
         largest,
@@ -55,10 +59,10 @@ def unpack() -> list[bytes]:
 
 def command() -> list[bytes]:
     """Each command as a program and as a person sends it, the document's sentences, and lines that are none."""
-    sealed = [sink.sentence(name, *["plastic rough"] * (name in sink.TOLD)) for name in sink.COMMANDS]
+    sealed = [robot_link.sentence(name, *["plastic rough"] * (name in robot_link.TOLD)) for name in robot_link.COMMANDS]
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
     written = [s.encode() + b"\r\n" for s in re.findall(r"`(\$PPLP[^`]*)`", protocol)]
-    by_hand = [b"PPLP," + name.encode() + b"\n" for name in sink.COMMANDS]
+    by_hand = [b"PPLP," + name.encode() + b"\n" for name in robot_link.COMMANDS]
     return [b"".join(sealed), b"".join(by_hand), *sealed, *written, b"$PPLP,ID*00\r\n", b"x" * 130 + b"\nPPLP,NEW\n"]
 
 
@@ -101,7 +105,7 @@ def capture() -> list[bytes]:
         writer.state(begin, "streaming")
         for i in range(6):
             now = begin + i * 8_000_000
-            writer.transfer(now, wire.pack(6 * i, 8000 * i, frames[6 * i : 6 * i + 6]))
+            writer.transfer(now, packets.pack(6 * i, 8000 * i, frames[6 * i : 6 * i + 6]))
             if i in (2, 4):
                 writer.edges(now + 2, [Edge((EdgeKind.START, EdgeKind.STOP)[i // 4], now + 1)])
         writer.command(begin + 50_000_000, "NEW")
@@ -119,9 +123,9 @@ SEEDS: dict[str, Callable[[], list[bytes]]] = {
 def words(target: str) -> Sequence[bytes]:
     """What the target's format is made of."""
     if target == "unpack":
-        return [wire.MAGIC, ENDLESS, *(b"%c%c" % (wire.VERSION, kind) for kind in wire.Kind)]
+        return [packets.MAGIC, ENDLESS, *(b"%c%c" % (packets.VERSION, kind) for kind in packets.Kind)]
     if target == "command":
-        return [b"$PPLP,", b"*", b"\r\n", b"\xff", *(name.encode() for name in sink.COMMANDS)]
+        return [b"$PPLP,", b"*", b"\r\n", b"\xff", *(name.encode() for name in robot_link.COMMANDS)]
     if target == "settings":
         groups = {
             f.name: type(getattr(config.load(None, site=Path("/dev/null")), f.name)) for f in fields(config.Config)

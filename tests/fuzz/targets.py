@@ -16,11 +16,12 @@ from operator import xor
 from pathlib import Path
 from typing import Any
 
-from appliance import sensor, sink, wire
-from appliance.errors import FormatError, SensorMismatch
-from appliance.sweep import SweepFormat
-from fuzz import files
-from fuzz.files import one_line
+from appliance.core.errors import FormatError, SensorMismatch
+from appliance.core.types import SweepFormat
+from appliance.io import packets as wire
+from appliance.io import robot_link, usb_sensor
+from tests.fuzz import files
+from tests.fuzz.files import one_line
 
 Target = Callable[[bytes, Path], None]
 
@@ -99,8 +100,8 @@ def unpack(data: bytes, folder: Path) -> None:
 
 def _stream(data: bytes, cut: int, sent: int) -> None:
     """Frames that a sensor makes of it: numbers rise, and each frame that came is out, stale or lost."""
-    tally = sensor.Tally()
-    stream = sensor.Stream(SKIN, tally)
+    tally = usb_sensor.Tally()
+    stream = usb_sensor.Stream(SKIN, tally)
     stream.restart()
     numbers = [-1]
     try:
@@ -144,7 +145,7 @@ def _replies(data: bytes, replies: list[wire.Reply]) -> None:
 
 def command(data: bytes, folder: Path) -> None:
     """sink.parse: one Command a line, in parts as at once, a bounded rest, and an answer that can be sent to each."""
-    got, rest = sink.parse(data)
+    got, rest = robot_link.parse(data)
     assert len(rest) <= LINE + 1
     *lines, last = re.split(rb"[\r\n]+", data)
     lines = [line for line in lines if line]
@@ -154,8 +155,8 @@ def command(data: bytes, folder: Path) -> None:
     for told in got:
         _answer(told)
     for cut in cuts(data):
-        first, left = sink.parse(data[:cut])
-        then, left = sink.parse(data[cut:], left)
+        first, left = robot_link.parse(data[:cut])
+        then, left = robot_link.parse(data[cut:], left)
         assert (first + then, left) == (got, rest), f"cut at {cut}, other commands come out"
 
 
@@ -163,15 +164,20 @@ def _is_command(line: bytes, name: str) -> bool:
     """Whether a line is a command by PROTOCOL.md, and this one."""
     body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
     said, comma, _ = body.removeprefix(b"PPLP,").decode("ascii", "replace").partition(",")
-    known = body.startswith(b"PPLP,") and said == name and name in sink.COMMANDS and bool(comma) == (name in sink.TOLD)
+    known = (
+        body.startswith(b"PPLP,")
+        and said == name
+        and name in robot_link.COMMANDS
+        and bool(comma) == (name in robot_link.TOLD)
+    )
     known = known and not re.search(rb"[^ -~]|[!\\~^]", body)  # what a sentence may not hold (PROTOCOL.md)
     sealed = not star or given.upper() == b"%02X" % reduce(xor, body, 0)
     return known and sealed and len(line) <= LINE
 
 
-def _answer(told: sink.Command) -> None:
+def _answer(told: robot_link.Command) -> None:
     """The sentence that answers a command has all its fields, whatever stood in the line."""
-    line = sink.sentence("ANS", told.name, "error" if told.error else "ok", told.error)
+    line = robot_link.sentence("ANS", told.name, "error" if told.error else "ok", told.error)
     assert len(line) <= LINE
     body, given = line.removeprefix(b"$").removesuffix(b"\r\n").split(b"*")
     assert body.decode("ascii").isprintable()

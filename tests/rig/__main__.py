@@ -12,12 +12,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from machines import Missing
-
-from . import notes
-from .cell import Cell
-from .image import ground, image, lacking
-from .machine import Machine
+from tests.factories.emulated_machines import Missing
+from tests.rig import notes
+from tests.rig.cell import Cell
+from tests.rig.image import ground, image, lacking
+from tests.rig.machine import Machine
 
 
 def show(cell: Cell, sweeps: int) -> None:

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from appliance.clock import SystemClock
+from appliance.core.clock import SystemClock
 from appliance.sim import rig, script, skin
-from appliance.sim.score import Answer
-
-from .machine import Machine
+from appliance.tools.score import Answer
+from tests.rig.machine import Machine
 
 FIFO = 22_500
 """Frames that a board holds: half a minute, so that what is lost was lost by the box and not by an emulator that stood

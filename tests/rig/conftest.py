@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from machines import Missing
 
-from . import notes
-from .cell import Cell
-from .image import Image
-from .image import image as make_image
-from .machine import Machine
+from tests.factories.emulated_machines import Missing
+from tests.rig import notes
+from tests.rig.cell import Cell
+from tests.rig.image import Image
+from tests.rig.image import image as make_image
+from tests.rig.machine import Machine
 
 HOW = os.environ.get("PALPATE_RIG", "")
 

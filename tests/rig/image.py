@@ -16,12 +16,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import machines
-from machines import ROOT, Missing, run, whole
+from tests.factories import emulated_machines
+from tests.factories.emulated_machines import ROOT, Missing, run, whole
 
 HERE = Path(__file__).parent
 GUEST = HERE / "guest"
-CACHE = machines.HOME.parent / "rig"
+CACHE = emulated_machines.HOME.parent / "rig"
 SUITE = "bookworm"
 GUEST_PYTHON = "3.11"
 """Python of that suite."""
@@ -107,7 +107,7 @@ def _need(tools: Iterable[str]) -> None:
 
 
 def _ground_name() -> str:
-    parts = [machines.LOCK, HERE / "arm.py", GUEST / "agent.py", GUEST / "agent.service", GUEST / "init"]
+    parts = [emulated_machines.LOCK, HERE / "arm.py", GUEST / "agent.py", GUEST / "agent.service", GUEST / "init"]
     said = repr((SUITE, PACKAGES, MODULES, EARLY, LINES, DISK, MACHINE))
     return f"ground-{_hash(parts, said)}"
 
@@ -129,14 +129,14 @@ def _hash(parts: Iterable[Path], said: str) -> str:
 
 
 def _make_ground(part: Path) -> None:
-    apt = machines.apt(part, "arm64")
+    apt = emulated_machines.apt(part, "arm64")
     about = run(*apt, "apt-cache", "depends", "linux-image-arm64").split()
     package = next(word for word in about if word.startswith("linux-image-6") or word[12:13].isdigit())
     subprocess.run([*apt, "apt-get", "-qq", "download", package, "busybox-static"], cwd=part, check=True)
     for deb in part.glob("*.deb"):
         run("dpkg-deb", "-x", deb, part / ("kernel" if "linux-image" in deb.name else "busybox"))
-    run(*machines.PIP, "download", *machines.ARM_WHEELS, "--python-version", GUEST_PYTHON,
-        "--require-hashes", "-r", machines.LOCK, "-d", part / "wheels")  # fmt: skip
+    run(*emulated_machines.PIP, "download", *emulated_machines.ARM_WHEELS, "--python-version", GUEST_PYTHON,
+        "--require-hashes", "-r", emulated_machines.LOCK, "-d", part / "wheels")  # fmt: skip
     version = package.removeprefix("linux-image-")
     _make_root(part, version)
     _make_ramdisk(part, version)
@@ -150,14 +150,14 @@ def _make_ground(part: Path) -> None:
 
 def _make_root(part: Path, version: str) -> None:
     """Debian with the box's virtual environment, the agent and the modules of its kernel."""
-    shutil.copy(machines.LOCK, part / "wheels")
+    shutil.copy(emulated_machines.LOCK, part / "wheels")
     (part / "wheels").chmod(0o755)
     pip = "/opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --find-links /wheels"
     hooks = (
         f"copy-in {part / 'wheels'} /",
         f"mkdir -p $1/opt/rig && cp {GUEST}/agent.py $1/opt/rig/ && cp {GUEST}/agent.service $1/etc/systemd/system/",
         'chroot "$1" python3 -m venv /opt/palpate',
-        f'chroot "$1" {pip} --require-hashes -r /wheels/{machines.LOCK.name}',
+        f'chroot "$1" {pip} --require-hashes -r /wheels/{emulated_machines.LOCK.name}',
         'rm -r "$1/wheels"; echo box > "$1/etc/hostname"; echo uninitialized > "$1/etc/machine-id"; : > "$1/etc/fstab"',
         'chroot "$1" systemctl enable agent.service serial-getty@ttyAMA0.service',
         'chroot "$1" systemctl mask apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer e2scrub_reap.service '
@@ -220,12 +220,12 @@ def _make_tree(path: Path) -> None:
 
 
 def _make_box(part: Path, on: Path) -> None:
-    from .machine import Machine
+    from tests.rig.machine import Machine
 
     code, source = part / "code", part / "source"
     code.mkdir()
     source.mkdir()
-    machines.wheel(code, source)
+    emulated_machines.wheel(code, source)
     for room in ("systemd", "firmware_config"):
         shutil.copytree(ROOT / room, code / room)
     for file in ("install.sh", "palpate.toml"):

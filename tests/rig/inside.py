@@ -10,12 +10,10 @@ from collections.abc import Iterable
 from importlib.metadata import distribution
 from pathlib import Path
 
-from machines import ROOT
-from undersides import Skin, skins
-
-from appliance.clock import SystemClock
-
-from .machine import Machine
+from appliance.core.clock import SystemClock
+from tests.backends import Skin, skins
+from tests.factories.emulated_machines import ROOT
+from tests.rig.machine import Machine
 
 RUNNER = ("pytest", "pluggy", "iniconfig", "pygments")
 """Pure Python, so this machine's installation serves the guest; `packaging` is in the box's lock."""

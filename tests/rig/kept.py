@@ -17,12 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from machines import ROOT
-
-from appliance.sink import checksum
-from appliance.sweep import Status, Sweep, load
-
-from .machine import Machine
+from appliance.core.types import Status, Sweep, load
+from appliance.io.robot_link import checksum
+from tests.factories.emulated_machines import ROOT
+from tests.rig.machine import Machine
 
 KEPT = "/var/lib/palpate/kept"
 DROP_IN = "/etc/systemd/system/palpate.service.d/arguments.conf"

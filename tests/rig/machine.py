@@ -16,12 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from machines import run
-
-from .far_end import FarEnd
-from .image import LINES, MACHINE, Image
-from .lines import GuestLines
-from .usbredir import Peer
+from tests.factories.emulated_machines import run
+from tests.rig.far_end import FarEnd
+from tests.rig.image import LINES, MACHINE, Image
+from tests.rig.lines import GuestLines
+from tests.rig.usbredir import Peer
 
 START_S = 20
 """Longest wait for QEMU to open its sockets, or to load a snapshot."""

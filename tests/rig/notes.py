@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from machines import ROOT
+from tests.factories.emulated_machines import ROOT
 
 FILE = ROOT / "build" / "rig" / "faults.jsonl"
 

@@ -20,17 +20,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from appliance.core.provenance import commit
+from appliance.io.robot_link import checksum
 from appliance.sim import skin
-from appliance.sim.bench import commit
-from appliance.sim.score import Answer
-from appliance.sink import checksum
+from appliance.tools.score import Answer
+from tests.factories.paths import ROOT
+from tests.rig import soak_judge, soak_page
+from tests.rig.soak_boxes import BoxUnderTest, Gone, Script, ThisMachine
+from tests.rig.soak_guest import VirtualBox
+from tests.rig.soak_judge import Run
 
-from . import soak_judge, soak_page
-from .soak_boxes import BoxUnderTest, Gone, Script, ThisMachine
-from .soak_guest import VirtualBox
-from .soak_judge import Run
-
-ROOT = Path(__file__).parent.parent.parent
 BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
 Clock = Callable[[], float]
 WAIT_S, SAMPLE_S, MINUTE_S = 0.2, 10.0, 60.0
@@ -283,7 +282,7 @@ def _together(arguments: list[str]) -> bool:
         if missing := kind.missing():
             print(f"{name}: left out, {missing}", flush=True)
         else:
-            command = [sys.executable, "-m", "rig.soak", "--box", name, *arguments]
+            command = [sys.executable, "-m", "tests.rig.soak", "--box", name, *arguments]
             children.append(subprocess.Popen(command, cwd=ROOT / "tests", start_new_session=True))
 
     def pass_on(number: int, frame: object) -> None:

@@ -25,14 +25,14 @@ from typing import Any, Protocol
 import numpy as np
 import onnxruntime as ort
 
-from appliance import bundle
-from appliance.classifier import Classifier
-from appliance.clock import SystemClock
-from appliance.sim import rig, script, skin, terminal
-from appliance.sim.score import Answer
-from appliance.sweep import Frames, Status, Sweep
-
-from .soak_judge import said
+from appliance.bundle import bundle
+from appliance.core.clock import SystemClock
+from appliance.core.types import Frames, Status, Sweep
+from appliance.inference.classifier import Classifier
+from appliance.sim import rig, script, skin
+from appliance.tools import pseudo_terminal
+from appliance.tools.score import Answer
+from tests.rig.soak_judge import said
 
 STOP_S = 30
 """Longest wait for a box to end after it was told to."""
@@ -175,7 +175,7 @@ class ThisMachine:
     def start(self, seed: int, sweeps: Script) -> None:
         """As BoxUnderTest."""
         self._robot = Reckoned(sweeps)
-        self._far, port = self._stack.enter_context(terminal.pair())
+        self._far, port = self._stack.enter_context(pseudo_terminal.pair())
         command = [Path(sys.executable).with_name("palpate"), "run", "--sim", "skin", "--seed", str(seed)]
         self._log = Path(self._stack.enter_context(tempfile.TemporaryDirectory())) / "log"
         self._box = subprocess.Popen([*command, "--set", f"serial.port={port}"], stderr=self._log.open("wb"))

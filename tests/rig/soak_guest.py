@@ -20,16 +20,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machines import LOCK
 
-from appliance import wire
-from appliance.clock import SystemClock
+from appliance.core.clock import SystemClock
+from appliance.io import packets
 from appliance.sim import rig, script, skin
-
-from . import image
-from .cell import IDLE
-from .machine import Failed, Machine
-from .soak_boxes import Gone, Script, process
+from tests.factories.emulated_machines import LOCK
+from tests.rig import image
+from tests.rig.cell import IDLE
+from tests.rig.machine import Failed, Machine
+from tests.rig.soak_boxes import Gone, Script, process
 
 READY_S = 180
 LOCKED = re.compile(r"^onnxruntime==(\S+)", re.M)
@@ -124,7 +123,7 @@ class VirtualBox:
 
     def _note(self, packet: bytes) -> bytes:
         """Take note of the last frame of a packet that goes to the guest; the packet as it is."""
-        _, _, _, _, _, count, *_, seq, _ = wire.HEADER.unpack_from(packet)
+        _, _, _, _, _, count, *_, seq, _ = packets.HEADER.unpack_from(packet)
         if self._anew and self._sent:
             # what it took from the box's STOP to its START it was asked not to send
             self._thrown += seq - self._thrown - self._sent[-1][1]
@@ -134,7 +133,7 @@ class VirtualBox:
 
     def _request(self, request: int) -> bytes | None:
         """Take note of a START; the board's answer."""
-        self._anew |= request == wire.Request.START and not self._board.running
+        self._anew |= request == packets.Request.START and not self._board.running
         return self._answer(request)
 
     def process(self) -> tuple[int, int, float, int, int]:

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from appliance.share import wilson
-from appliance.sweep import Status
+from appliance.core.statistics import wilson
+from appliance.core.types import Status
 
 Json = Mapping[str, Any]
 ANSWER = ("s", "number", "touched", "status", "label", "alone", "latency_ms", "lost")

@@ -14,10 +14,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from train import page
-from train.ink import ACCENT, FAINT, INK, SMALL, WIDTH, add, scale, svg
-
-from .soak_judge import ANSWER, GROWTH_KIB_H, IN_FLIGHT, SAMPLE, SECURE_MIN, band, columns, estimate, kind, targets
+from tests.rig.soak_judge import (
+    ANSWER,
+    GROWTH_KIB_H,
+    IN_FLIGHT,
+    SAMPLE,
+    SECURE_MIN,
+    band,
+    columns,
+    estimate,
+    kind,
+    targets,
+)
+from train.reports import html
+from train.reports.plot_style import ACCENT, FAINT, INK, SMALL, WIDTH, add, scale, svg
 
 Json = Mapping[str, Any]
 LOOKS = {"color": ACCENT, "linewidth": 1.8}, {"color": INK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))}
@@ -30,7 +40,7 @@ MARKS = {True: "reached", False: "not reached", None: "too short to tell"}
 def tell(told: Json) -> tuple[str, str]:
     """The page (HTML) and its picture (SVG)."""
     picture = charts(told)
-    return page.page("Soak", opening(told), drawn(told, picture), figures(told), faults(told), run(told)), picture
+    return html.page("Soak", opening(told), drawn(told, picture), figures(told), faults(told), run(told)), picture
 
 
 def opening(told: Json) -> str:
@@ -42,19 +52,19 @@ def opening(told: Json) -> str:
         reached = MARKS[False if False in marks else None if None in marks else True]
         rows.append([each[0][0], each[0][1], *(came for _, _, came, _ in each), reached])
     hours = ", ".join(f"{_hours(box['sums']['hours'])} on {_the(name)}" for name, box in boxes.items())
-    left = [page.text(f"Left out: {_the(name)}; {why}.", kind="note") for name, why in told["left_out"].items()]
+    left = [html.text(f"Left out: {_the(name)}; {why}.", kind="note") for name, why in told["left_out"].items()]
     return "\n".join([
-        page.text(f"Sweeps without pause, in real time: {hours or 'none yet'}. The skin is simulated in both boxes; each sentence "
+        html.text(f"Sweeps without pause, in real time: {hours or 'none yet'}. The skin is simulated in both boxes; each sentence "
                   "is compared with what the robot did."),
         *left,
-        page.table(["what", "wanted", *boxes, ""], rows, texts=(0,)) if rows else "",
+        html.table(["what", "wanted", *boxes, ""], rows, texts=(0,)) if rows else "",
     ])  # fmt: skip
 
 
 def drawn(told: Json, picture: str) -> str:
     """The charts with what they show."""
     names = " and ".join(f"{_the(name)} {'dashed' if i else 'in blue'}" for i, name in enumerate(told["boxes"]))
-    return page.heading("Over time") + page.figure(
+    return html.heading("Over time") + html.figure(
         picture,
         f"{names[:1].upper()}{names[1:]}. Memory is resident memory, latency the box's own figure for each sweep, loss all "
         "frames of a minute that never came, and the band is where the count of wrong verdicts lies in 95 % of cases if the box "
@@ -88,7 +98,7 @@ def figures(told: Json) -> str:
         ("share of a core", lambda s: f"{s['cpu']:.3f}"),
     ]
     rows = [[what, *(of(s) for s in sums)] for what, of in lines]
-    return page.heading("Sums") + page.table(["", *told["boxes"]], rows, texts=(0,)) + page.text(
+    return html.heading("Sums") + html.table(["", *told["boxes"]], rows, texts=(0,)) + html.text(
         "Shares with 95 % Wilson intervals. Refused are all answers without a label, such as unknown, and count neither as right "
         f"nor as wrong. Memory is flat where the 95 % interval of its slope ends below {GROWTH_KIB_H:g} KiB an hour, a bound set "
         f"before the first run, and told only of second halves of {SECURE_MIN} minutes or more. Frames that the board "
@@ -100,14 +110,14 @@ def faults(told: Json) -> str:
     """What must not be and was."""
     rows = [[name, f"{at_s:.1f}", what] for name, box in told["boxes"].items() for run in box["runs"]
             for at_s, what in run["faults"]]  # fmt: skip
-    return page.heading("Faults") + page.table(["box", "s", "what"], rows, texts=(0, 2)) if rows else ""
+    return html.heading("Faults") + html.table(["box", "s", "what"], rows, texts=(0, 2)) if rows else ""
 
 
 def run(told: Json) -> str:
     """What was run."""
     names = ("what", "machine", "versions", "commit", "seed", "format", "started", "runs")
     rows = [[name, *(_about(box, name) for box in told["boxes"].values())] for name in names]
-    return page.heading("What was run") + page.table(["", *told["boxes"]], rows, texts=range(len(told["boxes"]) + 1))
+    return html.heading("What was run") + html.table(["", *told["boxes"]], rows, texts=range(len(told["boxes"]) + 1))
 
 
 def charts(told: Json) -> str:

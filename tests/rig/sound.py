@@ -11,14 +11,13 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from appliance import bundle
-from appliance.classifier import Classifier
-from appliance.clock import SystemClock
+from appliance.bundle import bundle
+from appliance.core.clock import SystemClock
+from appliance.core.types import Frames, Status, Sweep
+from appliance.inference.classifier import Classifier
 from appliance.sim import rig, skin
-from appliance.sim.score import Answer
-from appliance.sweep import Frames, Status, Sweep
-
-from .cell import BEGUN_S, Cell, Touch
+from appliance.tools.score import Answer
+from tests.rig.cell import BEGUN_S, Cell, Touch
 
 FIELDS = (
     "time", "state", "sweeping", "answered", "received", "lost", "garbage", "enumerations", "dropped", "bundle",

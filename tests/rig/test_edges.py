@@ -13,10 +13,9 @@ from contextlib import contextmanager
 import pytest
 
 from appliance.sim import script
-from appliance.sim.score import Answer
-
-from .cell import Cell, Touch
-from .sound import comes_back, known, let_go, not_wrong, until
+from appliance.tools.score import Answer
+from tests.rig.cell import Cell, Touch
+from tests.rig.sound import comes_back, known, let_go, not_wrong, until
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]

@@ -7,11 +7,10 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from undersides import remote
-
-from .image import Image
-from .inside import Bench, pack
-from .machine import Machine
+from tests.backends import remote
+from tests.rig.image import Image
+from tests.rig.inside import Bench, pack
+from tests.rig.machine import Machine
 
 PYTEST = "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider test_contract.py"
 

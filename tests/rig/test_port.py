@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appliance import bundle
+from appliance.bundle import bundle
+from appliance.io.robot_link import MAX_LINE, checksum
 from appliance.sim import script
-from appliance.sim.score import Answer
-from appliance.sink import MAX_LINE, checksum
-
-from .cell import Cell, Touch
-from .far_end import FarEnd
-from .sound import known, not_wrong
+from appliance.tools.score import Answer
+from tests.rig.cell import Cell, Touch
+from tests.rig.far_end import FarEnd
+from tests.rig.sound import known, not_wrong
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]

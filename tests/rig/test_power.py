@@ -18,16 +18,15 @@ from pathlib import Path
 
 import pytest
 
+from appliance.core.types import Frames, Status, Sweep
+from appliance.io.robot_link import sentence
 from appliance.sim import script, skin
-from appliance.sink import sentence
-from appliance.sweep import Frames, Status, Sweep
-
-from .cell import Cell, Touch
-from .conftest import HOW
-from .image import Image
-from .kept import KEPT, Ledger, found, lost, owed, runs_with, sweeps, whole
-from .machine import Machine
-from .sound import known
+from tests.rig.cell import Cell, Touch
+from tests.rig.conftest import HOW
+from tests.rig.image import Image
+from tests.rig.kept import KEPT, Ledger, found, lost, owed, runs_with, sweeps, whole
+from tests.rig.machine import Machine
+from tests.rig.sound import known
 
 START_S = 12
 """The service takes about so long from a kill to READY, in the emulator."""

@@ -13,15 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from appliance.capture import Playback
+from appliance.recording.capture import Playback
 from appliance.sim import script
-from appliance.sim.score import Answer
-
-from .cell import Cell
-from .conftest import HOW
-from .image import GUEST_PYTHON
-from .kept import KEPT, runs_with
-from .sound import TRIES, begin, known, not_wrong, state, until_state
+from appliance.tools.score import Answer
+from tests.rig.cell import Cell
+from tests.rig.conftest import HOW
+from tests.rig.image import GUEST_PYTHON
+from tests.rig.kept import KEPT, runs_with
+from tests.rig.sound import TRIES, begin, known, not_wrong, state, until_state
 
 CAPTURE = "/run/capture"
 ROOM = "mount -t tmpfs -o remount,size={},nr_inodes={} none {}"

@@ -16,14 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from appliance.core.types import EPOCH_BITS, Sweep, load
 from appliance.sim import rig, script, skin
-from appliance.sweep import EPOCH_BITS, Sweep, load
-
-from .cell import Cell
-from .conftest import HOW
-from .kept import KEPT, runs_with
-from .machine import Machine
-from .sound import LATE, known, not_wrong
+from tests.rig.cell import Cell
+from tests.rig.conftest import HOW
+from tests.rig.kept import KEPT, runs_with
+from tests.rig.machine import Machine
+from tests.rig.sound import LATE, known, not_wrong
 
 Note = Callable[[str, str, int], None]
 
@@ -34,7 +33,7 @@ TRIPS, SWEEPS, ATTEMPTS = 400, 5, 3
 seconds, which looks as if the board's clock drifted.
 """
 SLOPE_PPM, SPAN_S = 200, 20
-"""What appliance.clock.DeviceClock takes for possible, and how far it looks back."""
+"""What appliance.core.clock.DeviceClock takes for possible, and how far it looks back."""
 LONGEST_WAY_NS = 5_000_000
 """From a frame to the program by the shortest way, in an emulator: the box cannot tell it from the clock's offset."""
 CASES = {

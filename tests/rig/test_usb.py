@@ -15,11 +15,10 @@ from pathlib import Path
 import pytest
 
 from appliance.sim import script
-
-from .cell import Cell
-from .conftest import HOW
-from .sound import begin, comes_back, known, let_go, not_wrong, only_answer, state, until, until_state
-from .usbredir import Peer
+from tests.rig.cell import Cell
+from tests.rig.conftest import HOW
+from tests.rig.sound import begin, comes_back, known, let_go, not_wrong, only_answer, state, until, until_state
+from tests.rig.usbredir import Peer
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]

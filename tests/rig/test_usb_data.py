@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from appliance import wire
+from appliance.io import packets
 from appliance.sim import script
-
-from .cell import Cell
-from .conftest import HOW
-from .sound import begin, comes_back, known, not_wrong, only_answer, state, until, until_state
+from tests.rig.cell import Cell
+from tests.rig.conftest import HOW
+from tests.rig.sound import begin, comes_back, known, not_wrong, only_answer, state, until, until_state
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]
@@ -43,13 +42,13 @@ class Fault:
     counter: str = ""
 
 
-def changed(how: Callable[[wire.Packet], tuple[int, int]]) -> Callable[[], Mangle]:
+def changed(how: Callable[[packets.Packet], tuple[int, int]]) -> Callable[[], Mangle]:
     """Transfers whose packets have another number and another time, as `how` says; all else is right, the CRC too."""
 
     def mangle(data: bytes) -> bytes:
-        packet = wire.unpack(data).packets[0]
+        packet = packets.unpack(data).packets[0]
         seq, t_us = how(packet)
-        return wire.pack(seq % COUNTS, t_us % COUNTS, packet.taxels, packet.flags)
+        return packets.pack(seq % COUNTS, t_us % COUNTS, packet.taxels, packet.flags)
 
     return lambda: mangle
 
@@ -60,7 +59,7 @@ def mirrored(pace: int) -> Callable[[], Mangle]:
     def make() -> Mangle:
         first: list[int] = []
 
-        def how(packet: wire.Packet) -> tuple[int, int]:
+        def how(packet: packets.Packet) -> tuple[int, int]:
             first[:] = first or [packet.t_us]
             return packet.seq, first[0] + pace * (packet.t_us - first[0])
 
@@ -72,7 +71,7 @@ def mirrored(pace: int) -> Callable[[], Mangle]:
 def noise() -> Mangle:
     """Bytes that mean nothing, with a magic here and there."""
     rng = np.random.default_rng(5)
-    return lambda data: wire.MAGIC + rng.bytes(len(data) - 2)
+    return lambda data: packets.MAGIC + rng.bytes(len(data) - 2)
 
 
 def babble() -> Mangle:

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import pytest
 
 from appliance.sim import script
-
-from .cell import Cell
-from .conftest import HOW
-from .sound import comes_back, known, state, until_state
-from .usbredir import Descriptors
+from tests.rig.cell import Cell
+from tests.rig.conftest import HOW
+from tests.rig.sound import comes_back, known, state, until_state
+from tests.rig.usbredir import Descriptors
 
 Note = Callable[[str, str, int], None]
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable
 
-from appliance import bundle
-
-from .cell import Cell
+from appliance.bundle import bundle
+from tests.rig.cell import Cell
 
 LABELS = bundle.load(bundle.DEFAULT).manifest.labels
 

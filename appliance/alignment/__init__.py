@@ -1,0 +1,1 @@
+"""Shows where the contact lies on the skin, in a terminal and as a page."""

@@ -1,0 +1,161 @@
+"""The room of the terminal that shows how the skin is placed. In: Views. Out: a picture drawn over and over, or plain lines.
+
+Everything can be told without colour: load by five characters and its digits, places by signs. Where the output is no
+terminal, or a dumb one, it gets one line a second.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Self, TextIO
+
+from appliance.signal.contact import Point
+
+if TYPE_CHECKING:
+    from appliance.alignment.live import View
+
+LINE_NS = 1_000_000_000
+"""Between two plain lines."""
+ENTER, LEAVE = "\033[?1049h\033[?25l", "\033[?1049l\033[?25h"
+"""To a screen of its own without a cursor, and back: what stood in the terminal before is there again."""
+BLOCKS, ASCII = " ░▒▓█◉+┌─┐│└┘", " .:*#@+.-.|''"
+"""Five loads, the contact's centre, a trained position and a frame: for UTF-8, and for any terminal."""
+LEFT, TOP, SPARE = 8, 6, 12
+"""Where the grid begins, and how many lines are not the grid's."""
+BOLD, PLAIN = "\033[1m", "\033[0m"
+MARKED = "\033[1;7m"
+HEAT = (236, 23, 30, 37, 79, 158)
+"""Colours of loads in a terminal that knows 256, from none to the strongest."""
+
+
+class Screen:
+    """Shows Views on `out`; `address`: of the page, where there is one. Leaves the terminal as it found it."""
+
+    def __init__(self, out: TextIO, address: str = "") -> None:
+        self._out, self._address = out, address
+        kind = os.environ.get("TERM", "dumb")
+        self._live = out.isatty() and kind != "dumb"
+        self._colours = "256" in kind
+        self._signs = BLOCKS if (out.encoding or "").lower().replace("-", "") == "utf8" else ASCII
+        self._next_ns = 0
+
+    def __enter__(self) -> Self:
+        self._write(ENTER if self._live else f"page: {self._address}\n" if self._address else "")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._write(LEAVE if self._live else "")
+
+    def show(self, view: View, now_ns: int) -> None:
+        """Draw `view` over the one before, in one write so that nothing flickers; or say it in a line, once a second."""
+        if self._live:
+            width, height = os.get_terminal_size(self._out.fileno())
+            lines = Canvas(view, self._signs, width or 80, height or 24, self._address).lines(self._colours)
+            self._write("\033[H" + "".join(f"{line}\033[K\n" for line in lines[:-1]) + f"{lines[-1]}\033[J")
+        elif now_ns >= self._next_ns:
+            self._next_ns = now_ns + LINE_NS
+            self._write(line(view) + "\n")
+
+    def _write(self, text: str) -> None:
+        self._out.write(text)
+        self._out.flush()
+
+
+def line(view: View) -> str:
+    """A View in one line, the words first."""
+    at = f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {unit(view)}" if view.centre else ""
+    return f"{'SIMULATED  ' * (view.source != 'usb')}{view.said}{at}  ({view.todo})"
+
+
+def unit(view: View) -> str:
+    """What a View's places are counted in."""
+    return "mm" if view.place else "taxels"
+
+
+class Canvas:
+    """A View as characters, each with a style, cut to the terminal's size."""
+
+    def __init__(self, view: View, signs: str, width: int, height: int, address: str) -> None:
+        self._view, self._signs = view, signs
+        rows, cols = view.shape
+        self._cell = max(1, min(3, (height - SPARE) // rows)), max(4, min(8, (width - LEFT) // cols))
+        self._height, self._width = height, width
+        self._cells: dict[tuple[int, int], tuple[str, str]] = {}
+        self._words(address)
+        if view.load:
+            self._grid()
+            self._places()
+
+    def lines(self, colours: bool) -> list[str]:
+        """The picture, line by line."""
+        drawn = []
+        for y in range(self._height):
+            row = [self._cells.get((y, x), (" ", "")) for x in range(self._width)]
+            text, style = "", ""
+            for sign, wanted in row:
+                wanted = wanted if colours or "38;5" not in wanted else ""
+                if wanted != style:
+                    text, style = text + PLAIN * bool(style) + wanted, wanted
+                text += sign
+            drawn.append(text.rstrip() + PLAIN * bool(style))
+        return drawn
+
+    def _put(self, y: int, x: int, text: str, style: str = "") -> None:
+        for i, sign in enumerate(text):
+            self._cells[y, x + i] = sign, style
+
+    def _words(self, address: str) -> None:
+        view, (rows, _) = self._view, self._view.shape
+        simulated = "   SIMULATED" * (view.source != "usb")
+        self._put(0, 1, f"palpate place   skin {view.skin}   bundle {view.bundle}{simulated}")
+        self._put(2, 1, view.said, BOLD)
+        self._put(3, 1, view.todo)
+        below = TOP + rows * self._cell[0] + 1
+        if view.centre:
+            row, col = view.centre
+            self._put(below, 1, f"centre: row {row:.1f}, column {col:.1f} {unit(view)} from taxel 1.1")
+        trained = f"   {self._signs[6]} where it was in training" if view.place else ""
+        self._put(below + 1, 1, f"{self._signs[5]} the contact's centre{trained}   Ctrl-C ends")
+        self._put(below + 2, 1, address)
+
+    def _grid(self) -> None:
+        """Each taxel a field of characters for its load, with the digits in the middle; a frame around all."""
+        (high, wide), view = self._cell, self._view
+        left_up, flat, right_up, upright, left_down, right_down = list(self._signs[7:])
+        for c in range(view.shape[1]):
+            self._put(TOP - 2, LEFT + c * wide, f"{'col ' * (wide > 6)}{c + 1}".center(wide - 1))
+        self._put(TOP - 1, LEFT - 1, left_up + flat * (wide * view.shape[1] - 1) + right_up)
+        for r, loads in enumerate(view.load):
+            top = TOP + r * high
+            self._put(top + high // 2, 1, f"row {r + 1}")
+            for y in range(high):
+                self._put(top + y, LEFT - 1, upright.ljust(wide * view.shape[1]) + upright)
+            for c, load in enumerate(loads):
+                self._taxel(top, LEFT + c * wide, load)
+        self._put(TOP + len(view.load) * high, LEFT - 1, left_down + flat * (wide * view.shape[1] - 1) + right_down)
+
+    def _taxel(self, top: int, left: int, load: float) -> None:
+        """One field; the last character of its width is the gap to the next."""
+        (high, wide), share = self._cell, max(0.0, min(1.0, load / self._view.full))
+        for y in range(high):
+            self._put(top + y, left, self._signs[round(4 * share)] * (wide - 1), f"\033[38;5;{HEAT[round(5 * share)]}m")
+        digits = f"{load:.0f}"
+        if wide >= len(digits) + 3:
+            digits = f" {digits} "
+        self._put(top + high // 2, left + (wide - 1 - len(digits)) // 2, digits[: wide - 1])
+
+    def _places(self) -> None:
+        view = self._view
+        if view.place:
+            for place in zip(view.place.rows_mm, view.place.cols_mm, strict=True):
+                self._put(*self._at(place), self._signs[6], BOLD)
+        if view.centre:
+            y, x = self._at(view.centre)
+            self._put(y, x - 1, f"({self._signs[5]})", MARKED)
+
+    def _at(self, point: Point) -> tuple[int, int]:
+        """Line and column of a place, at the grid's edge where it lies beyond it."""
+        pitch = self._view.place.pitch_mm if self._view.place else 1.0
+        (high, wide), (rows, cols) = self._cell, self._view.shape
+        row, col = (point[0] / pitch + 0.5) * high, (point[1] / pitch + 0.5) * wide
+        return TOP + int(max(0, min(rows * high - 1, row))), LEFT + int(max(0, min(cols * wide - 1, col)))

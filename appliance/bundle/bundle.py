@@ -1,0 +1,237 @@
+"""The model bundle: a folder in, a checked Bundle out. Nothing in it is trusted before its hash and form are.
+
+A bundle is `manifest.json`, `model.onnx`, `golden.npz` and, where the manifest has `known`, `means.npz`. The graph
+takes the sensor's own digits as `sweep` [1, T, R, C] (or float32 features [1, n] as `features`, where the manifest's
+input is one of features.KINDS); all scaling is inside it. It gives, by name:
+
+- `logits` float32 [1, K0] for the K0 labels that training knew;
+- `early` float32 [1, D, K0], optional: row d (from 0) is the logits after (d + 1) / (D + 1) of the window;
+- `embedding` float32 [1, r], optional: a linear image in which the sweeps of each material scatter with covariance 1.
+
+Golden sweeps come with the logits that export, or the box at enrolment, saw.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import stat
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.bundle.manifest import (
+    GOLDEN,
+    INPUTS,
+    LABEL,
+    MANIFEST,
+    MEANS,
+    MODEL,
+    MOST_BYTES,
+    Early,
+    Known,
+    Manifest,
+    Thresholds,
+)
+from appliance.bundle.onnx_check import check
+from appliance.core.errors import BundleError
+from appliance.core.types import UNREADABLE, SweepFormat
+
+try:  # not from hashlib: that loads OpenSSL, 4 MB for a function which Python has by itself
+    from _sha2 import sha256  # type: ignore[import-not-found,unused-ignore]
+except ImportError:  # Python 3.11
+    from _sha256 import sha256  # type: ignore[import-not-found,unused-ignore]
+
+__all__ = [
+    "DEFAULT", "GOLDEN", "GOLDEN_TOLERANCE", "INPUTS", "LABEL", "MANIFEST", "MEANS", "MODEL", "SIGNATURE",
+    "Bundle", "Classes", "Early", "Known", "Manifest", "Thresholds", "digest", "file_entry", "files", "identity", "load", "made",
+]  # fmt: skip
+DEFAULT = Path(__file__).parents[1] / "default_bundle"
+SIGNATURE = MANIFEST + ".sig"
+MOST_SMALL = 1 << 20
+"""Bytes of a manifest or a signature at most: read before anything is known of them."""
+GOLDEN_TOLERANCE = 0.02
+"""Largest allowed difference of a probability between export and this machine; the label must be the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class Classes:
+    """means.npz: where each label lies in the embedding, in the order of the labels.
+
+    means: float32 [K, r]. bias: float32 [K], what is added to means . embedding. sweeps: int64 [K], how many a label
+    was enrolled from; 0 where it was trained. spread: float32 [K], variance of its sweeps in a direction of the
+    embedding; 1 where it was trained, and for all labels where the file does not hold this array.
+    """
+
+    means: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    sweeps: NDArray[np.int64]
+    spread: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """A bundle whose files were found as its manifest says.
+
+    golden: digits [G, T, R, C]; golden_logits float32 [G, K]. id: see `identity`.
+    classes: where the manifest has `known`.
+    """
+
+    manifest: Manifest
+    id: str
+    model: bytes
+    golden: NDArray[Any]
+    golden_logits: NDArray[np.float32]
+    classes: Classes | None = None
+
+    @property
+    def enrolled(self) -> dict[str, int]:
+        """The labels that training did not know, with the number of sweeps they come from."""
+        if self.classes is None:
+            return {}
+        return {label: int(n) for label, n in zip(self.manifest.labels, self.classes.sweeps, strict=True) if n}
+
+    @property
+    def format(self) -> SweepFormat:
+        """The sweep format that the model was trained for."""
+        return self.manifest.format
+
+
+def file_entry(data: bytes) -> dict[str, Any]:
+    """sha256 and size of one file, as the manifest holds them."""
+    return {"sha256": digest(data), "bytes": len(data)}
+
+
+def digest(data: bytes) -> str:
+    """The sha256 in hexadecimal; of its manifest it is what a bundle goes by in a store."""
+    return str(sha256(data).hexdigest())
+
+
+def identity(manifest: bytes) -> str:
+    """A bundle's id: the first eight hex digits of its manifest's sha256."""
+    return digest(manifest)[:8]
+
+
+def load(folder: Path) -> Bundle:
+    """Read and check the bundle in `folder`. Raises BundleError where a file is missing, altered or of another form."""
+    return made(files(folder), str(folder))
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """The files of the bundle in `folder` by name: the manifest, those that it names, the signature where there is one.
+
+    Whatever else lies there is not looked at. Nothing is followed out of the folder, and of each file no more is read
+    than the manifest says. Raises BundleError where one cannot be read or is larger.
+    """
+    try:
+        held = {MANIFEST: _read(folder / MANIFEST, MOST_SMALL)}
+    except OSError as e:
+        raise BundleError(f"no bundle at {folder}: {MANIFEST}: {e.strerror}; name the folder of one") from e
+    for name, size in _named(held[MANIFEST]).items():
+        try:
+            held[name] = _read(folder / name, size)
+        except OSError as e:
+            if name == SIGNATURE and e.errno == errno.ENOENT:
+                continue
+            what = "was altered" if e.errno == errno.EFBIG else "cannot be read"
+            raise BundleError(f"{folder}: {name} {what}: {e.strerror}; copy the bundle again") from e
+    return held
+
+
+def _named(manifest: bytes) -> dict[str, int]:
+    """What else is to be read, with the most bytes of each."""
+    return {SIGNATURE: MOST_SMALL} | {name: entry["bytes"] for name, entry in Manifest.parse(manifest).files.items()}
+
+
+def _read(path: Path, most: int) -> bytes:
+    """A plain file's bytes, at most one more than `most`: never a link, a device, or a pipe that would wait."""
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as f:
+        if not stat.S_ISREG(os.fstat(f.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is no plain file", str(path))
+        data = f.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most} bytes", str(path))
+    return data
+
+
+def made(files: Mapping[str, bytes], where: str) -> Bundle:
+    """The bundle that `files` are, checked; `where` they come from. Raises BundleError as `load`."""
+    manifest = Manifest.parse(files[MANIFEST])
+    model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
+    samples, logits = _golden(golden, manifest)
+    classes = _classes(_checked(files, manifest, MEANS, where), manifest) if manifest.known else None
+    check.check(model, manifest)
+    return Bundle(manifest, identity(files[MANIFEST]), model, samples, logits, classes)
+
+
+def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: str) -> bytes:
+    """The bytes of one file, compared with its entry in the manifest."""
+    if name not in manifest.files or name not in files:
+        raise BundleError(f"{where}: the manifest does not name {name}; export the bundle again")
+    want, have = manifest.files[name], file_entry(files[name])
+    if want != have:
+        raise BundleError(f"{where}: {name} was altered: {have} instead of {want}; copy the bundle again")
+    return files[name]
+
+
+def _arrays(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
+    """Arrays of an .npz by name, `names` among them; never unpickled."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as packed:
+            size = sum(entry.file_size for entry in packed.infolist())
+        if size > MOST_BYTES:
+            raise BundleError(
+                f"{file} unpacks to {size} bytes, {MOST_BYTES} are allowed; export the bundle with fewer sweeps"
+            )
+        with np.load(io.BytesIO(data), allow_pickle=False) as z:
+            held = dict(z.items())
+        return {name: held[name] for name in names} | held
+    except (*UNREADABLE, OSError, KeyError, zipfile.BadZipFile) as e:
+        raise BundleError(f"{file} cannot be read: {e}; export the bundle again") from e
+
+
+def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    """Golden sweeps and their logits."""
+    f = manifest.format
+    held = _arrays(data, GOLDEN, "samples", "logits")
+    samples, logits = held["samples"], held["logits"]
+    if samples.shape[1:] != (f.window, f.rows, f.cols) or samples.dtype != f.digits or not len(samples):
+        raise BundleError(f"{GOLDEN} holds {samples.dtype} {samples.shape}, which does not fit the format {f}")
+    if logits.shape != (len(samples), len(manifest.labels)):
+        raise BundleError(
+            f"{GOLDEN} holds logits {logits.shape} for {len(samples)} sweeps, {len(manifest.labels)} labels"
+        )
+    return samples, logits.astype(np.float32)
+
+
+def _classes(data: bytes, manifest: Manifest) -> Classes:
+    """What means.npz holds: one row a label, trained ones first."""
+    n = len(manifest.labels)
+    held = {"spread": np.ones(n, np.float32)} | _arrays(data, MEANS, "means", "bias", "sweeps")
+    found = Classes(*(held[name] for name in Classes.__slots__))
+    for name, kind in (("means", "float32"), ("bias", "float32"), ("sweeps", "int64"), ("spread", "float32")):
+        values = held[name]
+        if values.dtype != kind or values.ndim != 1 + (name == "means") or len(values) != n or 0 in values.shape:
+            raise BundleError(
+                f"{MEANS} holds {name} {values.dtype} {values.shape} for {n} labels; {kind} is wanted, a row a label"
+            )
+        if not np.isfinite(values).all():
+            raise BundleError(f"{MEANS} holds {name} that are not finite; export the bundle again")
+    sweeps = found.sweeps
+    if not (found.spread > 0).all():
+        raise BundleError(
+            f"{MEANS} holds spread {found.spread.tolist()}, which must be above 0; export the bundle again"
+        )
+    if sweeps[0] or (sweeps[1:] < np.sign(sweeps[:-1])).any():
+        raise BundleError(f"{MEANS} holds sweeps {sweeps.tolist()}; trained labels (0) come first, enrolled ones after")
+    if manifest.early and sweeps.any():
+        raise BundleError(
+            "manifest has `early`, whose heads do not know the enrolled labels; enrol again from the original"
+        )
+    return found

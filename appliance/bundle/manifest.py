@@ -1,0 +1,197 @@
+"""What a bundle says of itself: the manifest. In: the bytes of manifest.json. Out: a checked Manifest, and back.
+
+The dataclasses are its schema. What is read can be reckoned with, shown and written again.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from appliance.core.errors import BundleError, FormatError
+from appliance.core.schema import typed
+from appliance.core.types import SweepFormat
+from appliance.signal import features
+from appliance.signal.contact import Place
+
+SCHEMA = 3
+"""What is written. Schema 1 has no `early` and no `known`, schema 2 no `runtime`, `counter` and `place`; both are read."""
+MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
+INPUTS = ("raw", *features.KINDS)
+LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
+"""What a label may look like: it travels in a sentence, so no comma, star or dollar, and at most 24 characters."""
+MOST_BYTES = 64 << 20
+"""Of one file. The largest of our own, the paper's network in int8, takes 16 MB; the box's memory is limited to 128 MB."""
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """What is checked before the network is asked, in digits above the tare, and what its answer must reach.
+
+    contact: least temporal mean of a loaded taxel. full_scale: the highest digit the sensor gives.
+    saturated: share of full-scale digits in a window that is still accepted. dead_taxels: how many the model bears.
+    unsure: least probability for status ok.
+    """
+
+    contact: float
+    full_scale: float
+    saturated: float = 0.01
+    dead_taxels: int = 0
+    unsure: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Early:
+    """When the answer goes out before the sweep has ended. Raises BundleError where a number makes no sense.
+
+    least: [D], the probability that a label must reach at each step; above 1: never there. agree: so many steps, the
+    newest included, must name the same label.
+    """
+
+    least: tuple[float, ...]
+    agree: int
+
+    def __post_init__(self) -> None:
+        if not self.least or not all(_positive(p) for p in self.least):
+            raise BundleError(f"early.least {list(self.least)} must be numbers above 0, one for each step")
+        if type(self.agree) is not int or self.agree < 1:
+            raise BundleError(f"early.agree {self.agree!r} must be a whole number from 1 on")
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What a trained material looks like. Raises BundleError where a number makes no sense.
+
+    limit: largest squared distance of a sweep's embedding to the nearest class mean; beyond it the material is unknown.
+    temperature: what logits from class means are divided by.
+    """
+
+    limit: float
+    temperature: float
+
+    def __post_init__(self) -> None:
+        for name, value in (("limit", self.limit), ("temperature", self.temperature)):
+            if not _positive(value):
+                raise BundleError(f"known.{name} {value!r} must be a number above 0")
+
+
+def _positive(value: object) -> bool:
+    return type(value) in (int, float) and 0 < value <= sys.float_info.max  # type: ignore[operator]
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a bundle says of itself. `files` maps each name to its sha256 and size, `figures` each protocol to numbers,
+    `made` names commit, seed and machine. early, known, place: None where the bundle cannot do it.
+
+    runtime: the least version of the box that can run it. counter: grows with each bundle that is signed, so that none
+    can be put back unnoticed; 0 was never signed.
+    """
+
+    name: str
+    version: str
+    format: SweepFormat
+    input: str
+    labels: tuple[str, ...]
+    thresholds: Thresholds
+    files: dict[str, dict[str, Any]]
+    figures: dict[str, Any] = field(default_factory=dict)
+    made: dict[str, Any] = field(default_factory=dict)
+    early: Early | None = None
+    known: Known | None = None
+    place: Place | None = None
+    runtime: str = "0.0.0"
+    counter: int = 0
+    schema: int = SCHEMA
+
+    def __post_init__(self) -> None:
+        if type(self.schema) is not int or not 1 <= self.schema <= SCHEMA:
+            raise BundleError(
+                f"manifest schema {self.schema} is unknown; this version reads 1 to {SCHEMA}: update one of them"
+            )
+        if self.input not in INPUTS:
+            raise BundleError(f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}")
+        _check_age(self)
+        _check_files(self.files)
+        if (self.known is not None) != (MEANS in self.files):
+            raise BundleError(f"manifest must have both `known` and {MEANS}, or neither; export the bundle again")
+        if self.early and self.input != "raw":
+            raise BundleError(
+                f"manifest has `early`, but input {self.input!r} needs the whole window; export it without"
+            )
+        if type(self.counter) is not int or not 0 <= self.counter < 1 << 53:
+            raise BundleError(
+                f"manifest counter {self.counter!r} must be a whole number from 0 on; sign the bundle again"
+            )
+        version(self.runtime)
+        _check_labels(self.labels)
+
+    def json(self) -> bytes:
+        """The manifest as it is written: one text for one content."""
+        return (json.dumps(asdict(self), indent=1, sort_keys=True) + "\n").encode()
+
+    @classmethod
+    def parse(cls, text: bytes) -> Manifest:
+        """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong type."""
+        try:
+            raw = json.loads(text)
+            for name, kind in (
+                ("format", SweepFormat),
+                ("thresholds", Thresholds),
+                ("early", Early),
+                ("known", Known),
+                ("place", Place),
+            ):
+                if raw.get(name) is not None:
+                    raw[name] = typed(kind, raw[name])
+            made = typed(cls, raw)
+            made.json()  # nested so deeply that it could not be written again after enrolment
+            return made
+        except (ValueError, TypeError, AttributeError, RecursionError, FormatError) as e:
+            raise BundleError(f"manifest cannot be read: {e}; export the bundle again") from e
+
+
+def version(text: object) -> tuple[int, ...]:
+    """A version as numbers that compare. Raises BundleError where it is not of the form 1.2.3."""
+    if not isinstance(text, str) or not _VERSION.fullmatch(text):
+        raise BundleError(f"version {text!r} is not of the form 1.2.3; export the bundle again")
+    return tuple(map(int, text.split(".")))
+
+
+def _check_age(m: Manifest) -> None:
+    """Raises BundleError where a manifest has what its schema does not know."""
+    if m.schema == 1 and (m.early or m.known):
+        raise BundleError("manifest schema 1 has no `early` and no `known`; export the bundle again")
+    if m.schema < 3 and (m.place or m.counter or m.runtime != "0.0.0"):
+        raise BundleError(f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle again")
+
+
+def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raises BundleError where a file is none that a bundle has, or its entry does not pin it down."""
+    for name, entry in files.items():
+        if name not in (MODEL, GOLDEN, MEANS):
+            raise BundleError(f"manifest names a file {name!r}; a bundle has {MODEL}, {GOLDEN} and {MEANS} alone")
+        hashed, size = entry.get("sha256"), entry.get("bytes")
+        if entry.keys() != {"sha256", "bytes"} or not isinstance(hashed, str) or not _SHA256.fullmatch(hashed):
+            raise BundleError(
+                f"manifest has {dict(entry)} for {name}; sha256 and bytes are wanted: export the bundle again"
+            )
+        if type(size) is not int or not 0 <= size <= MOST_BYTES:
+            raise BundleError(
+                f"manifest gives {name} {size!r} bytes; 0 to {MOST_BYTES} are allowed: export a smaller model"
+            )
+
+
+def _check_labels(labels: tuple[str, ...]) -> None:
+    """Raises BundleError where labels are too few, equal, or cannot be sent."""
+    if len(labels) < 2 or len(set(labels)) < len(labels):
+        raise BundleError(f"manifest labels {list(labels)} must be at least two different names")
+    for label in labels:
+        if not isinstance(label, str) or not LABEL.fullmatch(label):
+            raise BundleError(f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'")

@@ -1,0 +1,39 @@
+"""`python -m appliance.cli.lower_outputs`: takes the output lines low after a program that could not. In: its settings. Out: levels.
+
+systemd runs it whenever `palpate run` has ended (ExecStopPost=). A program that was killed leaves its lines to the
+chip's driver, and some drivers leave them as they were: READY high, with nobody there. It loads neither numpy nor
+onnxruntime, so that it is done before a robot has noticed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+import gpiod
+
+from appliance.cli.parser import settings
+from appliance.core import config
+from appliance.core.clock import SystemClock
+from appliance.core.errors import ApplianceError
+from appliance.io.gpio_lines import Lines
+
+
+def main(argv: list[str] | None = None, gpio: Any = gpiod) -> int:
+    """Drive all configured outputs low and let them go; the exit code, as `palpate` has them."""
+    about = "Takes all output lines low. Options as for palpate run."
+    args = argparse.ArgumentParser(
+        "python -m appliance.cli.lower_outputs", description=about, parents=[settings()]
+    ).parse_args(argv)
+    try:
+        loaded = config.load(args.board, args.set, folder=args.config_dir)
+        Lines(loaded.output, gpio, SystemClock()).close()  # requested low, then given back
+    except ApplianceError as e:
+        print(f"palpate: outputs may not be low: {e}", file=sys.stderr)
+        return e.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,238 @@
+"""The format that every room shares: SweepFormat, Frames, Sweep, Verdict, Status. In and out: recorded sweeps on disk.
+
+Nothing here knows where frames come from. Times are nanoseconds of the host's `CLOCK_MONOTONIC`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from tokenize import TokenError
+from types import MappingProxyType
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core import storage
+from appliance.core.errors import FormatError
+from appliance.core.schema import typed
+
+DIGITS = ("uint8", "int16", "uint16", "float32")
+"""Digit types of a taxel; the position in this tuple is the code on the wire (PROTOCOL.md)."""
+
+EPOCH_BITS = 40
+"""An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`: frames of two plug-ins never look adjacent."""
+
+
+SCHEMA = 2
+"""Of a recorded sweep's sidecar. Schema 1 holds the sweep alone, and is still read."""
+UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
+"""What numpy makes of a broken .npy, beside OSError; the last where it names a size that no machine has."""
+
+
+class Status(StrEnum):
+    """What became of a sweep. One list for sentences, lines and files; PROTOCOL.md explains each, a test compares."""
+
+    OK = "ok"
+    UNSURE = "unsure"
+    UNDECIDED = "undecided"
+    UNKNOWN = "unknown"
+    SHORT = "short"
+    LONG = "long"
+    GAP = "gap"
+    NO_CONTACT = "no-contact"
+    SATURATED = "saturated"
+    STUCK_TAXEL = "stuck-taxel"
+    DEAD_TAXEL = "dead-taxel"
+    SENSOR_LOST = "sensor-lost"
+    NO_START = "no-start"
+    NO_STOP = "no-stop"
+    NOT_READY = "not-ready"
+    EDGES_LOST = "edges-lost"
+    ABORTED = "aborted"
+
+    @property
+    def classified(self) -> bool:
+        """True where a label was computed."""
+        return self in (Status.OK, Status.UNSURE, Status.UNDECIDED)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepFormat:
+    """Form of a sweep: `rows` x `cols` taxels, `rate_hz` frames a second, `window` frames used, digits of type `dtype`.
+
+    It belongs to a bundle: another skin is another format, not other code.
+    Raises FormatError where a value makes no sense.
+    """
+
+    rows: int
+    cols: int
+    rate_hz: float
+    window: int
+    dtype: str
+
+    def __post_init__(self) -> None:
+        if self.dtype not in DIGITS:
+            raise FormatError(f"digit type {self.dtype!r} is unknown; use one of {', '.join(DIGITS)}")
+        if not (1 <= self.rows <= 255 and 1 <= self.cols <= 255):
+            raise FormatError(f"a grid of {self.rows} x {self.cols} taxels is out of range; use 1 to 255 each way")
+        if not 1e-3 <= self.rate_hz <= 1e6:  # a board tells thousandths
+            raise FormatError(f"a rate of {self.rate_hz} Hz is out of range; use 0.001 to 1e6")
+        if self.window < 1:
+            raise FormatError(f"a window of {self.window} frames is empty; use at least 1")
+
+    @property
+    def digits(self) -> np.dtype[Any]:
+        """numpy type of one taxel, little-endian."""
+        return np.dtype(self.dtype).newbyteorder("<")
+
+    @property
+    def period_ns(self) -> float:
+        """Time between two frames in nanoseconds."""
+        return 1e9 / self.rate_hz
+
+    @property
+    def skin(self) -> tuple[int, int, str]:
+        """What a readout board must agree to: rows, columns, digit type."""
+        return self.rows, self.cols, self.dtype
+
+    def __str__(self) -> str:
+        return f"{self.rows}x{self.cols} {self.dtype} at {self.rate_hz:g} Hz, window {self.window}"
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """A run of frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped, taxels [n, R, C] digits."""
+
+    t_ns: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    taxels: NDArray[Any]
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+    @classmethod
+    def empty(cls, fmt: SweepFormat) -> Frames:
+        """No frames of this format."""
+        none = np.empty(0, np.int64)
+        return cls(none, none, np.empty((0, fmt.rows, fmt.cols), fmt.digits))
+
+    @classmethod
+    def joined(cls, runs: Sequence[Frames]) -> Frames:
+        """Several runs as one."""
+        return cls(*(np.concatenate([getattr(run, name) for run in runs]) for name in cls.__slots__))
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One sweep as the recorder cut it. `frames` is the middle window where `status` is ok, and empty otherwise.
+
+    share: 1, or less for a sweep that still goes on: so much of a window's frames, counted from `sweep.lead_ms` after
+    the start edge; `frames` are these, all that there are.
+    start_ns, stop_ns: trigger edges, host monotonic (equal where one is missing; before the stop edge the last frame).
+    lost: frames of the window that never came; where `status` is ok they were interpolated.
+    complete_ns: when the last thing needed (stop edge or frame) was in hand.
+    object: counts NEW OBJECT signals; 0 before the first, when sweeps stand alone and are not fused.
+    """
+
+    id: int
+    start_ns: int
+    stop_ns: int
+    status: Status
+    frames: Frames
+    lost: int = 0
+    complete_ns: int = 0
+    object: int = 0
+    material: str = ""
+    position: str = ""
+    session: str = ""
+    share: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The answer to one sweep.
+
+    scores: float64 [C] probabilities of this sweep, or of all fused sweeps; empty where nothing was classified.
+    margin: probability of the label minus that of the next one. detail: what the status is about ("taxel 2,3").
+    latency_ns: from `Sweep.complete_ns` to the verdict. share: how much of the window was used: less
+    than 1 in an early answer. own: float64 [C] probabilities of this sweep alone; empty where nothing was classified.
+    moved: how far the contact lies from where training had it ("moved 2.1 mm too far towards row 4"), "" where it does
+    not, or the bundle cannot tell.
+    """
+
+    sweep: int
+    time_ns: int
+    status: Status
+    label: str
+    probability: float
+    margin: float
+    scores: NDArray[np.float64]
+    fused: int
+    lost: int
+    latency_ns: int
+    bundle: str
+    detail: str = ""
+    share: float = 1.0
+    own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    moved: str = ""
+
+
+def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
+    return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.digits, (fmt.rows, fmt.cols))])
+
+
+def save(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Write `sweep` as `path` (.npy, one record a frame) and a JSON sidecar beside it, whole or not at all.
+
+    The sidecar takes its name first, so an .npy never lacks its description. about: what else it shall hold, under names
+    that a Sweep does not have. Raises OSError where writing fails, and then leaves nothing behind.
+    """
+    table = np.zeros(len(sweep.frames), _record_dtype(fmt))
+    table["t_ns"], table["seq"], table["taxels"] = sweep.frames.t_ns, sweep.frames.seq, sweep.frames.taxels
+    own = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"}
+    packed = io.BytesIO()  # into a file np.save writes past Python, and a full disk has no errno then
+    np.save(packed, table, allow_pickle=False)
+    told = {**about, **own, "format": asdict(fmt), "crc32": crc32(packed.getvalue()), "schema": SCHEMA}
+    storage.put_all({path.with_suffix(".json"): json.dumps(told, indent=1).encode(), path: packed.getvalue()})
+
+
+def sidecar(path: Path) -> dict[str, Any]:
+    """All that the sidecar of the .npy at `path` holds. Raises FormatError where it is missing or broken."""
+    try:
+        told = json.loads(path.with_suffix(".json").read_text("utf-8"))
+        if not isinstance(told, dict):
+            raise TypeError(f"{type(told).__name__} instead of an object")
+        return told
+    except (ValueError, OSError, TypeError, RecursionError) as e:
+        raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e
+
+
+def load(path: Path) -> tuple[Sweep, SweepFormat]:
+    """Read a sweep that `save` wrote. Raises FormatError where a file is missing, broken or of another form."""
+    told = sidecar(path)
+    try:
+        data = path.read_bytes()
+        if told.get("crc32", crc32(data)) != crc32(data):
+            raise FormatError("its bytes are not those that were recorded: the file was altered")
+        table = np.load(io.BytesIO(data), allow_pickle=False)
+        fmt = typed(SweepFormat, told.pop("format"))
+        schema = told.pop("schema")
+        status = Status(told.pop("status"))
+        if type(schema) is not int or not 1 <= schema <= SCHEMA:
+            raise FormatError(
+                f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update one of them"
+            )
+        if table.dtype != _record_dtype(fmt) or table.ndim != 1:
+            raise FormatError(f"records of {table.dtype} do not fit the format {fmt} of its sidecar")
+        frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
+        own = told if schema == 1 else {name: told[name] for name in Sweep.__slots__ if name in told}
+        return typed(Sweep, own | {"status": status, "frames": frames}), fmt
+    except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
+        raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e

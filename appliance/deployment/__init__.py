@@ -1,0 +1,1 @@
+"""Signed bundles: store, trial, roll back, shadow."""

@@ -1,0 +1,250 @@
+"""The room of the shadow: a candidate that classifies beside the bundle in service, before anybody commits to it.
+
+In: sweeps with the verdicts that were sent. Out: how often the candidate says the same, and the sweeps on which it does
+not, in a folder. What the candidate does, raises or takes is never seen by the robot: an answer is out before it is asked.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appliance.bundle.bundle import Bundle
+from appliance.core import storage
+from appliance.core.clock import Clock
+from appliance.core.errors import ApplianceError, BundleError, FormatError
+from appliance.core.health import Health
+from appliance.core.schema import typed
+from appliance.core.statistics import wilson
+from appliance.core.types import Status, Sweep, Verdict
+from appliance.inference.classifier import Classifier
+from appliance.inference.early_exit import Decider
+from appliance.recording.recording import SweepFolder, told
+from appliance.service.journal import WARNING
+
+FILE = "agreement.json"
+KEPT = 100
+"""So many sweeps on which the two differ are kept."""
+FAILURES = 3
+"""The shadow ends after so many sweeps in a row on which the candidate failed."""
+SLOW_NS = 100_000_000
+"""A candidate that computes for longer has failed: frames wait for it."""
+STARTS = 3
+"""After so many starts in a row that a candidate's shadow did not outlive for PERIOD_NS it stays away."""
+PERIOD_NS = 60_000_000_000
+"""How often the counts are written where the two agree."""
+NEVER_NS = 1 << 63
+
+
+@dataclass(slots=True)
+class Agreement:
+    """What two bundles have said of the same sweeps.
+
+    pairs: what the current one said -> what the candidate said -> sweeps. later: early answers to which the candidate
+    would have waited for more of the sweep; these are not compared. failed: sweeps on which the candidate did. kept:
+    sweeps that lie beside. worst_ms: its longest computing; total_ms: of all. starts: begun in a row without an end in
+    order, the present one included until it is older than PERIOD_NS.
+    """
+
+    candidate: str
+    current: str
+    starts: int = 0
+    compared: int = 0
+    agreed: int = 0
+    later: int = 0
+    failed: int = 0
+    kept: int = 0
+    total_ms: float = 0.0
+    worst_ms: float = 0.0
+    pairs: dict[str, dict[str, int]] = field(default_factory=dict)
+    schema: int = 1
+
+    @property
+    def text(self) -> str:
+        """In one line, for a person."""
+        told = f"candidate {self.candidate} agrees with {self.current} on {self.agreed} of {self.compared} sweeps"
+        if self.compared:
+            low, high = wilson(self.agreed, self.compared)
+            told += (
+                f" [{100 * low:.1f} to {100 * high:.1f} %], computing {self.total_ms / self.compared:.2g} ms for each"
+            )
+            told += f" and {self.worst_ms:.2g} ms at most"
+        told += f"; {self.later} early answers are not compared" if self.later else ""
+        return told + (f"; it failed on {self.failed}" if self.failed else "")
+
+    def lines(self, folder: Path) -> list[str]:
+        """The same, then each pair of answers in which they differ, the most frequent first, and where the sweeps are."""
+        apart = [(n, one, other) for one, said in self.pairs.items() for other, n in said.items() if one != other]
+        said = [f"  {one} -> {other}: {n}" for n, one, other in sorted(apart, key=lambda a: -a[0])]
+        return [self.text, *said, *([f"  {self.kept} of these are kept in {folder}"] if self.kept else [])]
+
+    def json(self) -> bytes:
+        """As it is written."""
+        return json.dumps(asdict(self), indent=1).encode()
+
+    def add(self, one: Verdict, other: Verdict, took_ms: float) -> bool:
+        """Count a sweep; whether the robot would have been told the same."""
+        said = self.pairs.setdefault(_answer(one), {})
+        said[_answer(other)] = said.get(_answer(other), 0) + 1
+        same = _answer(one) == _answer(other)
+        self.compared, self.agreed = self.compared + 1, self.agreed + same
+        self.total_ms, self.worst_ms = self.total_ms + took_ms, max(self.worst_ms, took_ms)
+        return same
+
+
+def _answer(v: Verdict) -> str:
+    """What a robot goes by: the label, behind the status where that is not ok."""
+    return v.label if v.status is Status.OK else f"({v.status}) {v.label}".strip()
+
+
+def read(folder: Path) -> Agreement | None:
+    """The agreement that lies in a shadow's folder, None where there is none. Raises FormatError where it is broken."""
+    try:
+        found = typed(Agreement, json.loads((folder / FILE).read_bytes()))
+        if found.schema != 1:
+            raise TypeError(f"schema {found.schema} is unknown to this version")
+        return found
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, RecursionError) as e:
+        raise FormatError(f"{folder / FILE} cannot be read: {e}; take it away, and the counts begin anew") from e
+
+
+class Shadow:
+    """Keeper and pulse of a running box: has the candidate judge each sweep by the same rules, and counts.
+
+    current: the bundle in service. folder: where agreement and kept sweeps lie; those of another pair of bundles are
+    taken away. judge: makes a bundle's classifier, as the settings want it. circumstances: what the box tells of itself,
+    its tare among it. log: told when the shadow ends, and once where it cannot write. Raises ApplianceError where the
+    candidate or the folder cannot be used.
+    """
+
+    def __init__(
+        self, candidate: Bundle, current: Bundle, folder: Path, clock: Clock, *,
+        judge: Callable[[Bundle], Classifier], circumstances: Callable[[], Mapping[str, Any]], log: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        if candidate.format != current.format:
+            raise BundleError(
+                f"candidate {candidate.id} wants {candidate.format}, the bundle in service {current.format}: one skin "
+                "cannot serve both; commit to it without a shadow"
+            )
+        self._clock, self._circumstances, self._log = clock, circumstances, log
+        self._row, self._told = 0, False
+        self._waiting: list[tuple[Sweep, Verdict, Mapping[str, Any]]] = []
+        self._settled_ns = self._due_ns = clock.now_ns() + PERIOD_NS
+        try:
+            self._sweeps = SweepFolder(folder, current.format)
+            self.agreement = self._begin(candidate.id, current.id)
+        except OSError as e:
+            raise ApplianceError(f"{folder}: {e.strerror}; see that it has room and may be written") from e
+        try:  # the start is counted by now: the model may kill the program here
+            self._run = judge(candidate)
+            self._run.self_test()
+            self._early = Decider(self._run) if candidate.manifest.early else None
+        except ApplianceError:
+            self.stopping()
+            raise
+
+    def __call__(self, sweep: Sweep, verdict: Verdict) -> None:
+        """Have the candidate judge a sweep that has a window; a sweep on which they differ is kept later."""
+        if self._row == FAILURES or not len(sweep.frames):
+            return
+        about = self._circumstances()
+        self._run.tare = np.asarray(about["tare"], np.float64)
+        begin_ns = self._clock.now_ns()
+        self._due_ns = min(self._due_ns, begin_ns + PERIOD_NS)
+        try:
+            other = self._judge(sweep)
+        except Exception as e:  # onnxruntime raises its own classes, which share no base but Exception
+            self._fail(str(e).strip()[:200])
+            return
+        took_ns = self._clock.now_ns() - begin_ns
+        if took_ns > SLOW_NS:
+            self._fail(f"it computed {took_ns / 1e6:.0f} ms for a sweep, {SLOW_NS / 1e6:.0f} are allowed")
+            return
+        self._row = 0
+        if other is None:
+            self.agreement.later += 1
+        elif not self.agreement.add(verdict, other, took_ns / 1e6):
+            self._due_ns = begin_ns
+            if self.agreement.kept + len(self._waiting) < KEPT:
+                self._waiting.append((sweep, verdict, {**about, "candidate": told(other)}))
+
+    def turn(self, health: Health) -> None:
+        """A turn is over: write one thing that is due, while no sweep is open."""
+        if health.sweeping:
+            return
+        if self._waiting:
+            self._try(self._keep)
+        elif self._clock.now_ns() >= self._due_ns:
+            self._try(self._write)
+
+    def stopping(self) -> None:
+        """The loop has ended: write what is left. The present start has ended in order."""
+        self.agreement.starts = 0
+        while self._waiting:
+            self._try(self._keep)
+        self._try(self._write)
+        self._sweeps.close()
+
+    def _begin(self, candidate: str, current: str) -> Agreement:
+        """The agreement that goes on, or a new one; this start counted."""
+        try:
+            found = read(self._sweeps.folder)
+        except FormatError as e:
+            self._log(f"{WARNING}shadow: {e}")
+            found = None
+        if found is None or (found.candidate, found.current) != (candidate, current):
+            for number in [*self._sweeps.numbers]:
+                self._sweeps.remove(number)
+            found = Agreement(candidate, current)
+        if found.starts >= STARTS:
+            self._sweeps.close()
+            raise ApplianceError(
+                f"the program has died {found.starts} times while candidate {candidate} ran beside it; take away "
+                f"{self._sweeps.folder / FILE} to try again"
+            )
+        found.starts += 1
+        storage.put(self._sweeps.folder / FILE, found.json())
+        return found
+
+    def _judge(self, sweep: Sweep) -> Verdict | None:
+        """The candidate's verdict; None where it would wait for more of the sweep."""
+        if sweep.share == 1:
+            return self._run(sweep)
+        return self._early(sweep) if self._early else None
+
+    def _fail(self, why: str) -> None:
+        self.agreement.failed += 1
+        self._row += 1
+        if self._row == FAILURES:
+            self._log(
+                f"{WARNING}shadow: candidate {self.agreement.candidate} is not asked any more, it failed {FAILURES} times "
+                f"in a row: {why}; classifying goes on"
+            )
+
+    def _keep(self) -> None:
+        self._sweeps.put(*self._waiting.pop(0))
+        self.agreement.kept = len(self._sweeps.numbers)
+
+    def _write(self) -> None:
+        self._due_ns = NEVER_NS
+        if self._clock.now_ns() >= self._settled_ns:
+            self.agreement.starts = 0
+        storage.put(self._sweeps.folder / FILE, self.agreement.json())
+
+    def _try(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except OSError as e:
+            if not self._told:
+                self._log(
+                    f"{WARNING}shadow: {self._sweeps.folder} cannot be written: {e.strerror}; make room there; "
+                    "classifying goes on"
+                )
+            self._told = True

@@ -1,0 +1,139 @@
+"""Whose bundle it is. In: a manifest, its signature, a file of the signers that the box believes. Out: the signer's name.
+
+The work is ssh-keygen's (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its manual): keys and tools that
+people have, none of our own. A manifest names the hash of every other file, so its signature is that of the bundle.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from appliance.core.errors import BundleError, ConfigError
+
+if TYPE_CHECKING:
+    from subprocess import CompletedProcess
+
+NAMESPACE = "palpate-bundle"
+"""What is signed is meant for this alone: a signature for anything else, git say, is none here."""
+MOST_SIGNATURE, MOST_SIGNERS = 16 << 10, 256 << 10
+"""Bytes. A signature by the longest usual key, RSA of 16,384 bits, takes 6 kB."""
+DEADLINE_S, PATIENCE_S = 10.0, 120.0
+"""For ssh-keygen by itself, some milliseconds on a desktop; and with a person who types a passphrase or touches a key."""
+LINE = re.compile(
+    r'[\w.@+-]+[ \t]+(namespaces="[^"]*"[ \t]+)?'
+    r"(?P<kind>ssh-ed25519|ssh-rsa|ecdsa-sha2-nistp(256|384|521)|sk-(ssh-ed25519|ecdsa-sha2-nistp256)@openssh\.com)"
+    r"[ \t]+(?P<key>[A-Za-z0-9+/]+={0,2})([ \t].*)?",
+    re.ASCII,
+)
+"""One name, one key. ssh-keygen allows more: patterns, certificates, and dates, for which a box must know the time."""
+NO_TIME = re.compile(r"valid-after|valid-before|cert-authority", re.IGNORECASE)
+
+
+def verify(message: bytes, signature: bytes, signers: Path) -> str:
+    """The name of the one of `signers` who signed `message` as a bundle's manifest.
+
+    Raises BundleError where nobody of them did, and ConfigError where the box itself cannot tell: the file of signers is
+    missing, empty or holds a line that is not understood, or ssh-keygen does not do its work.
+    """
+    if len(signature) > MOST_SIGNATURE:
+        raise BundleError(f"signature has more than {MOST_SIGNATURE} bytes; sign the bundle again")
+    with _lent(_believed(signers)) as allowed, _lent(signature) as signed:
+        found = _keygen("find-principals", "-f", allowed, "-s", signed)
+        names = found.stdout.decode(errors="replace").splitlines()
+        if found.returncode or not names:
+            raise BundleError(
+                f"bundle is signed by none of those in {signers} ({_said(found)}); sign it with a key that is "
+                "there (palpate-train sign), or have the administrator add the key"
+            )
+        checked = _keygen("verify", "-f", allowed, "-I", names[0], "-n", NAMESPACE, "-s", signed, message=message)
+    if checked.returncode:
+        raise BundleError(
+            f"signature of {names[0]} does not fit the manifest ({_said(checked)}); copy the bundle again, or sign it "
+            "again (palpate-train sign)"
+        )
+    return names[0]
+
+
+def sign(message: bytes, key: Path) -> bytes:
+    """The signature of `message`, a bundle's manifest. Asks on the terminal for what the key wants.
+
+    key: a private key, or a public one whose private key an agent holds. Raises ConfigError where it does not sign.
+    """
+    done = _keygen("sign", "-f", str(key), "-n", NAMESPACE, "-q", message=message, asks=True)
+    if done.returncode or not done.stdout:
+        raise ConfigError(f"{key} does not sign; name a key of yours, or make one with ssh-keygen -t ed25519")
+    return bytes(done.stdout)
+
+
+def _believed(signers: Path) -> bytes:
+    """The content of the file of signers, each line of it understood: one that ssh-keygen passed over would be believed in
+    vain. Raises ConfigError."""
+    try:
+        with signers.open("rb") as f:
+            data = f.read(MOST_SIGNERS + 1)
+        lines = data.decode().split("\n")
+    except (OSError, ValueError) as e:
+        raise ConfigError(f"{signers} cannot be read: {e}; put a line `NAME KEY` there for each who signs") from e
+    if len(data) > MOST_SIGNERS:
+        raise ConfigError(f"{signers} has more than {MOST_SIGNERS} bytes; keep one line for each who signs")
+    held = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    if not held:
+        raise ConfigError(f"{signers} names nobody, so no bundle can be believed; put a line `NAME KEY` there")
+    for n, line in held:
+        if not _is_signer(line):
+            dated = NO_TIME.search(line)
+            why = f"{dated[0]} is not used here, a box may not know the time" if dated else "it is not understood"
+            raise ConfigError(f"{signers}, line {n}: {why}; write NAME ssh-ed25519 AAAA..., the rest as in a .pub file")
+    return data
+
+
+def _is_signer(line: str) -> bool:
+    """Whether a line is a name with a key that is what it says."""
+    found = LINE.fullmatch(line)
+    if not found:
+        return False
+    kind = found["kind"].encode()
+    try:
+        key = base64.b64decode(found["key"], validate=True)
+    except binascii.Error:
+        return False
+    return key.startswith(len(kind).to_bytes(4, "big") + kind)
+
+
+@contextmanager
+def _lent(data: bytes) -> Iterator[str]:
+    """`data` as a file that a child can open: in memory, so that it reads what was looked at here, and no disk is needed."""
+    at = os.memfd_create("palpate", 0)  # children inherit it
+    try:
+        os.write(at, data)
+        yield f"/proc/self/fd/{at}"
+    finally:
+        os.close(at)
+
+
+def _keygen(does: str, *options: str, message: bytes = b"", asks: bool = False) -> CompletedProcess[bytes]:
+    """What ssh-keygen says to `message`. asks: it may have something to ask of a person. Raises ConfigError."""
+    import subprocess  # 200 kB, and only where a bundle was deployed
+
+    try:
+        return subprocess.run(
+            ["ssh-keygen", "-Y", does, *options], input=message, timeout=PATIENCE_S if asks else DEADLINE_S,
+            stdout=subprocess.PIPE, stderr=None if asks else subprocess.PIPE, close_fds=False, check=False,
+        )  # fmt: skip
+    except FileNotFoundError as e:
+        raise ConfigError("ssh-keygen is missing, so no signature can be checked: apt install openssh-client") from e
+    except (OSError, subprocess.TimeoutExpired) as e:
+        raise ConfigError(f"ssh-keygen cannot be asked: {e}; try `ssh-keygen -Y {does}` by hand") from e
+
+
+def _said(done: CompletedProcess[bytes]) -> str:
+    """What ssh-keygen said, in one line."""
+    text = b" ".join((done.stderr or b"").split()).decode(errors="replace")
+    return text[:200] or f"ssh-keygen ended with {done.returncode}"

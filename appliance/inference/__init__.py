@@ -1,0 +1,1 @@
+"""From a sweep to a verdict: network, novelty, early exit, enrolment."""

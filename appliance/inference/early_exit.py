@@ -1,0 +1,65 @@
+"""Deciding early: an answer while the finger still slides. In: a sweep so far. Out: a Verdict of status ok, or None.
+
+The bundle's graph has a head for each tenth of the window; the manifest says from which probability on it may speak.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import BundleError
+from appliance.core.types import Status, Sweep, Verdict
+from appliance.inference.classifier import Classifier, inspect, softmax
+
+if TYPE_CHECKING:
+    from appliance.bundle.manifest import Early
+
+
+def decides(scores: NDArray[np.float64], rule: Early) -> bool:
+    """True where `scores` [d + 1, K], the probabilities of steps 0 to d, are enough to decide at step d.
+
+    The last `rule.agree` steps name the same label, and its probability at d is at least `rule.least[d]`.
+    """
+    labels = scores[-rule.agree :].argmax(axis=1)
+    agreed = len(labels) == rule.agree and (labels == labels[-1]).all()
+    return bool(agreed and scores[-1].max() >= rule.least[len(scores) - 1])
+
+
+class Decider:
+    """Answers sweeps that still go on. steps: how often in a window it can be asked.
+
+    Raises BundleError where the bundle cannot decide early.
+    """
+
+    def __init__(self, classifier: Classifier) -> None:
+        manifest = classifier.bundle.manifest
+        if manifest.early is None:
+            raise BundleError(
+                f"bundle {manifest.name} {manifest.version} has no early heads, but classifier.early is true; "
+                "set classifier.early = false, or name a bundle that was exported with them"
+            )
+        self._classifier, self._manifest, self._rule = classifier, manifest, manifest.early
+        self.steps = len(self._rule.least)
+
+    def __call__(self, sweep: Sweep) -> Verdict | None:
+        """The verdict on a sweep with share < 1, or None where the rest of it is needed: then nothing was counted.
+
+        It looks at the frames as it would at a whole window: what is refused there is not decided here. The rest of
+        the window that the graph is given repeats the last frame; the heads up to this step do not see it.
+        """
+        taxels = sweep.frames.taxels
+        if inspect(taxels, self._classifier.tare, self._manifest.thresholds).status is not Status.OK:
+            return None
+        scores = self.scores(sweep)
+        return self._classifier.conclude_if_ok(sweep, scores[-1]) if decides(scores, self._rule) else None
+
+    def scores(self, sweep: Sweep) -> NDArray[np.float64]:
+        """Probabilities [d, K] at the steps up to that of a sweep with share < 1."""
+        taxels = sweep.frames.taxels
+        rest = self._manifest.format.window - len(taxels)
+        step = round(sweep.share * (self.steps + 1))  # counted from 1
+        logits = self._classifier.early(np.concatenate([taxels, taxels[-1:].repeat(rest, axis=0)]))
+        return softmax(logits[:step])

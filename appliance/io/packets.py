@@ -1,0 +1,244 @@
+"""Bytes <-> frames: firmware_config/PROTOCOL.md part 1 in pure functions. In: bytes. Out: packets and what was lost.
+
+Nothing here raises on what a wire can bring, and a frame is given out only where its packet's CRC is right.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+from appliance.core.types import DIGITS, EPOCH_BITS
+
+MAGIC = b"\x50\xc1"
+VERSION = 1
+HEADER = struct.Struct("<2sBBHBBBBBxII")
+CRC = struct.Struct("<I")
+MAX_PAYLOAD = 4096
+MAX_FRAMES = 255
+RECENT = 1 << 16
+"""A packet at most this many frames behind the newest is a repetition; one further behind is a count that restarted."""
+
+_DTYPES = tuple(np.dtype(d).newbyteorder("<") for d in DIGITS)
+_IDENTITY = struct.Struct("<BBBB16s16s")
+_FORMAT = struct.Struct("<BBBxIII")
+
+
+class Kind(IntEnum):
+    """Byte 3 of a packet."""
+
+    FRAMES = 0
+    REPLY = 1
+
+
+class Flag(IntFlag):
+    """Byte 6 of a packet."""
+
+    TRIGGER = 1
+    OVERFLOW = 2
+
+
+class Request(IntEnum):
+    """Control requests: bRequest of a vendor device, one byte on the bulk OUT endpoint of a CDC-ACM board."""
+
+    IDENTITY = 1
+    FORMAT = 2
+    START = 3
+    STOP = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """Frames in a row: seq and t_us (32 bits, as sent) of the first, flags (bits of Flag), taxels [n, R, C] digits."""
+
+    seq: int
+    t_us: int
+    flags: int
+    taxels: NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The answer to a request that was sent as a byte (CDC-ACM)."""
+
+    request: int
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Unpacked:
+    """What a run of bytes held: packets and replies in order, bytes that belonged to none, and the unfinished rest."""
+
+    packets: list[Packet]
+    replies: list[Reply]
+    garbage: int
+    leftover: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who a readout board says it is."""
+
+    protocol: int
+    firmware: tuple[int, int, int]
+    board: str
+    serial: str
+
+
+@dataclass(frozen=True, slots=True)
+class SkinFormat:
+    """What a readout board sends: grid, digit type, frames a second, frames in its FIFO and in a packet."""
+
+    rows: int
+    cols: int
+    dtype: str
+    rate_hz: float
+    fifo_frames: int
+    packet_frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where in the stream we are: number of the enumeration, and the unwrapped number of the next frame if any came."""
+
+    epoch: int
+    next: int | None = None
+
+
+def _seal(head: bytes, payload: bytes) -> bytes:
+    return head + payload + CRC.pack(zlib.crc32(payload, zlib.crc32(head)))
+
+
+def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
+    """A frame packet; taxels [n, R, C] of a digit type on the list. seq and t_us are taken modulo 2**32."""
+    n, rows, cols = taxels.shape
+    digit = _DTYPES.index(taxels.dtype.newbyteorder("<"))
+    payload = taxels.astype(_DTYPES[digit], copy=False).tobytes()
+    if not 0 < n <= MAX_FRAMES or len(payload) > MAX_PAYLOAD:
+        raise FormatError(
+            f"{n} frames of {rows} x {cols} taxels do not fit a packet of {MAX_PAYLOAD} bytes; send fewer"
+        )
+    head = HEADER.pack(
+        MAGIC, VERSION, Kind.FRAMES, len(payload), flags, n, rows, cols, digit, seq % (1 << 32), t_us % (1 << 32)
+    )
+    return _seal(head, payload)
+
+
+def pack_reply(request: Request, payload: bytes, version: int = VERSION) -> bytes:
+    """A reply packet, as a CDC-ACM board answers a request byte."""
+    return _seal(HEADER.pack(MAGIC, version, Kind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0), payload)
+
+
+def unpack(data: bytes) -> Unpacked:
+    """Find all whole packets in `data`. Feed the leftover back in front of what comes next."""
+    packets: list[Packet] = []
+    replies: list[Reply] = []
+    garbage = at = 0
+    while True:
+        start = data.find(MAGIC, at)
+        if start < 0:
+            # the last byte may be the first half of a magic
+            keep = 1 if data[at:].endswith(MAGIC[:1]) else 0
+            garbage += len(data) - at - keep
+            return Unpacked(packets, replies, garbage, data[len(data) - keep :])
+        garbage += start - at
+        item, size = _one(data, start)
+        if size == 0:
+            return Unpacked(packets, replies, garbage, data[start:])
+        if isinstance(item, Packet):
+            packets.append(item)
+        elif item is not None:
+            replies.append(item)
+        else:
+            garbage += size
+        at = start + size
+
+
+def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
+    """The packet at `at` and its size; (None, 0) where more bytes are needed, (None, 1) where it is none."""
+    if len(data) - at < HEADER.size:
+        return None, 0
+    _, version, kind, length, flags, count, rows, cols, digit, seq, t_us = HEADER.unpack_from(data, at)
+    frames = kind == Kind.FRAMES and version == VERSION and digit < len(_DTYPES) and count > 0 and rows * cols > 0
+    if frames:
+        frames = length == count * rows * cols * _DTYPES[digit].itemsize
+    if length > MAX_PAYLOAD or not (frames or kind == Kind.REPLY):
+        return None, 1
+    end = at + HEADER.size + length
+    if len(data) < end + CRC.size:
+        return None, 0
+    if zlib.crc32(data[at:end]) != CRC.unpack_from(data, end)[0]:
+        return None, 1
+    size = end + CRC.size - at
+    if kind == Kind.REPLY:
+        return Reply(count, data[at + HEADER.size : end]), size
+    taxels = np.frombuffer(data, _DTYPES[digit], count * rows * cols, at + HEADER.size).reshape(count, rows, cols)
+    return Packet(seq, t_us, flags, taxels), size
+
+
+def follow(packets: list[Packet], place: Place) -> tuple[list[tuple[int, Packet]], Place, int, int]:
+    """Unwrap sequence numbers: ([(unwrapped number of the first frame, packet)], new place, lost frames, stale frames).
+
+    A packet that lies behind is stale (repeated or late) and left out; one that lies far behind starts a new epoch,
+    since the board's count has restarted. Frames are `lost` where the count jumps ahead.
+    """
+    fresh: list[tuple[int, Packet]] = []
+    lost = stale = 0
+    for p in packets:
+        n = len(p.taxels)
+        ahead = 0 if place.next is None else (p.seq - place.next + (1 << 31)) % (1 << 32) - (1 << 31)
+        if -RECENT <= ahead < 0:
+            stale += n
+            continue
+        if ahead < 0:
+            place = Place(place.epoch + 1)
+        if place.next is None:
+            first = (place.epoch << EPOCH_BITS) + p.seq
+        else:
+            first = place.next + ahead
+            lost += ahead
+        fresh.append((first, p))
+        place = Place(place.epoch, first + n)
+    return fresh, place, lost, stale
+
+
+def pack_identity(who: Identity) -> bytes:
+    """Payload of the IDENTITY reply."""
+    return _IDENTITY.pack(who.protocol, *who.firmware, who.board.encode()[:16], who.serial.encode()[:16])
+
+
+def unpack_identity(payload: bytes) -> Identity:
+    """Read an IDENTITY reply. Raises FormatError where it is too short; a newer board may send a longer one."""
+    if len(payload) < _IDENTITY.size:
+        raise FormatError(
+            f"identity of {len(payload)} bytes; protocol {VERSION} has {_IDENTITY.size}: check the firmware"
+        )
+    protocol, major, minor, patch, board, serial = _IDENTITY.unpack_from(payload)
+    return Identity(protocol, (major, minor, patch), _text(board), _text(serial))
+
+
+def pack_format(skin: SkinFormat) -> bytes:
+    """Payload of the FORMAT reply."""
+    digit, rate_mhz = DIGITS.index(skin.dtype), round(skin.rate_hz * 1000)
+    return _FORMAT.pack(skin.rows, skin.cols, digit, rate_mhz, skin.fifo_frames, skin.packet_frames)
+
+
+def unpack_format(payload: bytes) -> SkinFormat:
+    """Read a FORMAT reply. Raises FormatError where it is too short or its digit type is not on the list."""
+    if len(payload) < _FORMAT.size:
+        raise FormatError(f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the firmware")
+    rows, cols, digit, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
+    if digit >= len(DIGITS):
+        raise FormatError(f"digit type {digit} is not on the list 0..{len(DIGITS) - 1}; update the appliance")
+    return SkinFormat(rows, cols, DIGITS[digit], rate_mhz / 1000, fifo_frames, packet_frames)
+
+
+def _text(raw: bytes) -> str:
+    return "".join(c for c in raw.split(b"\0")[0].decode("ascii", "replace") if c.isprintable())

@@ -1,0 +1,267 @@
+"""Verdict -> sentence on the serial line, code on GPIO lines. Commands come back in over the serial line.
+
+Sentences are formed and read by pure functions (PROTOCOL.md, part 2); the port is never waited for: a peer that does
+not read costs dropped and counted sentences, and not one frame.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import re
+import sys
+import termios
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+from operator import xor
+from typing import Any, Protocol
+
+import serial
+
+from appliance.core.clock import Clock
+from appliance.core.config import SerialConfig
+from appliance.core.types import Verdict
+
+TALKER = "PPLP"
+COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD")
+TOLD = ("MATERIAL", "POSITION", "SESSION")
+"""Those that have a text after a comma."""
+MAX_LINE = 128
+RETRY_NS = 1_000_000_000
+"""How often a port that is gone is tried again."""
+PSEUDO_TERMINALS = range(136, 144)
+"""Their major device numbers."""
+_UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
+
+
+class ResultSink(Protocol):
+    """Whatever takes verdicts."""
+
+    def send(self, verdict: Verdict) -> None:
+        """Pass a verdict on without waiting."""
+        ...
+
+
+class Port(ResultSink, Protocol):
+    """A line to the robot controller: verdicts and other sentences out, commands in."""
+
+    dropped: int
+    trouble: str
+
+    def say(self, line: bytes) -> None:
+        """Send a sentence without waiting."""
+        ...
+
+    def commands(self) -> list[Command]:
+        """Commands that have come in since the last call."""
+        ...
+
+    def close(self) -> None:
+        """Let the line go."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A line from the robot controller: one of COMMANDS, with its text where it has one; or `error`: why it is none."""
+
+    name: str
+    text: str = ""
+    error: str = ""
+
+    @property
+    def line(self) -> str:
+        """As it stands in a sentence or a capture."""
+        return f"{self.name},{self.text}" if self.name in TOLD else self.name
+
+
+def checksum(body: str) -> str:
+    """NMEA 0183: exclusive or of the characters between $ and *, two hex digits."""
+    return f"{reduce(xor, body.encode('ascii'), 0):02X}"
+
+
+def sentence(kind: str, *fields: object) -> bytes:
+    """`$PPLP,KIND,field,…*hh` with CR and LF. What NMEA reserves becomes a space; too long a last field is cut."""
+    body = ",".join([TALKER, kind, *(_UNSAFE.sub(" ", str(f)) for f in fields)])[: MAX_LINE - 6]
+    return f"${body}*{checksum(body)}\r\n".encode("ascii")
+
+
+def result(v: Verdict, source: str) -> bytes:
+    """The RES sentence of a verdict; `source` says where the frames came from (usb, sim, replay)."""
+    return sentence(
+        "RES", v.sweep, f"{v.time_ns / 1e9:.3f}", v.status, v.label, f"{v.probability:.3f}", f"{v.margin:.3f}",
+        v.fused, v.lost, f"{v.latency_ns / 1e6:.2f}", v.bundle, source, f"{v.share:.2f}", v.detail,
+    )  # fmt: skip
+
+
+def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
+    """Commands in `data`, which goes on where `rest` ended, and the new unfinished rest.
+
+    A checksum may be left out by a person, but not be wrong. One Command a line, however it is cut: a line of over
+    MAX_LINE characters is told once; the rest then holds one more than these, so that its end is not taken for a line.
+    """
+    told = len(rest) > MAX_LINE
+    *lines, rest = re.split(rb"[\r\n]+", rest + data)
+    commands = [_command(line) for line in lines[told:] if line]
+    if len(rest) > MAX_LINE and (lines or not told):
+        commands.append(_command(rest))
+    return commands, rest[: MAX_LINE + 1]
+
+
+def _command(line: bytes) -> Command:
+    if len(line) > MAX_LINE:
+        return Command("", error=f"line of over {MAX_LINE} characters without an end")
+    # a name of letters only: it is sent back, and what noise held in its place could take the answer's fields away
+    # a sentence begins at its $: what noise or a break has left before it is no part of it
+    match = re.fullmatch(rb"(?s:.*\$)?PPLP,([A-Za-z]{0,16})(?:,([ -#%-)+-~]*))?(?:\*([0-9A-Fa-f]{2}))?", line.strip())
+    if not match:
+        return Command("", error=f"not a command; send for example $PPLP,ID*{checksum('PPLP,ID')}")
+    name = match[1].decode()
+    text, given = (None if group is None else group.decode() for group in match.group(2, 3))
+    said = f"{TALKER},{name}" + ("" if text is None else f",{text}")
+    if given and given.upper() != checksum(said):
+        return Command(name, error=f"checksum {given} should be {checksum(said)}")
+    return command(name, text)
+
+
+def command(name: str, text: str | None = None) -> Command:
+    """The command `name` with its text, or one that says why there is none."""
+    if name not in COMMANDS or _UNSAFE.search(text or ""):
+        return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
+    if (name in TOLD) != (text is not None):
+        want = f"{TALKER},{name}" + (",TEXT" if name in TOLD else "")
+        return Command(name, error=f"send it as ${want}")
+    return Command(name, text or "")
+
+
+class StdoutPort:
+    """Sentences on standard output, where no serial port is configured.
+
+    commands: where they come from; nobody can command on standard output itself.
+    """
+
+    def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
+        self.dropped, self.trouble, self._source, self._commands = 0, "", source, commands
+
+    def send(self, verdict: Verdict) -> None:
+        """Print a verdict's sentence."""
+        self.say(result(verdict, self._source))
+
+    def say(self, line: bytes) -> None:
+        """Print a sentence."""
+        sys.stdout.buffer.write(line)
+        sys.stdout.buffer.flush()
+
+    def commands(self) -> list[Command]:
+        """Whatever the other source has."""
+        return self._commands()
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class SerialSink:
+    """Sentences out of and commands into a serial port that may come and go.
+
+    opener: makes a `serial.Serial`; passed in so that a test can refuse. dropped: sentences that nobody took.
+    """
+
+    def __init__(
+        self, config: SerialConfig, clock: Clock, source: str, opener: Callable[..., Any] = serial.Serial
+    ) -> None:
+        self.dropped = 0
+        self.trouble = ""
+        self._config, self._clock, self._source, self._opener = config, clock, source, opener
+        self._port: Any = None
+        self._retry_ns = clock.now_ns()
+        self._queue: deque[bytes] = deque()
+        self._begun = 0  # bytes of the first sentence in the queue that are out already
+        self._rest = b""
+
+    def send(self, verdict: Verdict) -> None:
+        """Queue a verdict's sentence and hand over what the port takes."""
+        self.say(result(verdict, self._source))
+
+    def say(self, line: bytes) -> None:
+        """Queue a sentence; with a full queue the oldest that has not begun is dropped and counted."""
+        if len(self._queue) >= self._config.queue:
+            del self._queue[1 if self._begun else 0]
+            self.dropped += 1
+        self._queue.append(line)
+        self._flush()
+
+    def commands(self) -> list[Command]:
+        """Hand over what waits, and the commands that have come in since the last call."""
+        self._flush()
+        if not self._port:
+            return []
+        try:
+            data = os.read(self._port.fileno(), 4096)
+        except BlockingIOError:
+            return []
+        except OSError as e:
+            self._lose(e)
+            return []
+        found, self._rest = parse(data, self._rest)
+        return found
+
+    def close(self) -> None:
+        """Close the port; what it has not taken is dropped."""
+        if self._port:
+            port, self._port = self._port, None
+            with contextlib.suppress(OSError):  # a port that is gone cannot be closed properly
+                # another program may have it open from before us; then this outlives us, and would keep us out, too
+                fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
+            with contextlib.suppress(OSError):
+                port.close()
+
+    def _flush(self) -> None:
+        if not self._port and not self._open():
+            return
+        while self._queue:
+            try:
+                # not Serial.write: with write_timeout=0 pyserial 3.5 spins for as long as the peer does not read
+                self._begun += os.write(self._port.fileno(), self._queue[0][self._begun :])
+            except BlockingIOError:
+                return
+            except OSError as e:
+                self._lose(e)
+                return
+            if self._begun == len(self._queue[0]):
+                self._queue.popleft()
+                self._begun = 0
+
+    def _open(self) -> bool:
+        now = self._clock.now_ns()
+        if now < self._retry_ns:
+            return False
+        self._retry_ns = now + RETRY_NS
+        try:
+            port = self._opener(self._config.port, self._config.baud, timeout=0, write_timeout=0, exclusive=True)
+            _keep_others_out(port.fileno())
+        except (OSError, ValueError) as e:  # SerialException is an OSError
+            held = getattr(e, "errno", None) in (errno.EBUSY, errno.EAGAIN)
+            advice = "end the program that has it (fuser tells)" if held else "check serial.port and group dialout"
+            self.trouble = f"serial port {self._config.port} cannot be opened: {e}; {advice}"
+            return False
+        self._port, self.trouble, self._rest = port, "", b""
+        return True
+
+    def _lose(self, e: OSError) -> None:
+        self.trouble = f"serial port {self._config.port} failed: {e}; it is opened again when it is back"
+        self.close()
+        self._begun = 0
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
+
+
+def _keep_others_out(port: int) -> None:
+    """Nobody but root may open `port` from now on: who reads it takes commands away, and a lock binds only who asks.
+
+    Not a pseudo-terminal: it would stay shut, also for us, if we were killed while its other end is open.
+    """
+    if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
+        fcntl.ioctl(port, termios.TIOCEXCL)

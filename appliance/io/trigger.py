@@ -1,0 +1,235 @@
+"""The trigger room. In: the robot's GPIO edges, stamped by the kernel. Out: START, STOP, NEW OBJECT, settled, in order.
+
+What the kernel dropped or a storm buried is told as LOST; nothing is made up for it.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Protocol, Self
+
+from appliance.io.gpio_lines import check_binding, line_error, naming, request_lines
+
+if TYPE_CHECKING:
+    from gpiod import EdgeEvent, LineRequest
+
+    from appliance.core.config import TriggerConfig
+
+
+class EdgeKind(StrEnum):
+    """What an edge says. LOST: edges were dropped or came in a storm; what happened in between is unknown."""
+
+    START = "start"
+    STOP = "stop"
+    NEW_OBJECT = "new-object"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """One settled edge. t_ns: kernel time stamp, `CLOCK_MONOTONIC`, of the first edge of its burst.
+
+    LOST is stamped with the edge at which the loss or the storm was found out. What was told before it is certain.
+    Nothing comes after it until every line has been quiet for `glitch_us`; then the levels are read anew, which makes
+    no edge.
+    """
+
+    kind: EdgeKind
+    t_ns: int
+
+
+class Trigger(Protocol):
+    """Where the recorder gets its edges from."""
+
+    def edges(self, now_ns: int) -> list[Edge]:
+        """Edges that have settled by `now_ns`, in order of time; never waits."""
+        ...
+
+    @property
+    def blind(self) -> bool:
+        """True after LOST, until the levels are known again."""
+        ...
+
+
+_Meaning = tuple[EdgeKind | None, EdgeKind | None]
+"""What a line's fall and its rise say; None: nothing."""
+
+
+@dataclass(slots=True)
+class _Line:
+    """An input line: its kernel queue, its settled level, and the burst of edges that has not settled yet."""
+
+    request: LineRequest
+    offset: int
+    name: str
+    meaning: _Meaning
+    seqno: int = 0  # of the newest event that was taken
+    known_ns: int = 0  # all events up to here were taken
+    level: bool = False
+    count: int = 0  # edges in the burst
+    first_ns: int = 0
+    last_ns: int = 0
+    after: bool = False  # level after the last of them
+
+
+class GpioTrigger:
+    """The robot's lines as clean edges.
+
+    A burst is a run of edges on one line with less than `glitch_us` between neighbours. It has settled `glitch_us`
+    after its last edge. If the level is another one then, it was one edge, stamped with the burst's first; if not, a
+    glitch. So a clean edge is told `glitch_us` late, with its exact stamp (the kernel's own debouncing would move the
+    stamp). An edge waits for older bursts on other lines, so that order never inverts.
+
+    A call reads at most `storm_edges` events. Raises LineError where lines cannot be found, requested or read.
+    """
+
+    def __init__(self, config: TriggerConfig, gpio: Any) -> None:
+        check_binding(gpio)
+        self._glitch_ns = config.glitch_us * 1000
+        self._storm_edges = config.storm_edges
+        self._glitches = self._lost_events = self._storms = 0
+        self._pending: list[Edge] = []
+        self._blind_ns: int | None  # newest edge since the levels became unknown; None: they are known
+        roles = _roles(config)
+        with ExitStack() as stack:
+            # apart: in a request of several lines the interrupt numbers an edge and its thread tells it; of two edges
+            # before the thread has run one number is never told, so every bounce would look like a loss
+            names = [name for name, _ in roles]
+            requests = request_lines(gpio, names, _input_settings(config, gpio), stack, apart=True)
+            meaning = dict(roles)
+            self._lines = [_Line(r, o, name, meaning[name]) for r, found in requests for o, name in found.items()]
+            self._active, self._rising = gpio.line.Value.ACTIVE, gpio.EdgeEvent.Type.RISING_EDGE
+            self._read_levels()
+            self._open = stack.pop_all()
+
+    @property
+    def glitches(self) -> int:
+        """Bursts that changed nothing."""
+        return self._glitches
+
+    @property
+    def lost_events(self) -> int:
+        """Events that the kernel dropped because its queue was full."""
+        return self._lost_events
+
+    @property
+    def storms(self) -> int:
+        """Bursts of more than `storm_edges` edges."""
+        return self._storms
+
+    @property
+    def blind(self) -> bool:
+        """True from LOST until all lines were quiet and their levels are known again."""
+        return self._blind_ns is not None
+
+    def edges(self, now_ns: int) -> list[Edge]:
+        """Edges that have settled by `now_ns` (read before the call), in order of time; never waits."""
+        for line in self._lines:
+            try:  # not `naming`, whose generator costs more than a look at an empty queue
+                self._read(line, now_ns)
+            except OSError as e:
+                raise line_error("read", [line.name], e) from e
+        if self._blind_ns is None and not self._pending and not any(line.count for line in self._lines):
+            return []
+        horizon_ns = min(line.known_ns for line in self._lines)
+        for line in self._lines:
+            if line.count and horizon_ns - line.last_ns >= self._glitch_ns:
+                self._settle(line)
+        # the levels are those of now: first read everything that led to them
+        if self._blind_ns is not None and horizon_ns >= max(now_ns, self._blind_ns + self._glitch_ns):
+            self._read_levels()
+        until_ns = min([horizon_ns, *(line.first_ns for line in self._lines if line.count)])
+        self._pending.sort(key=lambda edge: edge.t_ns)
+        due = [edge for edge in self._pending if edge.t_ns <= until_ns]
+        del self._pending[: len(due)]
+        return due
+
+    def close(self) -> None:
+        """Give the lines back."""
+        self._open.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _read(self, line: _Line, now_ns: int) -> None:
+        """Take the line's share of events."""
+        left = max(1, self._storm_edges // len(self._lines))
+        while left > 0 and line.request.wait_edge_events(0):
+            events = line.request.read_edge_events(left)
+            left -= len(events)
+            for event in events:
+                self._take(line, event)
+        if left > 0:
+            line.known_ns = max(line.known_ns, now_ns)
+
+    def _take(self, line: _Line, event: EdgeEvent) -> None:
+        t_ns = event.timestamp_ns
+        dropped = (event.line_seqno - line.seqno - 1) % 2**32  # the kernel counts in 32 bits
+        line.seqno, line.known_ns = event.line_seqno, max(line.known_ns, t_ns)
+        if dropped:
+            self._lost_events += dropped
+            self._lose(t_ns)
+        if self._blind_ns is not None:
+            self._blind_ns = max(self._blind_ns, t_ns)
+            return
+        if line.count and t_ns - line.last_ns >= self._glitch_ns:
+            self._settle(line)
+        if not line.count:
+            line.first_ns = t_ns
+        # a rise may follow a rise: the kernel looks at the level only after the interrupt, so the newest word is right
+        line.count, line.last_ns, line.after = line.count + 1, t_ns, event.event_type is self._rising
+        if line.count > self._storm_edges:
+            self._storms += 1
+            self._lose(t_ns)
+
+    def _settle(self, line: _Line) -> None:
+        """The burst is over: an edge, if it changed the level."""
+        line.count = 0
+        if line.after == line.level:
+            self._glitches += 1
+            return
+        line.level = line.after
+        if kind := line.meaning[line.level]:
+            self._pending.append(Edge(kind, line.first_ns))
+
+    def _lose(self, t_ns: int) -> None:
+        """Tell LOST at `t_ns` and believe nothing later, on any line: a STOP may be missing as well as a START."""
+        if self._blind_ns is None:
+            self._pending = [edge for edge in self._pending if edge.t_ns <= t_ns] + [Edge(EdgeKind.LOST, t_ns)]
+            self._blind_ns = t_ns
+        for line in self._lines:
+            line.count = 0
+
+    def _read_levels(self) -> None:
+        """Begin anew from the lines' levels."""
+        for line in self._lines:
+            with naming("read", [line.name]):
+                line.level = line.request.get_values([line.offset]) == [self._active]
+        self._blind_ns = None
+
+
+def _roles(config: TriggerConfig) -> list[tuple[str, _Meaning]]:
+    """Each wired line with the meaning of its fall and of its rise."""
+    if config.mode == "one-line":
+        roles: list[tuple[str, _Meaning]] = [(config.start, (EdgeKind.STOP, EdgeKind.START))]
+    else:
+        roles = [(config.start, (None, EdgeKind.START)), (config.stop, (None, EdgeKind.STOP))]
+    if config.new_object:
+        roles.append((config.new_object, (None, EdgeKind.NEW_OBJECT)))
+    return roles
+
+
+def _input_settings(config: TriggerConfig, gpio: Any) -> Any:
+    """Both edges, stamped by the kernel on the host's monotonic clock, not debounced."""
+    return gpio.LineSettings(
+        direction=gpio.line.Direction.INPUT,
+        edge_detection=gpio.line.Edge.BOTH,
+        event_clock=gpio.line.Clock.MONOTONIC,
+        bias=gpio.line.Bias[config.bias.upper().replace("-", "_")],
+        active_low=config.active_low,
+    )

@@ -1,0 +1,166 @@
+"""The USB side of a readout board: finds, opens and claims it, sends requests, reads bulk transfers, explains errnos.
+
+In: a pyusb backend. Out: bytes, or SensorError where a board cannot be used. PROTOCOL.md, part 1, "Requests".
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+from typing import Any
+
+import usb.core
+import usb.util
+
+from appliance.core.clock import Clock
+from appliance.core.config import SensorConfig
+from appliance.core.errors import SensorAbsent, SensorBusy, SensorDenied, SensorError, SensorLost, SensorMismatch
+from appliance.io import packets
+
+REPLY_MS = 500
+"""Longest wait for the answer to a request."""
+
+
+class VendorLink:
+    """An opened vendor-class board: control requests and one bulk IN endpoint."""
+
+    def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
+        self._device, self._number, self._clock = device, interface.bInterfaceNumber, clock
+        self._in = _endpoint(interface, usb.util.ENDPOINT_IN)
+        for number in self._claimed():
+            _claim(device, number)
+
+    def _claimed(self) -> list[int]:
+        return [self._number]
+
+    def request(self, request: packets.Request, length: int) -> bytes:
+        """Send a request; its reply where `length` asks for one."""
+        kind = usb.util.CTRL_TYPE_VENDOR | usb.util.CTRL_RECIPIENT_INTERFACE | (0x80 if length else 0)
+        reply = self._device.ctrl_transfer(kind, request, 0, self._number, length or None, REPLY_MS)
+        return bytes(reply) if length else b""
+
+    def read(self, size: int, timeout_ms: int) -> bytes:
+        """One bulk transfer of at most `size` bytes. An endpoint that has stalled is cleared, for whoever reads next."""
+        try:
+            return bytes(self._device.read(self._in, size, timeout_ms))
+        except usb.core.USBError as e:
+            if e.errno == errno.EPIPE:
+                with contextlib.suppress(usb.core.USBError):
+                    self._device.clear_halt(self._in)
+            raise
+
+    def close(self) -> None:
+        """Ask the board to stop and release it; a board that is gone cannot be asked."""
+        with contextlib.suppress(usb.core.USBError):
+            self.request(packets.Request.STOP, 0)
+        usb.util.dispose_resources(self._device)
+
+
+class AcmLink(VendorLink):
+    """An opened CDC-ACM board: the same requests as single bytes on bulk OUT, their replies among the packets."""
+
+    def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
+        self._out = _endpoint(interface, usb.util.ENDPOINT_OUT)
+        super().__init__(device, interface, clock)
+
+    def _claimed(self) -> list[int]:
+        # the kernel's cdc_acm holds the control interface beside the data interface
+        return [i.bInterfaceNumber for i in self._device.get_active_configuration() if i.bInterfaceClass in (2, 10)]
+
+    def request(self, request: packets.Request, length: int) -> bytes:
+        """Send a request byte; its reply where `length` asks for one. The board is idle, so no frames are lost here."""
+        self._device.write(self._out, bytes([request]), REPLY_MS)
+        data, until_ns = b"", self._clock.now_ns() + REPLY_MS * 1_000_000
+        while length:
+            data += self.read(512, REPLY_MS)
+            for reply in packets.unpack(data).replies:
+                if reply.request == request:
+                    return reply.payload
+            # a few bytes now and then would go on for ever
+            if len(data) > 4 * packets.MAX_PAYLOAD or self._clock.now_ns() >= until_ns:
+                raise SensorMismatch(
+                    f"the skin sends frames but does not answer request {request.name}; check its firmware"
+                )
+        return b""
+
+
+def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
+    """Find and claim the configured board."""
+    ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
+    try:
+        found = list(usb.core.find(True, backend, idVendor=config.vendor_id, idProduct=config.product_id))
+    except usb.core.NoBackendError as e:
+        raise SensorAbsent("libusb-1.0 is not installed, so no skin can be found; apt install libusb-1.0-0") from e
+    device = next((d for d in found if not config.serial or _serial(d) == config.serial), None)
+    if device is None:
+        serial = f" with serial number {config.serial}" if config.serial else ""
+        raise SensorAbsent(
+            f"no skin {ids}{serial} on USB ({len(found)} with other numbers); check cable, power and udev rule"
+        )
+    link, wanted = (AcmLink, 10) if config.link == "acm" else (VendorLink, 255)
+    try:
+        interface = usb.util.find_descriptor(_configuration(device), bInterfaceClass=wanted)
+        if interface is None:
+            raise SensorMismatch(f"skin {ids} has no {config.link} interface (class {wanted}); see sensor.link")
+        return link(device, interface, clock)
+    except usb.core.USBError as e:
+        usb.util.dispose_resources(device)
+        raise explain(e) from e
+
+
+def _serial(device: usb.core.Device) -> str:
+    try:
+        return device.serial_number or ""
+    except usb.core.USBError as e:
+        raise explain(e) from e
+    except UnicodeDecodeError as e:
+        raise SensorMismatch(f"the skin's serial number is no text ({e}); check its firmware") from e
+    except ValueError as e:  # pyusb's answer where the string descriptors may not be read
+        raise SensorDenied(
+            f"the skin's serial number cannot be read ({e}); install the udev rule, join group plugdev"
+        ) from e
+
+
+def _configuration(device: usb.core.Device) -> Any:
+    """The active configuration; set only where none is, since setting it anew resets the board."""
+    try:
+        return device.get_active_configuration()
+    except usb.core.USBError:
+        device.set_configuration()
+        return device.get_active_configuration()
+
+
+def _endpoint(interface: Any, direction: int) -> int:
+    endpoint = usb.util.find_descriptor(
+        interface,
+        custom_match=lambda e: (
+            usb.util.endpoint_direction(e.bEndpointAddress) == direction
+            and usb.util.endpoint_type(e.bmAttributes) == usb.util.ENDPOINT_TYPE_BULK
+        ),
+    )
+    if endpoint is None:
+        raise SensorMismatch(
+            f"the skin's interface has no bulk endpoint {'IN' if direction else 'OUT'}; check its firmware"
+        )
+    return int(endpoint.bEndpointAddress)
+
+
+def _claim(device: usb.core.Device, number: int) -> None:
+    if device.is_kernel_driver_active(number):
+        device.detach_kernel_driver(number)
+    usb.util.claim_interface(device, number)
+
+
+def explain(e: usb.core.USBError) -> SensorError:
+    """What an errno of libusb means to a person."""
+    if e.errno == errno.EACCES:
+        return SensorDenied(
+            "the skin may not be opened by this user (errno 13); install the udev rule, join group plugdev"
+        )
+    if e.errno == errno.EBUSY:
+        return SensorBusy("another program holds the skin (errno 16); stop it, or unplug and replug the skin")
+    if e.errno == errno.ENODEV:
+        return SensorLost("the skin was unplugged (errno 19); plug it in again, it is taken up by itself")
+    return SensorLost(
+        f"the skin failed ({e.strerror or e}, errno {e.errno}); trying again, check its cable if this stays"
+    )

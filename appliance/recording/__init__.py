@@ -1,0 +1,1 @@
+"""From frames and edges to sweeps, and sweeps to files."""

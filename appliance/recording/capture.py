@@ -1,0 +1,198 @@
+"""Captures (transfers, states, edges, commands with their times, in one file) and kept sweeps. Out: the same, played.
+
+A capture played through the same rooms gives the same verdicts bit for bit, since nothing else enters them.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import asdict
+from enum import IntEnum
+from pathlib import Path
+from typing import IO
+
+from appliance.core.errors import ConfigError, FormatError, SensorError, SensorMismatch
+from appliance.core.schema import typed
+from appliance.core.types import Frames, SweepFormat
+from appliance.io.packets import Identity
+from appliance.io.robot_link import Command, command
+from appliance.io.trigger import Edge, EdgeKind
+from appliance.io.usb_sensor import Stream, Tally
+
+MAGIC = b"PPLPCAP1"
+_RECORD = struct.Struct("<BQI")
+_EDGE = struct.Struct("<QB")
+_KINDS = tuple(EdgeKind)
+_MOST_NS = 1 << 63
+"""Times are int64."""
+
+
+class Kind(IntEnum):
+    """What a record holds."""
+
+    TRANSFER = 0
+    STATE = 1
+    EDGES = 2
+    COMMAND = 3
+
+
+class CaptureWriter:
+    """Writes a capture as it happens; what a power failure cuts off is at most what the system had not written yet.
+
+    log: told once where the file cannot be written any more; the capture then ends, since one with a hole would lie,
+    and classifying goes on. Raises ConfigError where it cannot be opened.
+    """
+
+    def __init__(self, path: Path, fmt: SweepFormat, log: Callable[[str], None] = lambda line: None) -> None:
+        head = json.dumps(asdict(fmt)).encode()
+        self._path, self._log, self._ended = path, log, False
+        try:
+            self._file: IO[bytes] = path.open("wb")
+        except OSError as e:
+            raise ConfigError(f"--capture {path}: {e.strerror}; name a file that can be written") from e
+        self._put(lambda: self._file.write(MAGIC + len(head).to_bytes(4, "little") + head))
+
+    def transfer(self, t_ns: int, data: bytes) -> None:
+        """Note a bulk transfer that ended at `t_ns`."""
+        self._write(Kind.TRANSFER, t_ns, data)
+
+    def state(self, t_ns: int, state: str) -> None:
+        """Note the sensor's new state."""
+        self._write(Kind.STATE, t_ns, state.encode())
+
+    def edges(self, t_ns: int, edges: list[Edge]) -> None:
+        """Note edges that the trigger gave out at `t_ns`."""
+        self._write(Kind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
+
+    def command(self, t_ns: int, line: str) -> None:
+        """Note a command that was carried out, as it stands in a sentence."""
+        self._write(Kind.COMMAND, t_ns, line.encode())
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._put(self._file.close)
+
+    def _write(self, kind: Kind, t_ns: int, data: bytes) -> None:
+        if not self._ended:
+            self._put(lambda: self._file.write(_RECORD.pack(kind, t_ns, len(data)) + data))
+
+    def _put(self, write: Callable[[], object]) -> None:
+        try:
+            write()
+        except OSError as e:
+            if not self._ended:
+                self._log(f"capture: {self._path} cannot be written: {e.strerror}; it ends here, classifying goes on")
+            self._ended = True
+
+
+class Playback:
+    """Sensor, trigger, clock and commands in one: gives what a capture holds to the rooms behind, each at its time.
+
+    Raises FormatError where the file cannot be read or is no capture; a last record that was cut off is left out.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            data = path.read_bytes()
+        except OSError as e:
+            raise FormatError(f"{path}: cannot be read: {e.strerror}; name what `palpate run --capture` wrote") from e
+        if not data.startswith(MAGIC):
+            raise FormatError(
+                f"{path}: not a capture (it begins with {data[:8]!r}); `palpate run --capture` writes one"
+            )
+        begin = len(MAGIC) + 4 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 4], "little")
+        try:
+            self.format = typed(SweepFormat, json.loads(data[len(MAGIC) + 4 : begin]))
+        except (ValueError, TypeError, RecursionError) as e:
+            raise FormatError(f"{path}: the capture's head cannot be read: {e}; capture again") from e
+        self.state = "absent"
+        self.trouble: SensorError | None = None
+        self.identity: Identity | None = None
+        self.tally = Tally()
+        self._stream = Stream(self.format, self.tally)
+        self._records = deque(_records(path, data, begin))
+        self._now_ns = self._records[0][1] if self._records else 0
+
+    @property
+    def finished(self) -> bool:
+        """True when everything was played."""
+        return not self._records
+
+    @property
+    def clock(self) -> dict[str, float] | None:
+        """Sensor: how well the board's time is known."""
+        return self._stream.clock
+
+    def now_ns(self) -> int:
+        """Clock: the time of the record that was played last."""
+        return self._now_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Clock: the records alone move time."""
+
+    @property
+    def blind(self) -> bool:
+        """Trigger: a capture holds what was told, so nothing is unknown."""
+        return False
+
+    def read(self) -> Frames:
+        """Sensor: the next transfer's frames, or none where the next record is something else."""
+        frames = Frames.empty(self.format)
+        if self._records:
+            kind, self._now_ns, data = self._records[0]
+            if kind in (Kind.TRANSFER, Kind.STATE):
+                self._records.popleft()
+            if kind == Kind.TRANSFER:
+                with suppress(SensorMismatch):  # what the sensor made of it then is the next record
+                    frames = self._stream.feed(data, self._now_ns)
+            elif kind == Kind.STATE:
+                self.state = data.decode()
+                if self.state == "streaming":
+                    self._stream.restart()
+        return frames
+
+    def edges(self, now_ns: int) -> list[Edge]:
+        """Trigger: the edges that the box was given at this moment."""
+        edges = []
+        while self._records and self._records[0][0] == Kind.EDGES and self._records[0][1] <= now_ns:
+            edges += [Edge(_KINDS[k], t) for t, k in _EDGE.iter_unpack(self._records.popleft()[2])]
+        return edges
+
+    def commands(self) -> list[Command]:
+        """Port: the commands that were carried out at this moment."""
+        found = []
+        while self._records and self._records[0][0] == Kind.COMMAND and self._records[0][1] <= self._now_ns:
+            found.append(_command(self._records.popleft()[2]))
+        return found
+
+
+def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[Kind, int, bytes]]:
+    """(kind, host ns, content) one after another."""
+    while at + _RECORD.size <= len(data):
+        kind, t_ns, size = _RECORD.unpack_from(data, at)
+        body = data[at + _RECORD.size : at + _RECORD.size + size]
+        whole = len(body) == size
+        if kind >= len(Kind) or (whole and not _written(kind, t_ns, body)):
+            raise FormatError(f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture again")
+        if whole:
+            yield Kind(kind), t_ns, body
+        at += _RECORD.size + size
+
+
+def _written(kind: int, t_ns: int, body: bytes) -> bool:
+    """Whether a record is one that CaptureWriter writes."""
+    if kind == Kind.EDGES:
+        return not len(body) % _EDGE.size and all(k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body))
+    if kind == Kind.COMMAND:
+        return not _command(body).error
+    return t_ns < _MOST_NS and (kind == Kind.TRANSFER or body.isalpha())
+
+
+def _command(line: bytes) -> Command:
+    """The command that a record holds."""
+    name, comma, text = line.decode("ascii", "replace").partition(",")
+    return command(name, text if comma else None)

@@ -1,0 +1,225 @@
+"""Ring of frames + trigger edges -> Sweep: one answer to each trigger, whatever becomes of it.
+
+In: Frames from the sensor, edges from the trigger. Out: Sweeps, whole windows or a status that says why there is none,
+and the open sweep so far, for early answers. The window is the middle of the sweep (paper, sec. II.B), found by time
+and cut by sequence number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.config import SweepConfig
+from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat
+from appliance.io.trigger import Edge, EdgeKind
+
+MAX_GAP = 2
+"""Missing frames in a row that are interpolated; more make the status `gap`."""
+
+
+@dataclass(slots=True)
+class _Open:
+    """A sweep between its edges. answered: it has had its answer, only its stop edge is still awaited.
+
+    first: number of the first frame that counts for an early answer, once it is there. step: how often it was looked at.
+    """
+
+    id: int
+    object: int
+    start_ns: int
+    answered: bool = False
+    first: int | None = None
+    step: int = 0
+
+
+class Recorder:
+    """Holds the last `longest_s` (and a little more) of frames, and the sweeps that have not been answered yet."""
+
+    def __init__(self, fmt: SweepFormat, config: SweepConfig) -> None:
+        self._format = fmt
+        self._longest_ns = round(config.longest_s * 1e9)
+        self._late_ns, self._lead_ns = config.late_ms * 1_000_000, config.lead_ms * 1_000_000
+        self._size = fmt.window + 2 * MAX_GAP + int((config.longest_s + config.late_ms / 1000 + 1) * fmt.rate_hz)
+        # slot = seq % size: a frame's place is known without searching, and what was not overwritten is not lost
+        self._seq = np.full(self._size, -1, np.int64)
+        self._t_ns = np.zeros(self._size, np.int64)
+        self._taxels = np.zeros((self._size, fmt.rows, fmt.cols), fmt.digits)
+        self._newest = -1
+        self._open: _Open | None = None
+        self._closing: list[tuple[_Open, int]] = []  # (sweep, stop) whose window may still lack frames
+        self._done: list[Sweep] = []
+        self._count = self._object = 0
+
+    @property
+    def sweeping(self) -> bool:
+        """True between a start edge and the answer to it."""
+        return bool(self._closing) or (self._open is not None and not self._open.answered)
+
+    def put(self, frames: Frames, now_ns: int) -> None:
+        """Take frames into the ring. Those of a new enumeration end the open sweep: its first half lies before it."""
+        if not len(frames):
+            return
+        if self._newest >= 0 and frames.seq[-1] >> EPOCH_BITS != self._newest >> EPOCH_BITS:
+            self.interrupt(Status.SENSOR_LOST, now_ns)
+        n = len(frames)
+        at = int(frames.seq[0]) % self._size
+        slots: slice | NDArray[np.int64] = slice(at, at + n)
+        if at + n > self._size or frames.seq[-1] - frames.seq[0] != n - 1:
+            slots = frames.seq % self._size
+        self._seq[slots], self._t_ns[slots], self._taxels[slots] = frames.seq, frames.t_ns, frames.taxels
+        self._newest = int(frames.seq[-1])
+
+    def trigger(self, edges: Iterable[Edge], ready: bool, now_ns: int) -> None:
+        """Take trigger edges in their order; `ready` tells whether the box could take a sweep when they came."""
+        for edge in edges:
+            if edge.kind is EdgeKind.START:
+                self._start(edge.t_ns, ready, now_ns)
+            elif edge.kind is EdgeKind.STOP:
+                self._stop(edge.t_ns, now_ns)
+            elif edge.kind is EdgeKind.NEW_OBJECT:
+                self.new_object()
+            elif not self.interrupt(Status.EDGES_LOST, now_ns):
+                self._answer(self._begin(edge.t_ns), edge.t_ns, Status.EDGES_LOST, now_ns)
+
+    def new_object(self) -> None:
+        """Sweeps that start from now on are of another object."""
+        self._object += 1
+
+    def interrupt(self, status: Status, now_ns: int) -> bool:
+        """Answer every unanswered sweep with `status`; False where there was none. A stop edge to come stays silent."""
+        had = self.sweeping
+        if self._open and not self._open.answered:
+            self._answer(self._open, now_ns, status, now_ns)
+        for sweep, stop_ns in self._closing:
+            self._answer(sweep, stop_ns, status, now_ns)
+        self._closing = []
+        return had
+
+    def finished(self, now_ns: int) -> list[Sweep]:
+        """The sweeps that can be answered at `now_ns`, in the order of their numbers."""
+        if self._open and not self._open.answered and now_ns - self._open.start_ns > self._longest_ns:
+            self._answer(self._open, now_ns, Status.LONG, now_ns)
+        waiting = []
+        for item in self._closing:
+            sweep = self._cut(*item, now_ns)
+            if sweep:
+                self._done.append(sweep)
+            else:
+                waiting.append(item)
+        self._closing = waiting
+        done, self._done = self._done, []
+        return sorted(done, key=lambda s: s.id)
+
+    def so_far(self, steps: int, now_ns: int) -> Iterator[Sweep]:
+        """The open sweep at each of its steps that has come since the last call, until `settle` says it is answered.
+
+        steps: D; step d = 1..D comes with frame ceil(d * window / (D + 1)) of the window that begins `lead_ms` after the
+        start edge, and gives a Sweep of just these frames. Which frames came together changes nothing. Beyond a gap that
+        cannot be filled there is no step.
+        """
+        sweep = self._open
+        while sweep and not sweep.answered and not self._closing and sweep.step < steps:
+            if sweep.first is None:
+                begin_ns = sweep.start_ns + self._lead_ns
+                if self._newest < 0 or self._t_ns[self._newest % self._size] < begin_ns:
+                    return
+                sweep.first = self._seq_at(begin_ns)
+            n = -(-(sweep.step + 1) * self._format.window // (steps + 1))
+            if self._newest < sweep.first + n - 1:
+                return
+            sweep.step += 1
+            frames, lost = self._window(sweep.first, n)
+            if len(frames):
+                yield Sweep(
+                    sweep.id, sweep.start_ns, int(frames.t_ns[-1]), Status.OK, frames, lost, now_ns, sweep.object,
+                    share=sweep.step / (steps + 1),
+                )  # fmt: skip
+
+    def settle(self) -> None:
+        """The open sweep has had an early answer: its stop edge will be silent."""
+        if self._open:
+            self._open.answered = True
+
+    def latest(self, n: int) -> NDArray[Any] | None:
+        """The newest `n` frames [n, R, C], for a tare; None where they are not all there."""
+        window = np.arange(self._newest - n + 1, self._newest + 1)
+        slots = window % self._size
+        return self._taxels[slots] if self._newest >= 0 and (self._seq[slots] == window).all() else None
+
+    def _begin(self, t_ns: int) -> _Open:
+        self._count += 1
+        return _Open(self._count, self._object, t_ns)
+
+    def _start(self, t_ns: int, ready: bool, now_ns: int) -> None:
+        if self._open and not self._open.answered:
+            self._answer(self._open, t_ns, Status.NO_STOP, now_ns)
+        self._open = self._begin(t_ns)
+        if not ready:
+            self._answer(self._open, t_ns, Status.NOT_READY, now_ns)
+
+    def _stop(self, t_ns: int, now_ns: int) -> None:
+        sweep, self._open = self._open, None
+        if sweep is None:
+            self._answer(self._begin(t_ns), t_ns, Status.NO_START, now_ns)
+        elif not sweep.answered:
+            length_ns = t_ns - sweep.start_ns
+            if length_ns < self._format.window * self._format.period_ns:
+                self._answer(sweep, t_ns, Status.SHORT, now_ns)
+            elif length_ns > self._longest_ns:
+                self._answer(sweep, t_ns, Status.LONG, now_ns)
+            else:
+                self._closing.append((sweep, t_ns))
+
+    def _answer(self, sweep: _Open, stop_ns: int, status: Status, now_ns: int) -> None:
+        """Put an answer without frames to the finished ones."""
+        sweep.answered = True
+        none = Frames.empty(self._format)
+        self._done.append(Sweep(sweep.id, sweep.start_ns, stop_ns, status, none, 0, now_ns, sweep.object))
+
+    def _cut(self, sweep: _Open, stop_ns: int, now_ns: int) -> Sweep | None:
+        """The sweep with its window, or None while its frames may still come."""
+        window = self._format.window
+        first = self._seq_at((sweep.start_ns + stop_ns) / 2) - window // 2
+        late = now_ns > stop_ns + self._late_ns
+        if self._newest < first + window - 1 and not late:
+            return None
+        frames, lost = self._window(first, window)
+        status = Status.OK if len(frames) else Status.GAP
+        return Sweep(sweep.id, sweep.start_ns, stop_ns, status, frames, lost, now_ns, sweep.object)
+
+    def _window(self, first: int, n: int) -> tuple[Frames, int]:
+        """Frames `first` to `first + n` and how many of them are missing: filled, or no frames where a gap is too wide."""
+        pad = MAX_GAP
+        seq = np.arange(first - pad, first + n + pad)
+        slots = seq % self._size
+        have = np.flatnonzero((self._seq[slots] == seq) & (seq >= 0))
+        missing = np.setdiff1d(np.arange(pad, pad + n), have, assume_unique=True)
+        frames = Frames(self._t_ns[slots], seq, self._taxels[slots])
+        cut = slice(pad, pad + n) if interpolate(frames, have, missing) else slice(0)
+        return Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut]), len(missing)
+
+    def _seq_at(self, t_ns: float) -> int:
+        """Number of the frame taken nearest to `t_ns`, reckoned from the nearest frame that is there."""
+        k = int(np.abs(self._t_ns - round(t_ns)).argmin())
+        return int(self._seq[k]) + round((t_ns - int(self._t_ns[k])) / self._format.period_ns)
+
+
+def interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
+    """Fill `missing` rows of `frames` in place from their neighbours in `have`; False where a gap is too wide."""
+    right = np.searchsorted(have, missing)
+    if len(missing) and (right.min() == 0 or right.max() == len(have)):
+        return False
+    lo, hi = have[right - 1], have[right % max(len(have), 1)]
+    if len(missing) and (hi - lo).max() > MAX_GAP + 1:
+        return False
+    part = (missing - lo) / (hi - lo)
+    for values in (frames.t_ns, frames.taxels):
+        a, b = values[lo].astype(np.float64), values[hi].astype(np.float64)
+        between = a + (b - a) * part.reshape(-1, *[1] * (values.ndim - 1))
+        values[missing] = between if values.dtype.kind == "f" else np.rint(between)
+    return True

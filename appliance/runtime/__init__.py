@@ -1,0 +1,1 @@
+"""The loop, how it is put together, its self-test, and replay."""

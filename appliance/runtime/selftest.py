@@ -1,0 +1,101 @@
+"""The self-test behind `palpate check`: bundle, golden sweeps, lines, skin, port, each by itself.
+
+In: the configuration and a way to the devices. Out: one line for each part, with its trouble where it has one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from appliance.bundle.bundle import Bundle
+from appliance.core.config import Config
+from appliance.core.devices import World
+from appliance.core.errors import ApplianceError, PortError, SensorError
+from appliance.inference.classifier import Classifier
+from appliance.inference.early_exit import Decider
+from appliance.io.gpio_lines import Lines
+from appliance.io.robot_link import SerialSink
+from appliance.io.trigger import GpioTrigger
+from appliance.io.usb_sensor import UsbSensor
+
+LISTEN_S = 1.0
+"""How long the skin is listened to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What became of one part: ok with a detail, or not ok with what to do."""
+
+    part: str
+    ok: bool
+    detail: str
+
+
+def check(settings: Config, load: Callable[[], Bundle], world: World) -> Iterator[Finding]:
+    """Look at one part after another; a part that fails does not keep the others from being looked at."""
+    loaded: list[Bundle] = []
+
+    def bundle() -> str:
+        loaded.append(load())
+        m = loaded[0].manifest
+        enrolled = "".join(f", {label} enrolled from {n}" for label, n in loaded[0].enrolled.items())
+        return f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}"
+
+    def golden() -> str:
+        classifier = Classifier(loaded[0], world.clock)
+        worst = classifier.self_test()
+        if settings.classifier.early:
+            Decider(classifier)
+        return f"{len(loaded[0].golden)} sweeps, largest difference of a probability {worst:.2g}"
+
+    yield _try("bundle", bundle)
+    if loaded:
+        yield _try("golden sweeps", golden)
+        yield _try("skin", lambda: _skin(settings, loaded[0], world))
+    if settings.trigger.start:
+        yield _try("gpio lines", lambda: _lines(settings, world))
+    else:
+        yield Finding("gpio lines", False, "trigger.start names no line; choose a board with --board")
+    if settings.serial.port:
+        yield _try("serial port", lambda: _port(settings, world))
+
+
+def _try(part: str, look: Callable[[], str]) -> Finding:
+    try:
+        return Finding(part, True, look())
+    except ApplianceError as e:
+        return Finding(part, False, str(e))
+
+
+def _skin(settings: Config, bundle: Bundle, world: World) -> str:
+    sensor = UsbSensor(settings.sensor, bundle.format, world.clock, world.backend)
+    until_ns = world.clock.now_ns() + round(LISTEN_S * 1e9)
+    try:
+        while world.clock.now_ns() < until_ns:
+            sensor.read()
+        if sensor.trouble or not sensor.tally.frames:
+            raise sensor.trouble or SensorError(f"the skin sent no frame within {LISTEN_S} s; replug it")
+        who = sensor.identity
+        tally = sensor.tally
+        name = f"{who.board} {who.serial}" if who else ""
+        return f"{name}, {tally.frames} frames in {LISTEN_S} s, {tally.lost_frames} lost"
+    finally:
+        sensor.close()
+
+
+def _lines(settings: Config, world: World) -> str:
+    with GpioTrigger(settings.trigger, world.gpio), Lines(settings.output, world.gpio, world.clock) as lines:
+        codes = lines.capacity
+    inputs = [n for n in (settings.trigger.start, settings.trigger.stop, settings.trigger.new_object) if n]
+    return f"inputs {' '.join(inputs)}, outputs for {codes} codes"
+
+
+def _port(settings: Config, world: World) -> str:
+    port = SerialSink(settings.serial, world.clock, world.source)
+    port.commands()
+    trouble = port.trouble
+    port.close()
+    if trouble:
+        raise PortError(trouble)
+    return f"{settings.serial.port} opened at {settings.serial.baud} baud"

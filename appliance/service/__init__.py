@@ -1,0 +1,1 @@
+"""How a person and systemd see the running box."""

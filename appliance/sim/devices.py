@@ -1,0 +1,60 @@
+"""Puts the rig together: a world under the real drivers. In: what the robot does. Out: a SimWorld."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from appliance.core.clock import Clock
+from appliance.core.config import Config
+from appliance.core.devices import World
+from appliance.core.types import SweepFormat
+from appliance.sim import gpio, rig, usb
+
+READY, BUSY, RESULT_VALID, FAULT, DECIDED = "READY", "BUSY", "RESULT-VALID", "FAULT", "DECIDED"
+START, STOP, NEW_OBJECT = "START", "STOP", "NEW-OBJECT"
+BITS = tuple(f"CLASS-{i}" for i in range(8))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimWorld(World):
+    """The rig: its own lines and its own skin, and a robot that knows what it did."""
+
+    gpio: gpio.SimGpio
+    backend: usb.RigBackend
+    robot: rig.Robot
+
+    def wire(self, settings: Config) -> Config:
+        """The configuration with the rig's lines and skin."""
+        ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": ""}
+        sensor = replace(settings.sensor, **ids, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
+        trigger = replace(
+            settings.trigger, mode="two-lines", start=START, stop=STOP, new_object=NEW_OBJECT, active_low=False
+        )
+        output = replace(
+            settings.output, ready=READY, busy=BUSY, result_valid=RESULT_VALID, fault=FAULT, decided=DECIDED,
+            class_bits=BITS,
+        )  # fmt: skip
+        return replace(settings, sensor=sensor, trigger=trigger, output=output)
+
+    def finished(self, answered: int) -> bool:
+        """True when the script has ended and everything in it was answered."""
+        return self.robot.finished and answered >= self.robot.acts
+
+
+def build(
+    fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False, stops: bool = True,
+    remember: bool = True,
+) -> SimWorld:  # fmt: skip
+    """A world that plays `acts`: the same drivers above, nothing real below. stops: the robot heeds DECIDED.
+
+    remember: keep all acts and all that was driven, for who looks at them later; without it memory stays as it is.
+    """
+    outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
+    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember)
+    robot = rig.Robot(iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT, remember=remember)
+    if stops:
+        lines.watchers[DECIDED] = robot.react
+    board = rig.Board(fmt, robot, clock)
+    backend = usb.RigBackend(board, clock, acm=acm)
+    return SimWorld(clock=clock, gpio=lines, backend=backend, source=source, robot=robot)

@@ -1,0 +1,168 @@
+"""What `palpate bench` measures: latency, inference, memory, start, processor share, on the rig and this machine.
+
+In: a way to build a box on the rig. Out: one line a figure, and all of them as JSON under plain keys.
+Memory, start and processor share are taken in processes of their own, so that no part of the bench is in them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+
+from appliance.bundle.bundle import Bundle
+from appliance.core.clock import Clock, SystemClock
+from appliance.core.errors import BundleError
+from appliance.core.provenance import commit
+from appliance.core.statistics import wilson
+from appliance.core.types import Status, Sweep, SweepFormat, Verdict
+from appliance.inference.classifier import Classifier
+from appliance.inference.session import session
+from appliance.sim import devices, rig, script, skin
+from appliance.tools import bench_process
+from appliance.tools.bench_process import Build, drain
+
+SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
+
+
+def run(bundle: Bundle, build: Build, yardsticks: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """All figures; `say` gets each as soon as it is there."""
+    figures: dict[str, Any] = {"commit": commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id}
+
+    def add(more: dict[str, Any]) -> None:
+        figures.update(more)
+        for key, value in more.items():
+            say(f"{key:<24} {json.dumps(value)}")
+
+    add({k: figures[k] for k in ("commit", "seed", "machine", "bundle")})
+    add(_whole_way(bundle.format, build, seed))
+    add({"inference_ms": _inference(bundle, yardsticks, seed)})
+    if "fp32" not in figures["inference_ms"]:
+        say("fp32 and paper_int8 were not measured: they come with the desktop's tools (make bench)")
+    for name in bench_process.NAMES:
+        add(_child(name, seed))
+    add(_cold_start())
+    return figures
+
+
+def _percentiles(values: list[float]) -> dict[str, float]:
+    return {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)} | {"n": len(values)}
+
+
+class _Watch:
+    """A sink behind the serial port: when it gets a verdict, the port has the sentence."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.verdicts: list[Verdict] = []
+        self.answered_ms: list[float] = []
+        self.seen_ms: list[float] = []
+        self._clock = clock
+
+    def send(self, verdict: Verdict) -> None:
+        in_hand_ns = verdict.time_ns - verdict.latency_ns
+        self.verdicts.append(verdict)
+        self.answered_ms.append((self._clock.now_ns() - in_hand_ns) / 1e6)
+
+    def keep(self, sweep: Sweep, verdict: Verdict) -> None:
+        self.seen_ms.append((sweep.complete_ns - sweep.stop_ns) / 1e6)
+
+
+def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
+    """SWEEPS sweeps on skin positions of their own, USB bytes to sentence; work takes its time, waiting is skipped.
+
+    edge_to_sentence_ms: from stop edge and last frame of the window in hand to the sentence at the port.
+    edge_seen_ms: from the kernel's stamp of the stop edge to its being in hand (glitch filter, rest of a packet).
+    """
+    clock = rig.SkippingClock()
+    watch = _Watch(clock)
+    world = devices.build(fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim")
+    with ExitStack() as stack:
+        box, far_end = build(world, stack, [watch], [watch.keep])
+        while not world.finished(box.answered):
+            box.step()
+            drain(far_end)
+        lost = box.tally.lost_frames
+    pairs = zip(watch.verdicts, world.robot.played, strict=True)
+    right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
+    return {
+        "accuracy": {"right": right, "total": SWEEPS, "interval": [round(v, 4) for v in wilson(right, SWEEPS)]},
+        "frames_lost": lost,
+        "edge_to_sentence_ms": _percentiles(watch.answered_ms),
+        "edge_seen_ms": _percentiles(watch.seen_ms),
+    }
+
+
+def _inference(bundle: Bundle, yardsticks: Path, seed: int) -> dict[str, Any]:
+    """The bundle beside the same network in float and the paper's in int8, taken in turns in one run."""
+    rng = np.random.default_rng(seed)
+    window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.digits)
+    calls: dict[str, Callable[[], object]] = {}
+    calls["int8"] = partial(Classifier(bundle, SystemClock()).logits, window)
+    _make_yardsticks(yardsticks)
+    for name in ("fp32", "paper_int8"):
+        path = yardsticks / f"{name}.onnx"
+        if path.is_file():
+            calls[name] = partial(session(path.read_bytes()).run, None, {"sweep": window[None]})
+    took_ms: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(ROUNDS):
+        for name, call in calls.items():
+            call()  # the one before has emptied the caches
+            for _ in range(CALLS):
+                start = time.perf_counter_ns()
+                call()
+                took_ms[name].append((time.perf_counter_ns() - start) / 1e6)
+    return {name: _percentiles(values[len(values) // 10 :]) for name, values in took_ms.items()}
+
+
+def _make_yardsticks(folder: Path) -> None:
+    """Have the desktop's tools build the networks to compare with, where they are installed beside this program."""
+    tool = Path(sys.executable).with_name("palpate-train")
+    if folder.is_dir() or not tool.exists():
+        return
+    done = subprocess.run([tool, "yardsticks", "--out", str(folder)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise BundleError(f"palpate-train yardsticks failed: {done.stderr.strip()[-300:]}")
+
+
+def _child(name: str, seed: int) -> dict[str, Any]:
+    """A part in a fresh process."""
+    with tempfile.TemporaryDirectory() as folder:
+        acts = Path(folder) / "acts.npz"
+        bench_process.write_acts(acts, script.tubes(seed, 6))
+        command = [sys.executable, "-m", "appliance", "bench", "--part", name, "--acts", str(acts)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+def _cold_start() -> dict[str, Any]:
+    """Seconds from the start of the process to READY with a streaming skin: the first state sentence says so."""
+    took = []
+    command = [sys.executable, "-m", "appliance", "run", "--sim", "skin"]
+    for _ in range(STARTS):
+        start = time.monotonic()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as box:
+            assert box.stdout
+            while b",streaming," not in box.stdout.readline():
+                pass
+            took.append(time.monotonic() - start)
+            box.terminate()
+    return {"cold_start_s": round(statistics.median(took), 3), "cold_start_worst_s": round(max(took), 3)}
+
+
+def _machine() -> dict[str, Any]:
+    versions = {"python": platform.python_version(), "numpy": np.__version__, "onnxruntime": ort.__version__}
+    return {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()} | versions

@@ -1,0 +1,113 @@
+"""The figures of the bench that are taken in a process of their own: memory and processor share.
+
+In: recorded acts and a way to build a box. Out: figures. The simulated skin is not loaded here: it is not the box's.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable
+from contextlib import ExitStack, suppress
+from itertools import cycle
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from appliance.core.clock import SystemClock
+from appliance.core.types import SweepFormat
+from appliance.io.robot_link import ResultSink
+from appliance.runtime.loop import Box, Keeper
+from appliance.sim import devices, rig
+
+MEMORY_SWEEPS, STREAM_S = 1000, 15.0
+NAMES = ("memory", "stream")
+
+
+class Build(Protocol):
+    """Builds a box on a world; `stack` takes it apart. The box, and the far end of its serial line to be read."""
+
+    def __call__(
+        self,
+        world: devices.SimWorld,
+        stack: ExitStack,
+        also: Iterable[ResultSink] = (),
+        keepers: Iterable[Keeper] = (),
+    ) -> tuple[Box, int]:
+        """Build it."""
+        ...
+
+
+def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
+    """Record acts for `measure`."""
+    frames: dict[str, Any] = {f"{i} {a.start} {a.stop}": a.frames for i, a in enumerate(acts)}
+    np.savez(path, **frames)
+
+
+def measure(name: str, fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+    """One of NAMES, measured in this process while the acts in `path` are played over and over."""
+    with np.load(path, allow_pickle=False) as z:
+        acts = [rig.Act(z[key], int(key.split()[1]), int(key.split()[2]), "") for key in z]
+    return {"memory": _memory, "stream": _stream}[name](fmt, build, acts)
+
+
+def drain(far_end: int) -> None:
+    """Read what the box has said, so that its line does not fill up."""
+    with suppress(BlockingIOError):
+        os.read(far_end, 65536)
+
+
+def _memory(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str, Any]:
+    """Resident memory (in 2**20 bytes, as ps and systemd count) after MEMORY_SWEEPS sweeps.
+
+    growth_last_900: since a tenth of them; holds what the allocator takes while it warms up. growth_next_900: after it.
+    """
+    n = MEMORY_SWEEPS
+    # what the simulator remembers is not the box's
+    world = devices.build(fmt, cycle(acts), rig.VirtualClock(), "sim", remember=False)
+    rss_mb = {}
+    with ExitStack() as stack:
+        box, far_end = build(world, stack)
+        while box.answered < n * 19 // 10:
+            if box.step() and box.answered in (n // 10, n, n * 19 // 10):
+                rss_mb[box.answered] = _rss_mb()
+            drain(far_end)
+    first, after, later = rss_mb.values()
+    figures = {"after_1000": after, "growth_last_900": after - first, "growth_next_900": later - after}
+    return {"rss_mb": {name: round(value, 2) for name, value in figures.items()}}
+
+
+def _rss_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGESIZE") / 2**20
+
+
+def _stream(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str, Any]:
+    """Share of one core while streaming in real time, without the simulated board's own share, and with it."""
+    world = devices.build(fmt, cycle(acts), SystemClock(), "sim")
+    board_ns = 0
+    real_read = world.backend.bulk_read
+
+    def timed_read(*args: Any) -> int:
+        nonlocal board_ns
+        start = time.thread_time_ns()
+        try:
+            return real_read(*args)
+        finally:
+            board_ns += time.thread_time_ns() - start
+
+    world.backend.bulk_read = timed_read  # type: ignore[assignment]
+    with ExitStack() as stack:
+        box, far_end = build(world, stack)
+        box.step()
+        board_ns, wall_ns, cpu_ns = 0, -time.monotonic_ns(), -time.process_time_ns()
+        while time.monotonic_ns() + wall_ns < STREAM_S * 1e9:
+            box.step()
+            drain(far_end)
+        wall_ns, cpu_ns = wall_ns + time.monotonic_ns(), cpu_ns + time.process_time_ns()
+    box_ns = cpu_ns - board_ns
+    return {
+        "cpu_share_streaming": round(box_ns / wall_ns, 4),
+        "cpu_share_with_simulated_board": round(cpu_ns / wall_ns, 4),
+    }

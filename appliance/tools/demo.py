@@ -1,0 +1,113 @@
+"""What a person sees: the skin live in the terminal while a sweep runs, the verdict and its sentence, then a table.
+
+In: a box on the rig and the far end of its serial line. Out: pictures where there is a terminal, else plain lines.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+from collections.abc import Callable, Sequence
+from typing import IO, Any
+
+from numpy.typing import NDArray
+
+from appliance.core.clock import Clock
+from appliance.runtime.loop import Box
+from appliance.sim.rig import Act
+from appliance.tools.score import Answer, Score
+
+FRAME_NS = 66_000_000
+"""Time between two pictures of the skin."""
+HEARD_S = 1.0
+"""The longest that a sentence may take from one end of the line to the other."""
+BAR = 30
+BRIGHT = 160
+"""Digits that are shown white; the skin seldom gives more."""
+
+
+def bar(probability: float) -> str:
+    """A probability as a bar."""
+    full = round(probability * BAR)
+    return "█" * full + "·" * (BAR - full) + f" {probability:6.1%}"
+
+
+def picture(frame: NDArray[Any]) -> list[str]:
+    """A frame [R, C] as shaded cells with their digits, two lines a row."""
+    lines = []
+    for row in frame.astype(int):
+        level = [min(23, max(0, d) * 24 // BRIGHT) for d in row]
+        shade = [f"\033[48;5;{232 + v}m\033[38;5;{16 if v > 11 else 250}m" for v in level]
+        lines.append("  " + "".join(f"{s}{'':6}\033[0m" for s in shade))
+        lines.append("  " + "".join(f"{s}{d:^6}\033[0m" for s, d in zip(shade, row, strict=True)))
+    return lines
+
+
+class Demo:
+    """Steps a box until enough answers were read at the far end of its serial line, and shows what happens.
+
+    played: the acts of the rig's robot, for the truth. far_end: descriptor of the line's other end, non-blocking.
+    raw: print the sentences alone.
+    """
+
+    def __init__(self, played: Sequence[Act], far_end: int, clock: Clock, out: IO[str], *, raw: bool) -> None:
+        self.score = Score()
+        self._played, self._clock, self._out = played, clock, out
+        self._far_end, self._raw = far_end, raw
+        self._live = not raw and out.isatty()
+        self._rest = b""
+        self._drawn = 0
+        self._next_ns = 0
+
+    def run(self, box: Box, sweeps: int, stopped: Callable[[], bool]) -> None:
+        """Step `box` until `sweeps` answers were heard or `stopped()`."""
+        said = 0
+        while self.score.total.total() < sweeps and not stopped():
+            said += len(box.step())
+            self._listen(said, sweeps)
+            if self._live and self._clock.now_ns() >= self._next_ns and (frame := box.newest_frame()) is not None:
+                self._next_ns = self._clock.now_ns() + FRAME_NS
+                self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""])
+        if not self._raw and self.score.total:
+            lost = f"  frames lost     {box.tally.lost_frames} of {box.tally.frames + box.tally.lost_frames}"
+            touch = [f"  touch time      {self.score.touch(box.format.rate_hz)}"] if self.score.early else []
+            self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}", *touch)
+
+    def _listen(self, said: int, wanted: int) -> None:
+        """Read what has come to the robot's end; wait for answers that were said and are not here; stop at `wanted`."""
+        while select.select([self._far_end], [], [], HEARD_S if self.score.total.total() < said else 0)[0]:
+            *lines, self._rest = (self._rest + os.read(self._far_end, 65536)).split(b"\r\n")
+            for line in lines:
+                self._hear(line.decode("ascii"))
+                if self.score.total.total() == wanted:
+                    return
+
+    def _hear(self, line: str) -> None:
+        if self._raw:
+            self._print(line)
+        answer = Answer.read(line)
+        if answer is None:
+            return
+        act = self._played[answer.sweep - 1]
+        mark = "right" if self.score.add(act, answer) else "wrong"
+        if not self._raw:
+            said = answer.label or answer.status
+            used = f"  after {answer.share:.0%} of the window" if answer.share < 1 else ""
+            shown = f"{answer.sweep:>3}  {act.label:<15} -> {said:<15} {mark}  {bar(answer.probability)}{used}"
+            self._print(shown, f"     {line}")
+
+    def _draw(self, lines: list[str]) -> None:
+        """Paint over the picture before, in one write, so that nothing flickers."""
+        self._out.write(self._back() + "".join(f"{line}\033[K\n" for line in lines))
+        self._out.flush()
+        self._drawn = len(lines)
+
+    def _back(self) -> str:
+        """Where the picture begins."""
+        drawn, self._drawn = self._drawn, 0
+        return f"\033[{drawn}A" if drawn else ""
+
+    def _print(self, *lines: str) -> None:
+        erase = "\033[J" if self._drawn else ""
+        self._out.write(self._back() + erase + "\n".join(lines) + "\n")
+        self._out.flush()

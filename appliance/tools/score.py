@@ -1,0 +1,86 @@
+"""Right or wrong: answers as the robot read them against what it did. In: sentences, acts. Out: counts, intervals."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from dataclasses import dataclass, field
+
+from appliance.core.statistics import wilson
+from appliance.core.types import Status
+from appliance.sim.rig import Act
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A RES sentence as the robot read it."""
+
+    sweep: int
+    status: str
+    label: str
+    probability: float
+    lost: int
+    latency_ms: float
+    fused: int
+    share: float
+
+    @classmethod
+    def read(cls, line: str) -> Answer | None:
+        """The answer in a line, or None for another sentence."""
+        parts = line.split("*")[0].split(",")
+        if parts[:2] != ["$PPLP", "RES"]:
+            return None
+        return cls(
+            int(parts[2]), parts[4], parts[5], float(parts[6]), int(parts[9]), float(parts[10]), int(parts[8]),
+            float(parts[13]),
+        )  # fmt: skip
+
+
+@dataclass(slots=True)
+class Score:
+    """What has been answered so far. objects: the last answer for each object, where NEW OBJECT was signalled.
+
+    early: answers that did not need the whole window. slid: frames of all slides, as far as they went.
+    """
+
+    right: Counter[str] = field(default_factory=Counter)
+    total: Counter[str] = field(default_factory=Counter)
+    objects: list[bool] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    early: int = 0
+    slid: int = 0
+
+    def add(self, act: Act, answer: Answer) -> bool:
+        """Count an answer; True where it names the truth."""
+        right = answer.label == act.label and answer.status == Status.OK
+        self.total[act.label] += 1
+        self.right[act.label] += right
+        self.latency_ms.append(answer.latency_ms)
+        self.early += answer.share < 1
+        self.slid += act.stop - act.start
+        if act.new_object:
+            self.objects.append(right)
+        elif self.objects:
+            self.objects[-1] = right
+        return right
+
+    def table(self) -> list[str]:
+        """Right of how many, by material, in all, and by object."""
+        rows = [(name, self.right[name], self.total[name]) for name in sorted(self.total)]
+        sums = [("all sweeps", self.right.total(), self.total.total())]
+        if self.objects:
+            sums.append(("all objects", sum(self.objects), len(self.objects)))
+        lines = [f"  {name:<16}{right:>5} / {n}" for name, right, n in rows]
+        for name, right, n in sums:
+            low, high = wilson(right, n)
+            lines.append(f"  {name:<16}{right:>5} / {n:<5} {right / n:.3f} [{low:.3f}, {high:.3f}]")
+        return ["  material        right / all", *lines]
+
+    def touch(self, rate_hz: float) -> str:
+        """Mean touch time, from the start edge to the stop edge, and how many answers came before it."""
+        n = self.total.total()
+        return f"{self.slid / n / rate_hz:.2f} s mean, {self.early} of {n} answered early"
+
+    def latency(self) -> str:
+        """Median and worst latency."""
+        return f"{statistics.median(self.latency_ms):.2f} ms median, {max(self.latency_ms):.2f} ms worst"

@@ -1,0 +1,398 @@
+"""The page that shows how the skin is placed: what its server gives and refuses, and the page in a headless browser."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.alignment import web
+from appliance.alignment.live import View
+from appliance.alignment.web import MOST_HEAD, MOST_OPEN, Page
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Manifest
+from appliance.core.clock import SystemClock
+from appliance.core.errors import ConfigError
+from appliance.signal.contact import Place
+
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+PLACE = Place(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
+LOADS = tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4))
+VIEW = View(
+    7, "usb", "tubes 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1", "move the skin", (4, 4),
+    LOADS, 80.0, (3.8, 6.0), (6.0, 6.0), PLACE,
+)  # fmt: skip
+WAIT_S = 10
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    """A page that shows VIEW, at any free port."""
+    with Page(0, SystemClock()) as one:
+        one.show(VIEW)
+        yield one
+
+
+def port(page: Page) -> int:
+    """Where it listens."""
+    return int(page.address.rsplit(":", 1)[1])
+
+
+def connected(page: Page) -> socket.socket:
+    """A connection to it."""
+    return socket.create_connection(("127.0.0.1", port(page)), timeout=WAIT_S)
+
+
+def heard(one: socket.socket) -> bytes:
+    """All that comes until the other side ends."""
+    said = b""
+    with suppress(ConnectionResetError):
+        while more := one.recv(65536):
+            said += more
+    return said
+
+
+def asked(page: Page, path: str = "/state", method: str = "GET", host: str = "localhost", more: str = "") -> bytes:
+    """What it answers to one request, head and body."""
+    with connected(page) as one:
+        one.sendall(f"{method} {path} HTTP/1.1\r\nHost: {host}\r\n{more}\r\n".encode())
+        return heard(one)
+
+
+def test_the_state_is_the_newest_view(page: Page):
+    """As JSON, every field; the next View takes its place at once."""
+    head, _, body = asked(page).partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.0 200 ")
+    assert b"Content-Type: application/json" in head
+    assert json.loads(body) == json.loads(json.dumps(VIEW.json()))
+    page.show(replace(VIEW, turn=8, centre=None, place=None))
+    held = json.loads(asked(page).partition(b"\r\n\r\n")[2])
+    assert (held["turn"], held["centre"], held["place"]) == (8, None, None)
+
+
+@pytest.mark.parametrize("path", ["/", "/state", "/nothing"])
+def test_every_answer_says_what_a_browser_may_do(page: Page, path: str):
+    """Nothing kept, nothing framed, nothing loaded from elsewhere; no version is told; errors too."""
+    head = asked(page, path).partition(b"\r\n\r\n")[0].decode()
+    for line in (
+        "Cache-Control: no-store",
+        "X-Frame-Options: DENY",
+        "X-Content-Type-Options: nosniff",
+        "Content-Security-Policy: default-src 'none'; script-src 'sha256-",
+        "frame-ancestors 'none'",
+    ):
+        assert line in head
+    assert "unsafe" not in head
+    assert "Python" not in head
+
+
+@pytest.mark.parametrize(
+    ("path", "method", "host", "answer"),
+    [
+        ("/", "GET", "127.0.0.1:9000", 200),
+        ("/index.html", "GET", "localhost", 404),
+        ("/state?x", "GET", "localhost", 404),
+        ("/state/", "GET", "localhost", 404),
+        ("/../etc/passwd", "GET", "localhost", 404),
+        ("/state", "POST", "localhost", 501),
+        ("/state", "PUT", "localhost", 501),
+        ("/state", "OPTIONS", "localhost", 501),
+        ("/", "GET", "evil.example", 421),
+        ("/", "GET", "localhost.evil.example:80", 421),
+        ("/", "GET", "", 421),
+    ],
+)
+def test_two_paths_for_this_machine_and_no_more(page: Page, path: str, method: str, host: str, answer: int):
+    """GET of `/` and `/state` under this machine's own names; all else is refused by its number."""
+    said = asked(page, path, method, host, "Content-Length: 5\r\n")
+    assert int(said.split()[1]) == answer
+    assert (b"doctype" in said.lower()) or answer != 200
+
+
+def test_it_listens_on_this_machine_alone(page: Page):
+    """The socket is bound to 127.0.0.1; another address of this machine is refused."""
+    assert page.address.startswith("http://127.0.0.1:")
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", port(page)), timeout=WAIT_S)
+
+
+def test_a_port_that_is_taken_is_named(page: Page):
+    """A ConfigError with the port and what to do; so is a number that is no port."""
+    for taken in (port(page), 70_000):
+        with pytest.raises(ConfigError, match=f"port {taken} .*--web PORT"):
+            Page(taken, SystemClock())
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)])
+def test_half_a_request_ends_at_the_deadline(page: Page, sent: bytes, monkeypatch: pytest.MonkeyPatch):
+    """However it began: no answer and a closed connection, also where bytes drip in meanwhile; others are served."""
+    monkeypatch.setattr(web, "DEADLINE_NS", 300_000_000)
+    with connected(page) as slow, connected(page) as dripping:
+        slow.sendall(sent)
+        dripping.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
+        assert b" 200 " in asked(page)
+        ended = threading.Event()
+
+        def drip() -> None:
+            with suppress(OSError):
+                while not ended.wait(0.02):
+                    dripping.sendall(b"X: y\r\n")
+
+        thread = threading.Thread(target=drip)
+        thread.start()
+        try:
+            assert heard(slow) == b""
+            assert heard(dripping) == b""
+        finally:
+            ended.set()
+            thread.join()
+
+
+def test_an_endless_head_is_not_read_on(page: Page):
+    """Over MOST_HEAD bytes without an empty line: closed at once, long before the deadline of a patient one."""
+    with connected(page) as one:
+        with suppress(OSError):
+            one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * MOST_HEAD)
+        assert heard(one) == b""
+
+
+def test_too_many_connections_are_turned_away(page: Page, monkeypatch: pytest.MonkeyPatch):
+    """MOST_OPEN wait for their deadline; the next is closed at once; when they are gone there is room again."""
+    monkeypatch.setattr(web, "DEADLINE_NS", 700_000_000)
+    with ExitStack() as stack:
+        open_ones = [stack.enter_context(connected(page)) for _ in range(MOST_OPEN)]
+        assert asked(page) == b""
+        assert [heard(one) for one in open_ones] == [b""] * MOST_OPEN
+    until(lambda: b" 200 " in asked(page))
+
+
+def test_one_who_reads_nothing_holds_nobody_up(page: Page, monkeypatch: pytest.MonkeyPatch):
+    """A browser that asks and never reads: its thread ends at the deadline, and others are served meanwhile."""
+    monkeypatch.setattr(web, "DEADLINE_NS", 300_000_000)
+    page._server.held["/"] = "text/html", b"x" * 50_000_000
+    before = threading.active_count()
+    with connected(page) as one:
+        one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert b" 200 " in asked(page)
+        until(lambda: threading.active_count() == before)
+
+
+def until(done: Any) -> None:
+    """Wait for `done()`; fails after WAIT_S."""
+    end = time.monotonic() + WAIT_S
+    while not done():
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.02)
+
+
+def test_the_page_holds_everything_it_shows():
+    """One file: no address but the picture's namespace, no src, no import; nothing that could be sent."""
+    text = web.PAGE.read_text(encoding="utf-8")
+    assert set(re.findall(r"https?://[^\"' ]+", text)) == {"http://www.w3.org/2000/svg"}
+    assert not re.search(r"\bsrc=|@import|url\(|<form|<a |innerHTML|eval\(|localStorage", text)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle with trained positions, on disk."""
+    target = tmp_path_factory.mktemp("bundle")
+    manifest = Manifest.parse((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
+    for name in manifest.files:
+        (target / name).write_bytes((bundle.DEFAULT / name).read_bytes())
+    (target / bundle.MANIFEST).write_bytes(replace(manifest, place=PLACE, schema=3).json())
+    return target
+
+
+@pytest.fixture
+def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """The command itself, with the simulated skin and its page; where that is."""
+    command = [sys.executable, "-m", "appliance", "place", "--sim", "rest", "--web", "0"]
+    with subprocess.Popen([*command, "--set", f"classifier.bundle={folder}"], stdout=subprocess.PIPE) as run:
+        address = run.stdout.readline().decode().removeprefix("page: ").strip()
+        yield run, address
+        run.stdout.close()
+        run.kill()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser of the system's, else the one that playwright has installed."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (make test installs it)")
+    with api.sync_playwright() as tool:
+        path = next(filter(None, map(shutil.which, BROWSERS)), tool.chromium.executable_path)
+        if not Path(path).exists():
+            pytest.skip("no browser: apt-get install chromium-headless-shell, or playwright install chromium")
+        one = tool.chromium.launch(executable_path=path)
+        yield one
+        one.close()
+
+
+class Seen:
+    """The page as somebody sees it. troubles: what the browser complained of. asked: addresses that it asked for."""
+
+    def __init__(self, context: Any, address: str) -> None:
+        self.page, self.troubles, self.asked = context.new_page(), [], []
+        self.page.on("console", lambda said: self.troubles.append(said.text))
+        self.page.on("pageerror", lambda error: self.troubles.append(str(error)))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.goto(address)
+
+    def state(self, wanted: str) -> None:
+        """Wait for this state of the page."""
+        until(lambda: self.page.evaluate("document.body.dataset.state") == wanted)
+
+    def text(self, where: str) -> str:
+        """What stands there, with plain spaces."""
+        return str(self.page.inner_text(where)).replace("\xa0", " ")
+
+
+def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
+    """The real command: the page waits for contact, advises, follows the next touch; ended, it says no connection."""
+    run, address = box
+    context = browser.new_context(viewport={"width": 820, "height": 1180})
+    seen = Seen(context, address)
+    seen.state("off")
+    until(lambda: seen.text("#said").startswith("2."))
+    assert re.fullmatch(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1", seen.text("#said"))
+    assert "move the skin" in seen.text("#todo")
+    assert seen.page.is_visible("#simulated")
+    assert seen.text("#state") == "skin streaming"
+    assert seen.page.locator(".trained").count() == 2
+    assert seen.page.is_visible("#way")
+    seen.state("no-contact")
+    assert seen.page.locator("#centre").evaluate("e => getComputedStyle(e).visibility") == "hidden"
+    assert set(seen.page.locator(".digits").all_text_contents()) <= {"0", "1"}
+    seen.state("off")
+    assert seen.troubles == []
+    run.send_signal(signal.SIGINT)
+    assert run.wait(timeout=WAIT_S) == 0
+    seen.state("no-connection")
+    assert seen.text("#said") == "no connection"
+    assert {url.removeprefix(address) for url in seen.asked} == {"/", "/state"}
+    context.close()
+
+
+def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
+    """Loads by darkness and digits, places where they are, what is said in large letters and to those who hear it."""
+    context = browser.new_context(viewport={"width": 1180, "height": 820})
+    seen = Seen(context, page.address)
+    seen.state("off")
+    assert seen.text("#said") == VIEW.said
+    assert seen.page.text_content("#heard").startswith(VIEW.said)
+    assert seen.page.get_attribute("#heard", "aria-live") == "polite"
+    assert not seen.page.is_visible("#simulated")
+    shades = seen.page.eval_on_selector_all(".load", "all => all.map(e => Number(e.style.opacity))")
+    assert shades == pytest.approx([load / 80 for row in LOADS for load in row])
+    assert seen.page.locator(".digits").all_text_contents() == [f"{load:.0f}" for row in LOADS for load in row]
+    centre = seen.page.evaluate("new DOMMatrix(document.getElementById('centre').style.transform)")
+    assert (centre["e"], centre["f"]) == pytest.approx((6.0 / 4 * 100 + 50, 3.8 / 4 * 100 + 50))
+    assert [e["r"] for e in circles(seen, ".halo")] == pytest.approx([15, 15])
+    assert circles(seen, ".trained")[1] == pytest.approx({"cx": 195, "cy": 210, "r": 3.5})
+    page.show(replace(VIEW, turn=8, state="in-place", said="in place"))
+    seen.state("in-place")
+    assert seen.text("#said") == "✓ in place"
+    assert not seen.page.is_visible("#way")
+    page.show(replace(VIEW, turn=9, state="no-skin", skin="absent", said="no skin: absent", load=(), centre=None))
+    seen.state("no-skin")
+    assert seen.text("#state") == "skin absent"
+    assert set(seen.page.locator(".digits").all_text_contents()) == {""}
+    page.show(replace(VIEW, turn=10, shape=(2, 3), load=((1.0, 2, 3),) * 2, place=None, state="no-positions", nearest=None,
+                      centre=(0.5, 1.0)))  # fmt: skip
+    seen.state("no-positions")
+    assert seen.page.locator(".tile").count() == 6
+    assert "0.5, column 1.0 taxels" in seen.text("#figures")
+    assert seen.troubles == []
+    context.close()
+
+
+def circles(seen: Seen, which: str) -> list[dict[str, float]]:
+    """Centre and radius of each."""
+    return seen.page.eval_on_selector_all(
+        which, "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r: e.r.baseVal.value}))"
+    )
+
+
+def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
+    """The server still answers, but its loop hangs: after a while the page says so instead of showing an old picture."""
+    context = browser.new_context()
+    seen = Seen(context, page.address)
+    seen.state("off")
+    seen.state("no-connection")
+    assert "no news" in seen.text("#todo")
+    page.show(replace(VIEW, turn=8))
+    seen.state("off")
+    context.close()
+
+
+def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypatch: pytest.MonkeyPatch):
+    """It takes the question and never answers: the page does not wait for it."""
+    context, held = browser.new_context(), threading.Event()
+    seen = Seen(context, page.address)
+    seen.state("off")
+    monkeypatch.setattr(web.Handler, "do_GET", lambda self: held.wait(3 * WAIT_S))
+    try:
+        seen.state("no-connection")
+    finally:
+        held.set()
+    assert "tunnel" in seen.text("#todo")
+    context.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, height: int, scheme: str):
+    """All of it on one screen, without scrolling, by day and by night; the words can be read on their ground."""
+    page.show(replace(VIEW, said="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"))
+    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+    seen = Seen(context, page.address)
+    seen.state("off")
+    assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+    assert seen.page.evaluate("document.documentElement.scrollHeight") <= height
+    board = seen.page.locator(".board").bounding_box()
+    assert board["x"] >= 0
+    assert board["y"] + board["height"] <= height
+    assert min(board["width"], board["height"]) > 0.3 * min(width, height)
+    for what in ("#said", "#todo", "#figures"):
+        box = seen.page.locator(what).bounding_box()
+        assert box["x"] + box["width"] <= width
+        assert contrast(seen, what) > 4.5
+    assert (luminance(seen, "body", "backgroundColor") > 0.5) == (scheme == "light")
+    context.close()
+
+
+def luminance(seen: Seen, what: str, colour: str) -> float:
+    """Relative luminance of a colour (WCAG 2.1), 0 to 1."""
+    text = seen.page.locator(what).evaluate(f"e => getComputedStyle(e).{colour}")
+    parts = [int(part) / 255 for part in re.findall(r"\d+", text)[:3]]
+    linear = [part / 12.92 if part <= 0.03928 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(w * part for w, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+def contrast(seen: Seen, what: str) -> float:
+    """Of a text on the page's ground (WCAG 2.1)."""
+    dark, light = sorted((luminance(seen, what, "color"), luminance(seen, "body", "backgroundColor")))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_without_a_browser_the_command_ends_at_sigterm(box: tuple[subprocess.Popen[bytes], str]):
+    """SIGTERM ends it with 0 while connections are open; nothing keeps the port."""
+    run, address = box
+    where = int(address.rsplit(":", 1)[1])
+    with socket.create_connection(("127.0.0.1", where), timeout=WAIT_S):
+        run.send_signal(signal.SIGTERM)
+        assert run.wait(timeout=WAIT_S) == 0
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", where), timeout=WAIT_S)

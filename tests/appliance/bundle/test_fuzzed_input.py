@@ -1,0 +1,288 @@
+"""What fuzzing has learned, held in each run: the corpus, all that ever broke, and that each promise can be seen broken."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle, manifest
+from appliance.core import config, schema, types
+from appliance.core.errors import ApplianceError
+from appliance.io import packets, robot_link, usb_sensor
+from appliance.recording import capture
+from tests.fuzz import corpus, files, seeds, targets
+from tests.fuzz.mutators import MUTATORS
+
+TARGETS = sorted(targets.TARGETS)
+INPUTS = {
+    name: [*seeds.SEEDS[name](), *corpus.load(name), *(f.read_bytes() for f in corpus.crashes(name))]
+    for name in TARGETS
+}
+
+BROKE = {
+    "capture/brackets-in-brackets": "5000 brackets in its head: RecursionError",
+    "capture/command-that-is-none": "the command JUMP was played: KeyError when the box obeyed",
+    "capture/edge-of-unknown-kind": "kind 200: IndexError while it played",
+    "capture/rate-without-end": "1e-320 frames a second: an endless period, OverflowError",
+    "capture/rows-with-a-point": "rows = 4.0 in its head: TypeError at the first frame",
+    "capture/state-that-is-no-text": "UnicodeDecodeError while it played",
+    "capture/time-of-64-bits": "a time that is no int64: OverflowError",
+    "command/checksum-beside-noise": "a byte above 127 and a checksum: UnicodeEncodeError, and one noisy line ended the box",
+    "command/end-of-a-long-line": "a line of over 128 bytes, read in two parts: its end was carried out as a command",
+    "command/name-without-end": "a command's name of 120 letters took `error` and its reason out of the answer",
+    "manifest/brackets-in-brackets": "5000 brackets: RecursionError",
+    "manifest/dead-taxels-of-many-digits": "a number of 401 digits was taken",
+    "manifest/figures-in-figures": "figures 800 levels deep were read, but enrolment could not write them: RecursionError",
+    "manifest/files-as-text": "`files` was a text that held all names: TypeError",
+    "manifest/key-with-a-line-end": "a message of two lines",
+    "manifest/name-of-half-a-character": "a name that no terminal shows: UnicodeEncodeError in `palpate check`",
+    "manifest/number-of-many-digits": "early.least of 401 digits: OverflowError",
+    "manifest/rows-with-a-point": "rows = 4.0 came past the golden sweeps: TypeError when the first array was made",
+    "manifest/threshold-as-text": 'contact = "10" was taken: TypeError at the first sweep',
+    "manifest/threshold-nan": "contact = NaN was taken: every sweep `no-contact`",
+    "recording/brackets-in-brackets": "5000 brackets in its sidecar: RecursionError",
+    "recording/format-out-of-range": "the message did not say which file",
+    "recording/number-as-text": 'id = "1" was taken',
+    "recording/table-head-without-end": "a table whose head is cut: tokenize.TokenError out of numpy",
+    "recording/table-of-a-petabyte": "a table that says it is 21 PiB: MemoryError",
+    "settings/brackets-in-brackets": "2000 brackets: RecursionError",
+    "settings/delete-character": "a text with a control character was taken, and what `palpate config` printed did not load",
+    "settings/key-with-a-line-end": "a message of two lines",
+    "settings/number-of-many-digits": "vendor_id of 4817 digits: ValueError while the message was made",
+    "settings/tables-in-tables": "1500 tables in a value: RecursionError while the message was made",
+    "settings/zero-character": "a path with a zero was taken: ValueError when the bundle was opened",
+    "unpack/restart-in-one-transfer": "frames before the restart were neither given out nor counted",
+}
+
+
+def replay(target: str, folder: Path) -> None:
+    """All known inputs of a target."""
+    for data in INPUTS[target]:
+        targets.TARGETS[target](data, folder)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_what_was_found_still_holds(target: str, tmp_path: Path) -> None:
+    """Seeds, saved corpus and former crashes keep every promise."""
+    replay(target, tmp_path)
+
+
+def test_each_crash_is_explained() -> None:
+    """No input in crashes/ without a word on what it did, and none that is told of but gone."""
+    there = {f"{target}/{file.stem}" for target in TARGETS for file in corpus.crashes(target)}
+    assert there == set(BROKE)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_corpus_is_small_and_read_as_it_was_written(
+    target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line an input, the shortest first; a file that fits a change's page."""
+    file = corpus.SAVED / f"{target}.txt"
+    assert file.stat().st_size < 200_000
+    saved = corpus.load(target)
+    monkeypatch.setattr(corpus, "SAVED", tmp_path)
+    corpus.save(target, reversed(saved))
+    assert (tmp_path / file.name).read_bytes() == file.read_bytes()
+    assert max(map(len, saved)) <= 1024
+
+
+def written(folder: Path, name: str, data: bytes) -> Path:
+    """A file in `folder`."""
+    (folder / name).write_bytes(data)
+    return folder / name
+
+
+def read_manifest(data: bytes, folder: Path) -> bundle.Bundle:
+    """The bundle in `folder` with this manifest."""
+    return bundle.load(written(folder, bundle.MANIFEST, data).parent)
+
+
+def read_recording(data: bytes, folder: Path) -> Any:
+    """A recording from sidecar and table."""
+    about, magic, table = data.partition(files.NPY)
+    written(folder, "s.json", about)
+    return types.load(written(folder, "s.npy", magic + table))
+
+
+READ: dict[str, Callable[[bytes, Path], Any]] = {
+    "unpack": lambda data, folder: packets.unpack(data).packets,
+    "command": lambda data, folder: any(not c.error for c in robot_link.parse(data)[0]),
+    "settings": lambda data, folder: config.load(None, folder=folder, site=written(folder, "palpate.toml", data)),
+    "manifest": read_manifest,
+    "recording": read_recording,
+    "capture": lambda data, folder: capture.Playback(written(folder, "c", data)).format,
+}
+"""What the room makes of an input: something, nothing, or an error of its own."""
+
+
+def taken(target: str, data: bytes, folder: Path) -> bool:
+    """Whether the room takes an input, rather than to refuse it."""
+    try:
+        return bool(READ[target](data, folder))
+    except ApplianceError:
+        return False
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_corpus_reaches_what_lies_behind_the_checks(target: str, tmp_path: Path) -> None:
+    """Several inputs are taken and several refused: a corpus of nothing but broken files would prove little."""
+    replay(target, tmp_path)  # puts beside a manifest what belongs there
+    count = sum(taken(target, data, tmp_path) for data in INPUTS[target])
+    assert 2 <= count < len(INPUTS[target]) - 2
+
+
+def changed(room: Any, name: str, change: Callable[[Any], Any]) -> Callable[..., Any]:
+    """A function of a room whose result is changed."""
+    right = getattr(room, name)
+    return lambda *args, **more: change(right(*args, **more))
+
+
+def fewer(got: packets.Unpacked) -> packets.Unpacked:
+    """Without the last packet, whose bytes count as garbage."""
+    if not got.packets:
+        return got
+    size = len(got.packets[-1].taxels.tobytes()) + 24
+    return dataclasses.replace(got, packets=got.packets[:-1], garbage=got.garbage + size)
+
+
+def forgetful(data: bytes) -> packets.Unpacked:
+    """Gives the rest of the bytes away where a packet is not yet whole."""
+    got = packets.Unpacked([], [], len(data), b"")
+    return got if len(data) < packets.HEADER.size else UNPACK(data)
+
+
+def searching(data: bytes) -> packets.Unpacked:
+    """Looks for the next magic from every byte on: right, but its time grows with the square."""
+    for at in range(len(data)):
+        data.find(packets.MAGIC, at)
+    return UNPACK(data)
+
+
+def trusting(data: bytes, at: int) -> Any:
+    """Does not compare checksums."""
+    if len(data) - at >= packets.HEADER.size:
+        length = int.from_bytes(data[at + 4 : at + 6], "little")
+        end = at + packets.HEADER.size + length
+        crc = packets.CRC.pack(packets.zlib.crc32(data[at:end]))
+        data = data[:end] + crc + data[end + 4 :] if end + 4 <= len(data) else data
+    return ONE(data, at)
+
+
+def unguarded(kind: Any, table: Any) -> Any:
+    """A dataclass from whatever is there, as the manifest was read once."""
+    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in table.items()})
+
+
+def hasty(data: bytes, rest: bytes = b"") -> tuple[list[robot_link.Command], bytes]:
+    """Drops a line that is too long as soon as it is, as was done once."""
+    found, rest = PARSE(rest + data)
+    return found, b"" if len(rest) > robot_link.MAX_LINE else rest
+
+
+UNPACK, ONE, PARSE, FIT, FRAMES = packets.unpack, packets._one, robot_link.parse, schema.Key.fit, types.Frames
+
+
+def numb(load: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that reads a file, with an error that does not say which."""
+
+    def call(*args: Any, **more: Any) -> Any:
+        try:
+            return load(*args, **more)
+        except ApplianceError as e:
+            raise type(e)("something is wrong") from e
+
+    return call
+
+
+def broken_json(text: bytes) -> Any:
+    """Reads nothing, and says so in two lines."""
+    raise ValueError("line 1\nline 2")
+
+
+BREAKS: list[tuple[str, str, Any, str, Any]] = [
+    ("unpack", "a packet is missed", packets, "unpack", changed(packets, "unpack", fewer)),
+    ("unpack", "garbage is not counted", packets, "unpack",
+     changed(packets, "unpack", lambda got: dataclasses.replace(got, garbage=0))),
+    ("unpack", "the rest is dropped", packets, "unpack", forgetful),
+    ("unpack", "time grows with the square", packets, "unpack", searching),
+    ("unpack", "a wrong checksum is taken", packets, "_one", trusting),
+    ("unpack", "frames come twice", packets, "follow", changed(packets, "follow", lambda got: (got[0] * 2, *got[1:]))),
+    ("unpack", "a format is read from the wrong place", packets, "unpack_format",
+     lambda payload: packets.SkinFormat(4, 4, "uint8", 750, 750, 6)),
+    ("unpack", "numbers stand still", usb_sensor.Stream, "_stamp",
+     changed(usb_sensor.Stream, "_stamp", lambda frames: dataclasses.replace(frames, seq=frames.seq * 0))),
+    ("command", "one command a line is lost", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0][1:], got[1]))),
+    ("command", "the end of a long line is a command", robot_link, "parse", hasty),
+    ("command", "the rest grows", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0], got[1] * 200))),
+    ("command", "any checksum is right", robot_link, "checksum", lambda body: "00"),
+    ("command", "an answer has no limit", robot_link, "MAX_LINE", 200),
+    ("command", "a command is obeyed twice", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0] * 2, got[1]))),
+    ("settings", "limits are not looked at", schema.Key, "fit",
+     lambda key, value: value if key.hint in (int, float) else FIT(key, value)),
+    ("settings", "any text is a choice", schema.Key, "fit",
+     lambda key, value: value if isinstance(value, str) else FIT(key, value)),
+    ("settings", "the file is not named", config, "load", numb(config.load)),
+    ("settings", "what is described does not load", config, "describe",
+     changed(config, "describe", lambda text: text.replace("= true", "= 1").replace("0x", ""))),
+    ("manifest", "types are not looked at", manifest, "typed", unguarded),
+    ("manifest", "a message of two lines", manifest.json, "loads", broken_json),
+    ("manifest", "golden sweeps of any form", bundle, "_golden", lambda data, manifest: (np.ones((1, 2, 3, 4)), None)),
+    ("recording", "a time is lost", types, "Frames", lambda t_ns, seq, taxels: FRAMES(t_ns[1:], seq, taxels)),
+    ("recording", "types are not looked at", types, "typed", unguarded),
+    ("recording", "the file is not named", types, "load", numb(types.load)),
+    ("capture", "records are not looked at", capture, "_written", lambda kind, t_ns, body: True),
+    ("capture", "the last record is never played", capture.Playback, "finished", False),
+    ("manifest", "what is written is something else", bundle.Manifest, "json", lambda manifest: b"{}"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("target", "what", "room", "name", "broken"), BREAKS, ids=[f"{b[0]}-{b[1].replace(' ', '-')}" for b in BREAKS]
+)
+def test_each_promise_can_be_seen_broken(
+    target: str, what: str, room: Any, name: str, broken: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A room that is broken on purpose is found by the known inputs."""
+    monkeypatch.setattr(room, name, broken)
+    with pytest.raises((AssertionError, ApplianceError)):
+        replay(target, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("target", "room", "name"),
+    [("unpack", packets, "unpack_identity"), ("command", robot_link, "_command"), ("settings", config, "_checked"),
+     ("manifest", manifest, "typed"), ("recording", types, "typed"), ("capture", capture, "typed")],
+)  # fmt: skip
+def test_another_error_is_not_kept_back(
+    target: str, room: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is none of the room's own errors comes out of a target, so that the fuzzer stops at it."""
+
+    def broken(*args: object) -> None:
+        raise ZeroDivisionError("broken")
+
+    monkeypatch.setattr(room, name, broken)
+    with pytest.raises(ZeroDivisionError, match="broken"):
+        replay(target, tmp_path)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_changes_keep_the_form(target: str, tmp_path: Path) -> None:
+    """A mutator gives the same for the same seed, and a good part of what it makes is still taken."""
+
+    def plain(data: bytes) -> bytes:
+        return data.replace(b"A", b"E")
+
+    data = seeds.SEEDS[target]()[0]
+    made = [MUTATORS[target](data, Random(seed), plain) for seed in range(100)]
+    assert made == [MUTATORS[target](data, Random(seed), plain) for seed in range(100)]
+    assert len(set(made)) > 2
+    replay(target, tmp_path)
+    assert sum(taken(target, data, tmp_path) for data in made) > 25

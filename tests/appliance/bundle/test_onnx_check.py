@@ -1,0 +1,237 @@
+"""The graph's check: our own models pass, hostile ones are refused with their reason, and what passes cannot hurt."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from tests.factories import toy_bundle
+
+pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
+import numpy as np
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Manifest, Thresholds
+from appliance.bundle.onnx_check import check, reader
+from appliance.core.errors import BundleError
+from appliance.inference.session import session
+from tests.campaigns import hostile_fuzz
+from tests.factories import hostile_models as hostile
+from tests.factories import mutated_models
+from tests.factories.grown_models import FORM, grown
+
+HOSTILE = hostile.every()
+MANIFEST = Manifest("hostile", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255), {})
+
+
+@pytest.fixture(scope="module")
+def owns() -> list[mutated_models.Own]:
+    """Models that `palpate-train` writes, which have all allowed operators but GRU and MaxPool between them."""
+    return mutated_models.own_models(mutated_models.QUICK)
+
+
+def test_our_own_models_pass(owns: list[mutated_models.Own]):
+    """The default bundle's, those of all kinds of methods, and a graph of opset 18."""
+    for own in owns:
+        check.check(own.model, own.manifest)
+    small = replace(MANIFEST, format=toy_bundle.FORMAT, labels=("a", "b", "c"))
+    check.check(toy_bundle.model(), small)
+
+
+def test_a_harmless_model_of_the_hostile_kind_passes():
+    """What surrounds the hostile nodes is sound: they are refused for what they are."""
+    check.check(hostile.model([hostile.node("Relu", ["x"], ["y"])]).SerializeToString(), MANIFEST)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_model_is_refused(name: str):
+    """With one printable line that says why and what to try, and within a second."""
+    data, words = HOSTILE[name]
+    with pytest.raises(BundleError, match=words) as refused:
+        check.check(data, MANIFEST)
+    message = str(refused.value)
+    assert message.isprintable()
+    assert message.endswith("export the bundle again")
+    assert len(message) < 600
+
+
+def in_child(work: Callable[[], Any], more: int) -> tuple[Any, float]:
+    """What `work` gives or raises in a fork that may take `more` bytes, and how many MB more it had at most."""
+
+    def child(end: Any) -> None:
+        size = hostile_fuzz.memory("VmSize") * 1024 + more
+        resource.setrlimit(resource.RLIMIT_AS, (size, size))
+        Path("/proc/self/clear_refs").write_text("5")
+        before = hostile_fuzz.memory("VmRSS")
+        try:
+            told = work()
+        except Exception as e:  # onnxruntime's own classes cannot travel
+            told = str(e)
+        end.send((told, (hostile_fuzz.memory("VmHWM") - before) / 1024))
+
+    near, far = multiprocessing.Pipe()
+    process = multiprocessing.get_context("fork").Process(target=child, args=(far,))
+    process.start()
+    far.close()
+    try:
+        assert near.poll(30), "the child hangs"
+        return near.recv()
+    finally:
+        process.kill()
+        process.join()
+
+
+def test_152_bytes_would_take_6_gigabytes():
+    """Without the check onnxruntime opens the model, and 5.5 GB are not enough for its first sweep."""
+    model = hostile.tiny()
+    assert len(model) <= 152
+    told, _ = in_child(lambda: hostile_fuzz.run(session(model), Random(1)), 5_500_000_000)
+    assert "ConstantOfShape" in told
+    assert "bad_alloc" in told
+    told, most_mb = in_child(lambda: check.check(model, MANIFEST), 1 << 30)
+    assert "6000000000 bytes (limit" in told
+    assert most_mb < 2
+
+
+def test_a_file_that_ends_anywhere_is_refused(owns: list[mutated_models.Own]):
+    """The default bundle's model, cut off at every byte."""
+    own = owns[0]
+    for end in range(len(own.model)):
+        with pytest.raises(BundleError):
+            check.check(own.model[:end], own.manifest)
+
+
+def test_a_link_and_a_file_beside_the_model_are_never_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """External data that is there, as a symlink: refused before anything is opened."""
+    (tmp_path / "secret").write_bytes(bytes(16))
+    (tmp_path / "weights.bin").symlink_to(tmp_path / "secret")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BundleError, match="external_data"):
+        check.check(HOSTILE["external data beside"][0], MANIFEST)
+
+
+def heavy(kind: str) -> bytes:
+    """A model that costs nearly as much memory as one may, by one operator."""
+    node, model = hostile.node, hostile.model
+    start = [node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0), node("Expand", ["s", "n"], ["m"])]
+    if kind == "MatMul":
+        weights = np.ones((4000, 2000), np.float32)
+        return model([*start, node("MatMul", ["m", "w"], ["y"])], {"n": [1, 4000], "w": weights}).SerializeToString()
+    if kind == "TopK":
+        count = {"n": [1, 4_000_000], "k": [4_000_000]}
+        return model([*start, node("TopK", ["m", "k"], ["y", "at"])], count).SerializeToString()
+    if kind == "ConstantOfShape":
+        one = hostile.helper.make_tensor("one", 1, [1], [1.0])
+        made = [
+            node("ConstantOfShape", ["c"], ["o"], value=one),
+            node("Sin", ["o"], ["i"]),
+            node("Mul", ["i", "s"], ["y"]),
+        ]
+        return model([start[0], *made], {"c": [4_000_000]}).SerializeToString()
+    pooled = node("MaxPool", ["m"], ["y"], kernel_shape=[2], strides=[1])
+    return model([*start, pooled], {"n": [1, 1, 8_000_000]}).SerializeToString()
+
+
+@pytest.mark.parametrize("kind", ["MatMul", "TopK", "ConstantOfShape", "MaxPool"])
+def test_what_passes_takes_no_more_than_was_counted(kind: str):
+    """The check's account of memory is above what onnxruntime takes, and that below 256 MB."""
+    model = heavy(kind)
+    check.check(model, MANIFEST)
+
+    def opened() -> str:
+        hostile_fuzz.run(session(model), Random(1))
+        return "ran"
+
+    told, most_mb = in_child(opened, 512 << 20)
+    assert told == "ran"
+    assert most_mb < (check.MOST_MEMORY >> 20) + 16
+
+
+@pytest.mark.parametrize("limit", ["MOST_MEMORY", "MOST_WORK", "MOST_NODES", "MOST_CONSTANTS", "MOST_TENSOR"])
+def test_every_cap_caps(limit: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
+    """Our own model is refused where a cap is lower than what it needs."""
+    monkeypatch.setattr(check, limit, 20)
+    with pytest.raises(BundleError, match="limit 20"):
+        check.check(owns[0].model, owns[0].manifest)
+
+
+def test_a_file_that_is_too_large_is_not_read(monkeypatch: pytest.MonkeyPatch):
+    """By its size alone."""
+    monkeypatch.setattr(check, "MOST_MEMORY", 99)
+    with pytest.raises(BundleError, match=r"it has 100 bytes \(limit 99\)"):
+        check.check(bytes(100), MANIFEST)
+
+
+def test_values_are_counted(owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
+    """A file is read value by value only so far."""
+    monkeypatch.setattr(reader, "MOST_VALUES", 100)
+    with pytest.raises(BundleError, match="more than 100 values"):
+        check.check(owns[0].model, owns[0].manifest)
+
+
+def test_the_manifest_decides_what_goes_in_and_comes_out():
+    """A skin of another size or type, too few labels, heads that are missing or too many."""
+    model, manifest = bundle.load(bundle.DEFAULT).model, bundle.load(bundle.DEFAULT).manifest
+    other = {
+        "takes uint8": {"format": replace(manifest.format, dtype="int16")},
+        r"the manifest has uint8 \[1, 1400": {"format": replace(manifest.format, window=1400)},
+        "5 labels": {"labels": manifest.labels[:5]},
+        r"early is \[1, 9, 6\] instead of \[1, 3, 6\]": {"early": bundle.Early((0.9,) * 3, 1)},
+        "the manifest has float32": {"input": "L", "early": None},
+    }
+    for words, change in other.items():
+        with pytest.raises(BundleError, match=words):
+            check.check(model, replace(manifest, **change))
+    sound = hostile.model([hostile.node("Relu", ["x"], ["y"])]).SerializeToString()
+    with pytest.raises(BundleError, match="the manifest needs early, logits"):
+        check.check(sound, replace(MANIFEST, early=bundle.Early((0.9,), 1)))
+
+
+def test_grown_models_pass_and_run():
+    """Random operators in any order, as far as the rules let them: most of them onnxruntime opens and runs."""
+    ran = 0
+    for seed in range(20):
+        model = grown(Random(seed))
+        check.check(model, MANIFEST)
+        told = hostile_fuzz.tried(model, replace(hostile_fuzz.GROWING, manifest=MANIFEST), Random(seed))
+        ran += told["outcome"] == "ran"
+    assert ran >= 10
+
+
+def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
+    """150 of the campaign's kind, in children of limited memory and time; enough of them get as far as onnxruntime."""
+    record = hostile_fuzz.fresh(3)
+    for told in hostile_fuzz.Fuzz(owns, 3).results(0, 150):
+        hostile_fuzz.note(record, told)
+    assert record["done"] == 150
+    assert record["finds"] == []
+    assert record["outcomes"]["ran"] >= 20
+
+
+@pytest.mark.parametrize("how", ["dies", "hangs", "swells"])
+def test_the_campaign_would_tell(how: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
+    """A child that dies, hangs or takes too much memory is told, with its number, and the next model is tried."""
+
+    def run(opened: Any, rng: Random) -> None:
+        if how == "dies":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if how == "hangs":
+            signal.pause()
+        np.ones(400 << 20, np.uint8)
+
+    monkeypatch.setattr(hostile_fuzz, "run", run)
+    monkeypatch.setattr(hostile_fuzz, "DEADLINE_S", 0.5)
+    fuzz = hostile_fuzz.Fuzz(owns, 1)
+    monkeypatch.setattr(hostile_fuzz.Fuzz, "model", lambda self, number: (owns[0].model, owns[0], Random(1)))
+    told = list(fuzz.results(7, 2))
+    wanted = {"dies": "died (-9)", "hangs": "hung", "swells": "no memory"}[how]
+    assert [(t["number"], t["outcome"]) for t in told] == [(7, wanted), (8, wanted)]

@@ -1,0 +1,363 @@
+"""The command as a person or a script uses it: what it prints, how it ends, its exit codes."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Early
+from appliance.cli.main import main
+from appliance.core import statistics
+from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError
+from appliance.core.types import Frames, Status, Sweep, save
+from appliance.inference.classifier import softmax
+from appliance.sim import script, skin
+from appliance.tools import bench, bench_process, demo, pseudo_terminal
+from tests.factories import toy_bundle
+from tests.factories.simulated_box import numbered
+
+VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
+
+
+def test_demo_prints_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]):
+    """Each sweep with truth, verdict, bar and raw sentence; then the table."""
+    assert main(["demo", *VIRTUAL]) == 0
+    out = capsys.readouterr().out
+    assert out.count("$PPLP,RES,") == 3
+    assert out.count(" -> ") == 3
+    assert "frames lost     0 of" in out
+    assert "\033" not in out
+
+
+def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
+    """Nothing but sentences, the same in every run with the same seed."""
+    assert main(["demo", "--raw", *VIRTUAL]) == 0
+    first = capsys.readouterr().out
+    assert all(line.startswith("$PPLP,") for line in first.splitlines())
+    assert first.count(",RES,") == 3
+    main(["demo", "--raw", *VIRTUAL])
+    assert capsys.readouterr().out == first
+
+
+def test_demo_paints_on_a_terminal():
+    """On a terminal the skin is drawn in 16 shaded cells and painted over."""
+    far, near = os.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "appliance", "demo", "--virtual", "--sweeps", "1"], stdout=near, stderr=subprocess.PIPE
+    ) as run:
+        os.close(near)
+        shown = b""
+        try:
+            while data := os.read(far, 65536):
+                shown += data
+        except OSError:  # the terminal's end where the last writer has gone
+            pass
+        assert run.wait() == 0
+    os.close(far)
+    first = shown.split(b"\033[12A")[0]
+    assert first.count(b"\033[48;5;") == 32
+    assert b"$PPLP,RES,1," in shown
+
+
+def test_picture_shows_each_digit():
+    """The picture's numbers are the newest frame's digits."""
+    frame = numbered(1)
+    text = "\n".join(demo.picture(frame[0]))
+    assert all(f"{d:^6}" in text for d in frame.ravel())
+
+
+def test_run_prints_sentences_and_ends_with_its_script(capsysbinary: pytest.CaptureFixture[bytes]):
+    """Without a serial port the sentences are printed, and say that they are simulated."""
+    assert main(["run", "--sim", "skin", *VIRTUAL]) == 0
+    lines = capsysbinary.readouterr().out.decode("ascii").split("\r\n")
+    results = [line for line in lines if ",RES," in line]
+    assert len(results) == 3
+    assert all(",sim," in line for line in results)
+
+
+def test_run_ends_within_a_second_of_sigterm():
+    """SIGTERM: exit code 0 within a second, in real time with a streaming skin."""
+    with subprocess.Popen([sys.executable, "-m", "appliance", "run", "--sim", "skin"], stdout=subprocess.PIPE) as run:
+        while b",streaming," not in run.stdout.readline():
+            pass
+        start = time.monotonic()
+        run.send_signal(signal.SIGTERM)
+        run.stdout.read()
+        assert run.wait(timeout=5) == 0
+        assert time.monotonic() - start < 1
+
+
+def test_run_on_a_serial_port():
+    """With serial.port set the sentences come out there, and standard output stays empty."""
+    with pseudo_terminal.pair() as (far, name):
+        done = subprocess.run(
+            [sys.executable, "-m", "appliance", "run", "--sim", "skin", *VIRTUAL, "--set", f"serial.port={name}"],
+            capture_output=True, check=True,
+        )  # fmt: skip
+        assert done.stdout == b""
+        assert os.read(far, 65536).count(b",RES,") == 3
+
+
+def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]):
+    """`record --capture`, then `replay` of either: the same labels and probabilities."""
+    where = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
+    assert main(["record", "--sim", "skin", *VIRTUAL, *where]) == 0
+
+    def said() -> list[list[bytes]]:
+        return [line.split(b",")[4:8] for line in capsysbinary.readouterr().out.splitlines() if b",RES," in line]
+
+    first = said()
+    assert main(["replay", str(tmp_path / "c")]) == 0
+    assert said() == first
+    for path in sorted((tmp_path / "kept").glob("*.npy")):
+        assert main(["replay", str(path)]) == 0
+    assert said() == first
+
+
+def test_a_full_disk_costs_the_recording_never_the_classifying(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    """Neither sweeps nor capture can be written: each is told, every sweep is answered, exit code 0."""
+
+    def full(*args: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("appliance.core.storage.write", full)
+    assert main(["record", "--sim", "skin", *VIRTUAL, "--out", str(tmp_path), "--capture", "/dev/full"]) == 0
+    said = capfd.readouterr()
+    assert said.out.count(",RES,") == 3
+    assert said.out.count(",full,0,,,,No space left on device*") == 3
+    assert said.err.count("not stored: No space left on device") == 1
+    assert said.err.count("capture: /dev/full cannot be written: No space left on device") == 1
+
+
+def test_a_log_on_a_full_disk_costs_the_log_alone():
+    """Where standard error cannot be written, sweeps are answered all the same, and the exit code is 0."""
+    command = [sys.executable, "-m", "appliance", "run", "--sim", "skin", *VIRTUAL, "--capture", "/dev/full"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=full, text=True, timeout=60, check=False)
+    assert done.returncode == 0
+    assert done.stdout.count("$PPLP,RES,") == 3
+
+
+def test_replay_of_a_sweep_set(
+    tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
+):
+    """`run --sim replay:FILE`: each window of a set, over the wire, gets the verdict that the window itself gets."""
+    samples = np.concatenate([default_bundle.golden, default_bundle.golden[::-1]])
+    np.savez(
+        tmp_path / "set.npz", samples=samples, labels=np.zeros(len(samples), int), materials=np.array(["a", "b"]),
+        rate_hz=750.0, group_recording=np.repeat(np.arange(2), len(default_bundle.golden)),
+    )  # fmt: skip
+    assert main(["run", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]) == 0
+    results = [r.split(b",") for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
+    assert [int(r[8]) for r in results] == [*range(1, len(default_bundle.golden) + 1)] * 2
+    assert all(r[12] == b"replay" for r in results)
+    want = [default_bundle.manifest.labels[k] for k in default_bundle.golden_logits.argmax(1)]
+    assert results[0][5].decode() == want[0]
+    assert results[len(want)][5].decode() == want[-1]
+
+
+def test_the_sequential_test_is_configured(
+    tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
+):
+    """classifier.sure and classifier.most_sweeps reach the classifier, in `run` and in `replay`."""
+    samples = default_bundle.golden[:1].repeat(3, axis=0)
+    np.savez(
+        tmp_path / "set.npz", samples=samples, labels=np.zeros(3, int), materials=np.array(["a"]), rate_hz=750.0,
+        group_recording=np.zeros(3, int),
+    )  # fmt: skip
+    never = ["--set", "classifier.sure=1", "--set", "classifier.most_sweeps=2", "--set", "classifier.fuse=product"]
+    played = ["record", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
+    kept = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
+
+    def said() -> list[bytes]:
+        return [r.split(b",")[4] for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
+
+    p = softmax(default_bundle.golden_logits[0]).max()
+    assert p < 0.9999, "take a golden sweep that is less sure"
+    assert main([*played, *never, *kept]) == 0
+    assert said()[:2] == [b"unsure", b"undecided"]
+    assert main(["replay", str(tmp_path / "c"), *never]) == 0
+    assert said()[:2] == [b"unsure", b"undecided"]
+    assert main(["replay", str(next((tmp_path / "kept").glob("*.npy"))), *never]) == 0
+    assert said() == [b"unsure"]
+    assert main(["run", *played[1:]]) == 0
+    assert said() == [b"ok"] * 3
+
+
+def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """classifier.early with a bundle without early heads ends before the first sweep; `check` names it."""
+    folder = Path(shutil.copytree(bundle.DEFAULT, tmp_path / "bundle"))
+    manifest = json.loads((folder / bundle.MANIFEST).read_text()) | {"early": None}
+    (folder / bundle.MANIFEST).write_text(json.dumps(manifest))
+    which = ["--set", "classifier.early=true", "--set", f"classifier.bundle={folder}"]
+    assert main(["run", "--sim", "skin", *VIRTUAL, *which]) == BundleError.exit_code
+    said = capsys.readouterr()
+    assert "has no early heads" in said.err
+    assert said.out == ""
+    assert main(["check", "--sim", "skin", "--virtual", *which]) == 1
+    assert "FAIL  golden sweeps" in capsys.readouterr().out
+
+
+def test_a_sweep_that_was_answered_early_is_replayed_so(tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]):
+    """By a bundle that decides there; another one is named."""
+    frames = Frames(np.arange(10), np.arange(10), toy_bundle.window(1, 0)[:10])
+    save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.OK, frames, share=0.5), toy_bundle.FORMAT)
+    for least, code in ((0.5, 0), (2.0, 1)):
+        made = toy_bundle.files(early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early"))
+        folder = toy_bundle.put(tmp_path / f"b{least}", made)
+        assert main(["replay", str(tmp_path / "s.npy"), "--set", f"classifier.bundle={folder}"]) == code
+    said = capsysbinary.readouterr()
+    assert said.out.count(b",RES,1,") == 1
+    assert b",ok,a," in said.out
+    assert b"answered early, which this bundle does not do" in said.out
+
+
+def test_check_says_ok_part_by_part(capsys: pytest.CaptureFixture[str]):
+    """On the rig everything is there."""
+    assert main(["check", "--sim", "skin", "--virtual"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["ok"] * 4
+    assert "SIM0001" in lines[2]
+
+
+def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """On a machine without devices: the bundle is fine, the devices are not, each with its own line, and exit code 1."""
+    code = main(["check", "--board", "rpi5", "--set", f"serial.port={tmp_path}/none", "--set", "sensor.product_id=1"])
+    lines = {line[6:20].strip(): line for line in capsys.readouterr().out.splitlines()}
+    assert code == 1
+    assert lines["bundle"].startswith("ok")
+    assert lines["golden sweeps"].startswith("ok")
+    assert all(lines[part].startswith("FAIL") for part in ("skin", "gpio lines", "serial port"))
+    assert main(["check", "--set", f"classifier.bundle={tmp_path}"]) == 1
+    assert "FAIL  bundle" in capsys.readouterr().out
+
+
+def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
+    """Each value with the file it comes from."""
+    assert main(["config", "--board", "rpi5", "--set", "sweep.longest_s=9"]) == 0
+    out = capsys.readouterr().out
+    assert "# --set" in next(line for line in out.splitlines() if line.startswith("sweep.longest_s"))
+    assert "board-rpi5.toml" in out
+
+
+@pytest.mark.parametrize(
+    ("args", "trouble", "hint"),
+    [
+        (["run"], ConfigError, "trigger.start names no line"),
+        (
+            ["run", "--set", "trigger.start=A", "--set", "trigger.mode=two-lines"],
+            ConfigError,
+            "trigger.stop names no line",
+        ),
+        (["run", "--virtual"], ConfigError, "--virtual needs --sim"),
+        (["run", "--sim", "world"], ConfigError, "--sim world is unknown"),
+        (["run", "--board", "toaster"], ConfigError, "rpi5"),
+        (["run", "--set", "sweep.longets_s=1"], ConfigError, "longest_s"),
+        (["run", "--sim", "skin", "--set", "classifier.bundle=/nowhere"], BundleError, "no bundle at /nowhere"),
+        (["run", "--sim", "replay:/nowhere.npz"], FormatError, "nowhere.npz: not a sweep set"),
+        (["run", "--board", "rpi5"], LineError, "gpiochip"),
+        (["replay", "/nowhere"], FormatError, "cannot be read"),
+        (["replay", "/nowhere.npy"], FormatError, "not a recorded sweep"),
+        (["record", "--sim", "skin", "--virtual", "--out", "/proc/x"], ConfigError, "--out /proc/x"),
+        (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], ConfigError, "--capture /proc/x"),
+    ],
+)
+def test_exit_codes(args: list[str], trouble: type[ApplianceError], hint: str, capsys: pytest.CaptureFixture[str]):
+    """Each kind of trouble has its exit code and one line that says what to do."""
+    if "rpi5" in args and trouble is LineError and any(Path("/dev").glob("gpiochip*")):
+        pytest.skip("this machine has gpio chips")
+    assert main(args) == trouble.exit_code
+    err = capsys.readouterr().err.strip()
+    assert hint in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("key", ["samples", "labels", "materials", "rate_hz"])
+def test_sets_that_lack_something(tmp_path: Path, key: str, capsys: pytest.CaptureFixture[str]):
+    """A sweep set without one of its arrays is named with what is missing."""
+    arrays = {"samples": np.zeros((2, 5, 4, 4), np.uint8), "labels": [0, 0], "materials": ["a"], "rate_hz": 750.0}
+    np.savez(tmp_path / "s.npz", **{k: v for k, v in arrays.items() if k != key})
+    assert main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == FormatError.exit_code
+    assert key in capsys.readouterr().err
+
+
+def test_a_set_of_another_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A set that the bundle was not made for is refused with both formats."""
+    np.savez(
+        tmp_path / "s.npz", samples=np.zeros((2, 5, 3, 3), np.int16), labels=[0, 0], materials=["a"], rate_hz=100.0
+    )
+    assert main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == FormatError.exit_code
+    err = capsys.readouterr().err
+    assert "3x3 int16 at 100 Hz" in err
+    assert "4x4 uint8 at 750 Hz" in err
+
+
+def test_unknown_arguments_are_usage_errors():
+    """argparse's own exit code."""
+    with pytest.raises(SystemExit) as e:
+        main(["fly"])
+    assert e.value.code == 2
+
+
+def test_output_that_nobody_reads():
+    """`palpate … | head` ends without a traceback."""
+    command = f"{sys.executable} -m appliance run --sim skin --virtual --sweeps 30 | head -n 1"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("$PPLP")
+    assert "Traceback" not in done.stderr
+
+
+def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """A small bench: every key that scripts rely on, in JSON, with commit, seed and machine."""
+    for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
+        monkeypatch.setattr(bench, name, value)
+    monkeypatch.setattr(bench, "_child", lambda name, seed: {name: {"seed": seed}})
+    monkeypatch.setattr(bench, "_make_yardsticks", lambda folder: None)
+    assert main(["bench", "--json", str(tmp_path / "b.json"), "--yardsticks", str(tmp_path)]) == 0
+    figures = json.loads((tmp_path / "b.json").read_text())
+    assert figures["accuracy"]["total"] == 6
+    assert figures["frames_lost"] == 0
+    assert figures["edge_to_sentence_ms"].keys() >= {"p50", "p99"}
+    assert figures["inference_ms"]["int8"]["p50"] > 0
+    assert figures["cold_start_s"] > 0
+    assert figures["memory"] == {"seed": 2000}
+    assert {"commit", "seed", "machine"} <= figures.keys()
+    out = capsys.readouterr().out
+    assert "edge_to_sentence_ms" in out
+    assert "fp32 and paper_int8 were not measured" in out
+
+
+def test_bench_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Memory and processor share, in short."""
+    monkeypatch.setattr(bench_process, "MEMORY_SWEEPS", 20)
+    monkeypatch.setattr(bench_process, "STREAM_S", 0.5)
+    bench_process.write_acts(tmp_path / "acts.npz", script.tubes(1, 2))
+    assert main(["bench", "--part", "memory", "--acts", str(tmp_path / "acts.npz")]) == 0
+    assert json.loads(capsys.readouterr().out)["rss_mb"]["after_1000"] > 10
+    assert main(["bench", "--part", "stream", "--acts", str(tmp_path / "acts.npz")]) == 0
+    shares = json.loads(capsys.readouterr().out)
+    assert 0 < shares["cpu_share_streaming"] < shares["cpu_share_with_simulated_board"]
+
+
+def test_wilson():
+    """The paper's 55 of 60 has the interval that is known for it."""
+    assert statistics.wilson(55, 60) == pytest.approx([0.819, 0.964], abs=5e-4)
+
+
+def test_skin_format_is_the_default_bundles(default_bundle: bundle.Bundle):
+    """The simulated skin is the one that the default bundle was trained for."""
+    assert default_bundle.format == skin.FORMAT
+    assert set(default_bundle.manifest.labels) == set(skin.MATERIALS)

@@ -1,0 +1,282 @@
+"""The manual and the change log beside the code: what they name is there, and what is there they name."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+import numpy as np
+import pytest
+
+from appliance import __version__
+from appliance.cli import bundle_list, parser
+from appliance.cli.main import RUNS
+from appliance.core import config, errors
+from appliance.core.schema import Key
+from appliance.core.types import Status, Verdict
+from appliance.deployment import state
+from appliance.io import robot_link
+from appliance.service import journal, status
+from tests.factories.paths import ROOT
+
+DOCS = ROOT / "docs"
+MANUAL = (DOCS / "manual.md").read_text()
+CHANGES = (ROOT / "CHANGELOG.md").read_text()
+SECTIONS = {title: text for title, text in re.findall(r"(?ms)^## \d+\. (.+?)$(.*?)(?=^## |\Z)", MANUAL)}
+BLOCKS = re.findall(r"(?m)^    (\S.*)$", MANUAL)
+"""The lines of all code blocks."""
+PARSER = parser.parser(RUNS)
+PICTURES = sorted(DOCS.glob("manual/*.svg"))
+
+
+def rows(section: str, column: str) -> Iterator[list[str]]:
+    """The cells of each row of the tables of a section whose first column is headed so."""
+    inside = False
+    for line in SECTIONS[section].splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("|") else []
+        if cells and inside and not set(cells[0]) <= {"-"}:
+            yield cells
+        inside = bool(cells) and (inside or cells[0] == column)
+
+
+def named(section: str, column: str) -> list[str]:
+    """What stands in backticks at the beginning of each row."""
+    return [re.match(r"`?([^`]*)`?", cells[0])[1] for cells in rows(section, column)]
+
+
+def spoken() -> list[list[str]]:
+    """The arguments of each `palpate` command of the manual's code blocks; what it prints has wide gaps."""
+    found = (re.fullmatch(r"(?:sudo -u palpate )?palpate ([a-z].*)", line) for line in BLOCKS)
+    return [shlex.split(m[1]) for m in found if m and "   " not in m[1]]
+
+
+def test_every_status_is_explained():
+    """Section 6 has the statuses of sweep.Status, in their order, and the skin's states, each with what to do."""
+    title = "Statuses, and what to do about each"
+    assert named(title, "status") == [*Status]
+    kinds = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, errors.SensorError)]
+    assert set(named(title, "state")) == {k.state for k in kinds if k is not errors.SensorError} | {"streaming"}
+    assert all(all(cells) for column in ("status", "state") for cells in rows(title, column))
+
+
+def test_every_serial_command_is_named():
+    """The commands of the serial line, in the order of sink.COMMANDS."""
+    assert named("Sentences and commands", "command") == [*robot_link.COMMANDS]
+
+
+def test_sentences_are_as_the_box_forms_and_reads_them():
+    """Each sentence of the manual has its checksum; RES, STA, ANS and REC are there; commands are understood."""
+    found = re.findall(r"\$PPLP,([A-Z]+)([^*`\n]*)\*([0-9A-F]{2})", MANUAL)
+    kinds = set()
+    for kind, rest, given in found:
+        assert given == robot_link.checksum(f"PPLP,{kind}{rest}"), f"{kind}{rest}"
+        kinds.add(kind)
+        if kind in robot_link.COMMANDS:
+            ((command,), _) = robot_link.parse(f"$PPLP,{kind}{rest}*{given}\r\n".encode())
+            assert not command.error
+    assert kinds >= {"RES", "STA", "ANS", "REC"}
+
+
+def test_every_command_is_named_and_there():
+    """Section 10 lists the parser's commands; a command of the text is one of them."""
+    assert PARSER.parse_args(["bench"]).run is RUNS["bench"]
+    listed = [name.removeprefix("palpate ") for name in named("Commands and exit codes", "command")]
+    assert sorted(listed) == sorted(RUNS)
+    assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= {*RUNS}
+
+
+@pytest.mark.parametrize("words", spoken(), ids=" ".join)
+def test_commands_can_be_copied(words: list[str]):
+    """Each `palpate` command of a code block is one that the parser takes."""
+    assert PARSER.parse_args(words).run
+
+
+def test_commands_to_be_copied_are_many():
+    """The search for them finds them."""
+    assert len(spoken()) >= 8
+
+
+def test_training_commands_are_there():
+    """What the manual calls of palpate-train: commands and options stand in its parsers."""
+    code = "\n".join(path.read_text() for path in sorted(ROOT.glob("train/**/*.py")))
+    commands = set(re.findall(r'\badd(?:_parser)?\(\s*"([a-z]+)"', code))
+    lines = [*BLOCKS, *re.findall(r"`([^`]+)`", MANUAL.replace("\n", " "))]
+    called = [line.split()[1:] for line in lines if line.startswith("palpate-train ")]
+    assert len(called) >= 6
+    for first, *more in called:
+        assert {first, *more[: first == "sets"]} <= commands, first
+        assert all(f'"{word}"' in code for word in more if word.startswith("--")), more
+
+
+def test_make_targets_are_there():
+    """Each `make TARGET NAME=...` of the manual is a target that uses this variable; install and deploy are among them."""
+    text = (ROOT / "Makefile").read_text()
+    targets = set(re.findall(r"(?m)^([a-z-]+):", text))
+    called = re.findall(r"(?m)(?:^    |`)make ([a-z-]+)([^`\n#]*)", MANUAL)
+    assert {"install", "deploy"} <= {target for target, _ in called}
+    for target, given in called:
+        assert target in targets
+        assert all(f"$({name})" in text for name in re.findall(r"([A-Z]+)=", given)), given
+
+
+def allowed(key: Key) -> str:
+    """What a setting may be, as the table has it."""
+    if "line" in key.limits:
+        return "lines" if get_origin(key.hint) is tuple else "line"
+    if get_args(key.hint):
+        return ", ".join(json.dumps(one) for one in get_args(key.hint))
+    if key.hint in (str, bool):
+        return {str: "text", bool: "true, false"}[key.hint]
+    step = f", step {key.limits['step']}" if "step" in key.limits else ""
+    return f"{key.limits['least']:.8g} to {key.limits['most']:.8g}{step}"
+
+
+def test_settings_are_those_of_the_code():
+    """Key, default and what is allowed, in the code's order; each with a word on what it is."""
+    told = {cells[0].strip("`"): cells[1:] for cells in rows("Settings", "key")}
+    assert [*told] == ["board", *config._KEYS]
+    assert all(about for *_, about in told.values())
+    for name, key in config._KEYS.items():
+        default = f"0x{key.default:04x}" if "hex" in key.limits else json.dumps(key.default)
+        assert told[name][:2] == [default, allowed(key)], name
+
+
+def test_settings_of_the_text_exist():
+    """A `section.key` in the text is a setting."""
+    sections = "|".join(config._SECTIONS)
+    files = {"sensor.toml"}
+    found = set(re.findall(rf"`((?:{sections})\.[a-z_]+)", MANUAL)) - files
+    assert found <= {*config._KEYS}
+
+
+def test_exit_codes_are_those_of_the_code():
+    """The codes of `palpate --help`, of the errors, and what the unit does about them."""
+    told = {int(cells[0]): cells for cells in rows("Commands and exit codes", "exit code")}
+    assert [*told] == [int(n) for n in re.findall(r"(?:^|[;:] )(\d+) ", parser.EXIT_CODES)]
+    codes = {k.exit_code for k in vars(errors).values() if isinstance(k, type)}
+    assert codes <= told.keys()
+    unit = (ROOT / "systemd" / "palpate.service").read_text()
+    stays = [int(n) for n in re.findall(r"(?m)^RestartPreventExitStatus=(.*)", unit)[0].split()]
+    assert [code for code, cells in told.items() if "stopped" in cells[2]] == stays
+
+
+@pytest.mark.parametrize("board", ["rpi4", "rpi5"])
+def test_wiring_is_that_of_the_board_files(board: str):
+    """Each line's kernel name and pin as in the board file, the header drawn as there, the kernel's settings too."""
+    text = (ROOT / "firmware_config" / f"board-{board}.toml").read_text()
+    settings = config.load(board)
+    lines = {
+        "START": settings.trigger.start, "STOP": settings.trigger.stop, "NEW OBJECT": settings.trigger.new_object,
+        **{name.upper().replace("_", " "): getattr(settings.output, name)
+           for name in ("ready", "busy", "result_valid", "fault", "decided")},
+        **{f"class bit {i}": name for i, name in enumerate(settings.output.class_bits)},
+    }  # fmt: skip
+    told = {cells[0]: cells[1:] for cells in rows("Wiring", "line")}
+    assert told.keys() - lines.keys() == {"serial TXD", "serial RXD"}
+    for role, (_, name, pin, _) in told.items():
+        assert name == lines.get(role, name)
+        assert re.search(rf"\({pin}\) +{name}\b|\b{name} +\({pin}\)", text), role
+    header = ["    " + line[2:].rstrip() for line in text.splitlines() if re.search(r"\(\d+\) \(\d+\)", line)]
+    assert len(header) == 20
+    assert "\n".join(header) in MANUAL
+    boot = re.findall(r"(?m)^#     ((?:dt|enable)\S+)$", text)
+    assert len(boot) >= 2
+    assert "".join(f"\n    {line}" for line in boot) + "\n\n" in MANUAL
+
+
+def test_links_and_pictures_are_there():
+    """Each link leads to a file or a place of this page; each picture of docs/manual is shown, with a word for the blind."""
+    for name, text in (("docs/manual.md", MANUAL), ("CHANGELOG.md", CHANGES)):
+        for target in re.findall(r"\]\(([^)#]+)\)", text):
+            assert not target.startswith("http"), target
+            assert ((ROOT / name).parent / target).is_file(), target
+    shown = dict(re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", MANUAL))
+    assert {Path(target) for target in shown.values()} >= {p.relative_to(DOCS) for p in PICTURES}
+
+
+def test_pictures_go_to_the_box():
+    """What `make install` copies holds the manual and each of its pictures."""
+    copied = re.findall(r'"(docs/[^"]+)": "/usr/share/doc/palpate/([^"]+)"', (ROOT / "systemd/install.py").read_text())
+    assert ("docs/manual.md", "manual.md") in copied
+    for target in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", MANUAL):
+        assert any(f"docs/{target}".startswith(source) and target.startswith(place) for source, place in copied), target
+
+
+@pytest.mark.parametrize("path", PICTURES, ids=lambda p: p.name)
+def test_pictures_stand_alone(path: Path):
+    """Each is SVG with a title and a description, and asks for nothing outside of it."""
+    root = ET.parse(path).getroot()
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    assert [child.tag.rpartition("}")[2] for child in root][:2] == ["title", "desc"]
+    assert all(child.text for child in root[:2])
+    for element in root.iter():
+        assert element.tag.rpartition("}")[2] not in ("script", "image", "foreignObject", "use")
+        values = [*element.attrib.values(), element.text or ""]
+        assert not any("href" in key for key in element.attrib)
+        assert all("@import" not in value for value in values)
+        assert all(m == "#" for value in values for m in re.findall(r"url\(['\"]?(.)", value))
+
+
+def test_any_terminal_shows_it():
+    """ASCII alone; drawings fit into 80 columns; the sections are those that its first page lists."""
+    assert MANUAL.isascii()
+    assert CHANGES.isascii()
+    drawn = re.findall(r"(?m)^.*[_~]{4}.*$|^.*={4}.*$", MANUAL)
+    assert len(drawn) >= 30
+    assert max(map(len, drawn)) <= 80
+    listed = re.findall(r"(?m)^\d+\. (.+)$", MANUAL.partition("\n## ")[0])
+    assert listed == [*SECTIONS]
+
+
+def verdict(sweep: int, what: Status, label: str = "", probability: float = 0.0, **more: Any) -> Verdict:
+    """An answer, 1 ms after its sweep."""
+    about = {"time_ns": 0, "margin": 0.9, "scores": np.empty(0), "fused": 1, "lost": 0, "latency_ns": 1_000_000} | more
+    return Verdict(sweep=sweep, status=what, label=label, probability=probability, bundle="d5b2b6ef", **about)
+
+
+def test_samples_are_what_the_box_prints():
+    """Lines of the journal, of `palpate status` and of `palpate bundles`, from the code that prints them."""
+    told = [journal.words(verdict(1, Status.OK, "wood", 0.991)), journal.words(verdict(8, Status.SENSOR_LOST))]
+    health = {
+        "time_ns": 0, "skin": "streaming", "trouble": "", "streams": True, "sweeping": False, "answered": 1,
+        "frames": 54006, "lost_frames": 0, "garbage_bytes": 0, "enumerations": 1, "dropped": 0, "bundle": "d5b2b6ef",
+        "source": "usb",
+    }  # fmt: skip
+    now_ns = 72_000_000_000
+    file = {
+        **health, "running": True, "why": "", "pid": 712, "version": __version__, "since_ns": 0,
+        "model": "default 2, 6 labels",
+        "verdicts": [status.plain(verdict(1, Status.OK, "wood", 0.991, time_ns=now_ns - 9_000_000_000))],
+    }  # fmt: skip
+    told += status.lines(file, now_ns)
+    detail = "start 1 of 3, 7 of 20 sweeps, 41 of 600 s, as of its last start or end"
+    told += bundle_list.lines([
+        bundle_list.Entry("9" * 64, "9f3c2a1b", "mine", "2", 2, "anna", "on trial", detail),
+        bundle_list.Entry("5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""),
+        bundle_list.Entry("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
+    ])  # fmt: skip
+    assert [line for line in told if line not in BLOCKS] == []
+
+
+def test_the_trial_is_told_as_it_is():
+    """How many starts, sweeps and seconds: the ledger's and the settings' defaults."""
+    how = config.StoreConfig()
+    text = SECTIONS["Record, train, sign, deliver"]
+    assert f"`store.probation_sweeps` ({how.probation_sweeps})" in text.replace("\n", " ")
+    assert f"`store.probation_s` ({how.probation_s:.0f} s)" in text.replace("\n", " ")
+    assert f" {state.MOST_STARTS} starts " in text.replace("\n", " ")
+
+
+def test_the_change_log_knows_this_version():
+    """Versions go down, the newest is this one, each with what was added, changed or fixed."""
+    heads = re.findall(r"(?m)^## (\d+\.\d+\.\d+)", CHANGES)
+    assert heads[0] == __version__
+    assert heads == sorted(heads, key=lambda v: [*map(int, v.split("."))], reverse=True)
+    for part in re.split(r"(?m)^## ", CHANGES)[1:]:
+        assert set(re.findall(r"(?m)^### (.*)", part)) <= {"Added", "Changed", "Fixed", "Removed"}
+        assert "### Added" in part

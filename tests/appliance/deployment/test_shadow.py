@@ -1,0 +1,351 @@
+"""The room of the shadow: what a candidate says beside the bundle in service, and that the robot notices nothing of it."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle
+from appliance.bundle.manifest import Early
+from appliance.core import statistics, storage, types
+from appliance.core.errors import ApplianceError, BundleError
+from appliance.core.health import Health
+from appliance.core.types import Status, Sweep
+from appliance.deployment import shadow
+from appliance.deployment.shadow import Shadow
+from appliance.inference.classifier import Classifier
+from appliance.sim import rig, skin
+from tests.factories import toy_bundle
+from tests.factories.simulated_box import SECOND, Rigged
+
+IDLE = Health(0, "streaming", "", True, False, 0, 0, 0, 0, 1, 0, "", "sim")
+SWEEPING = replace(IDLE, sweeping=True)
+
+
+class Side:
+    """A current bundle and a candidate beside it, without a box."""
+
+    def __init__(self, current: Bundle, candidate: Bundle, folder: Path, **how: Any) -> None:
+        self.clock, self.folder, self.log = rig.VirtualClock(), folder, []
+        self.tare = np.zeros((current.format.rows, current.format.cols))
+        self.current = Classifier(current, self.clock, **how)
+        self.shadow = Shadow(
+            candidate, current, folder, self.clock, judge=lambda b: Classifier(b, self.clock, **how),
+            circumstances=lambda: {"tare": self.tare.tolist()}, log=self.log.append,
+        )  # fmt: skip
+
+    def judge(self, *sweeps: Sweep) -> None:
+        """Have both judge, each sweep with the end of its turn."""
+        for one in sweeps:
+            self.shadow(one, self.current(one))
+            self.turn()
+
+    def turn(self, health: Health = IDLE, n: int = 2) -> None:
+        """Take turns."""
+        for _ in range(n):
+            self.shadow.turn(health)
+
+    def written(self) -> shadow.Agreement:
+        """What lies on the disk."""
+        found = shadow.read(self.folder)
+        assert found
+        return found
+
+    def kept(self) -> list[Path]:
+        """The sweeps that were kept."""
+        return sorted(self.folder.glob("*.npy"))
+
+
+def renamed(old: Bundle, name: str = "aaaaaaaa") -> Bundle:
+    """The same bundle with its labels in another order, so that it names every material wrongly."""
+    return replace(
+        old, id=name, manifest=replace(old.manifest, labels=(*old.manifest.labels[1:], old.manifest.labels[0]))
+    )
+
+
+@pytest.fixture
+def side(tmp_path: Path) -> Callable[..., Side]:
+    """Makes a toy bundle with a candidate beside it: the same one, or what `change` makes of it."""
+
+    def make(change: Callable[[Bundle], Bundle] = lambda b: replace(b, id="bbbbbbbb"), **how: Any) -> Side:
+        current = toy_bundle.load(tmp_path / "toy", known=None)
+        return Side(current, change(current), tmp_path / "shadow", **how)
+
+    return make
+
+
+A, B = toy_bundle.sweep(0, 0), toy_bundle.sweep(6, 0, 2)
+
+
+def test_two_that_agree_are_counted_and_nothing_is_kept(side):
+    """Written after a minute and at the end, not with each sweep; in words with a Wilson interval."""
+    pair = side()
+    pair.judge(A, B)
+    assert pair.written().compared == 0
+    pair.clock.sleep_until(pair.clock.now_ns() + 61 * SECOND)
+    pair.turn()
+    assert (pair.written().compared, pair.written().agreed) == (2, 2)
+    pair.judge(toy_bundle.sweep(0, 0, 3))
+    pair.shadow.stopping()
+    assert pair.written().pairs == {"a": {"a": 2}, "b": {"b": 1}}
+    assert pair.kept() == []
+    assert "bbbbbbbb agrees with" in pair.written().text
+    assert "on 3 of 3 sweeps [43.9 to 100.0 %]" in pair.written().text
+
+
+def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
+    """At the end of its turn sweep and counts are on the disk; the sweep gives both verdicts again, bit for bit."""
+    pair = side(renamed)
+    pair.judge(A)
+    (path,) = pair.kept()
+    again, fmt = types.load(path)
+    told = types.sidecar(path)
+    assert (told["verdict"]["label"], told["candidate"]["label"]) == ("a", "b")
+    assert fmt == toy_bundle.FORMAT
+    for name, run in (("verdict", pair.current), ("candidate", pair.shadow._run)):
+        assert run(again).scores.tolist() == told[name]["scores"]
+    written = pair.written()
+    assert (written.compared, written.agreed, written.kept, written.pairs) == (1, 0, 1, {"a": {"b": 1}})
+    assert written.lines(pair.folder)[1:] == ["  a -> b: 1", f"  1 of these are kept in {pair.folder}"]
+
+
+def test_another_status_is_another_answer(side):
+    """The same label, but the robot is told to sweep once more: that is a difference."""
+    pair = side(
+        lambda b: replace(b, manifest=replace(b.manifest, thresholds=replace(toy_bundle.LIMITS, unsure=0.9999999)))
+    )
+    pair.judge(toy_bundle.sweep(2.5, 0))
+    assert pair.written().pairs == {"a": {"(unsure) a": 1}}
+
+
+def test_nothing_is_written_while_a_sweep_is_open(side):
+    """Only counted then; with the sweep over, one thing a turn."""
+    pair = side(renamed)
+    for one in (A, B):
+        pair.shadow(one, pair.current(one))
+    pair.turn(SWEEPING, 10)
+    assert (pair.kept(), pair.written().compared) == ([], 0)
+    for kept, compared in ((1, 0), (2, 0), (2, 2)):
+        pair.turn(n=1)
+        assert (len(pair.kept()), pair.written().compared) == (kept, compared)
+
+
+def test_no_more_are_kept_than_its_limit(side, monkeypatch: pytest.MonkeyPatch):
+    """A candidate that is always wrong fills no disk; the counts go on."""
+    monkeypatch.setattr(shadow, "KEPT", 2)
+    pair = side(renamed)
+    pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 6)))
+    assert (len(pair.kept()), pair.written().kept, pair.written().compared) == (2, 2, 5)
+
+
+def test_it_fuses_by_the_same_rule(side):
+    """Sweeps of one object are fused by the candidate, too: neither asks for a third one."""
+    pair = side(sure=0.9)
+    pair.judge(
+        toy_bundle.sweep(2.5, 0, 1, object=1),
+        toy_bundle.sweep(2.5, 0, 2, object=1),
+        toy_bundle.sweep(2.5, 0, 3, object=1),
+    )
+    told = pair.shadow.agreement.pairs
+    assert told == {"(unsure) a": {"(unsure) a": 1}, "a": {"a": 2}}
+
+
+def test_it_judges_with_the_box_s_tare(side):
+    """What the robot has tared away is no contact for the candidate either."""
+    pair = side()
+    pair.tare = np.full((2, 2), 1e4)
+    pair.current.tare = pair.tare
+    pair.judge(A)
+    assert pair.shadow.agreement.pairs == {"(no-contact)": {"(no-contact)": 1}}
+
+
+def test_what_has_no_window_is_not_compared(side):
+    """A sweep that the recorder refused says nothing about a bundle."""
+    pair = side()
+    pair.judge(replace(A, status=Status.SHORT, frames=types.Frames.empty(toy_bundle.FORMAT)))
+    assert pair.shadow.agreement.compared == 0
+
+
+def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Path):
+    """One that has no heads for it, or would wait for more, is not compared but counted."""
+    files = {"outputs": ("logits", "early"), "known": None}
+    eager, slow = (
+        toy_bundle.load(tmp_path / name, early=Early((least,) * 3, 1), **files)
+        for name, least in (("eager", 0.5), ("slow", 2.0))
+    )
+    plain = toy_bundle.load(tmp_path / "plain", known=None)
+    half = replace(A, share=0.5, frames=types.Frames(*(v[:10] for v in (A.frames.t_ns, A.frames.seq, A.frames.taxels))))
+    for candidate, counts in ((replace(eager, id="e"), (1, 1, 0)), (slow, (0, 0, 1)), (plain, (0, 0, 1))):
+        pair = Side(eager, candidate, tmp_path / f"shadow-{candidate.id}")
+        verdict = shadow.Decider(pair.current)(half)
+        assert verdict
+        pair.shadow(half, verdict)
+        found = pair.shadow.agreement
+        assert (found.compared, found.agreed, found.later) == counts
+
+
+class Broken:
+    """A candidate whose model fails on some sweeps, as onnxruntime does: with an exception of its own."""
+
+    def __init__(self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]) -> None:
+        self.bundle, self.self_test, self._run, self._fails, self._act = run.bundle, run.self_test, run, fails, act
+
+    def __call__(self, one: Sweep):
+        """Fail, or judge."""
+        if self._fails(one):
+            self._act()
+        return self._run(one)
+
+
+def strange() -> None:
+    """What onnxruntime raises shares no base but Exception."""
+    raise type("Fail", (Exception,), {})("[ONNXRuntimeError] : 1 : FAIL : no")
+
+
+def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side):
+    """Three failures in a row: told once, not asked any more; a success between begins the row anew."""
+    pair = side()
+    pair.shadow._run = Broken(pair.shadow._run, lambda s: s.id != 3, strange)
+    pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 10)))
+    found = pair.shadow.agreement
+    assert (found.compared, found.failed) == (1, 5)
+    assert len(pair.log) == 1
+    assert "failed 3 times in a row: [ONNXRuntimeError]" in pair.log[0]
+    pair.turn()
+    pair.clock.sleep_until(pair.clock.now_ns() + 61 * SECOND)
+    pair.turn()
+    assert pair.written().failed == 5
+
+
+def test_a_candidate_that_is_too_slow_has_failed(side):
+    """A tenth of a second is the most that frames may wait."""
+    pair = side()
+    slow = lambda: pair.clock.sleep_until(pair.clock.now_ns() + SECOND // 5)  # noqa: E731
+    pair.shadow._run = Broken(pair.shadow._run, lambda s: True, slow)
+    pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
+    assert (pair.shadow.agreement.compared, pair.shadow.agreement.failed) == (0, 3)
+    assert "it computed 200 ms for a sweep, 100 are allowed" in pair.log[0]
+
+
+def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path: Path):
+    """The same pair goes on; another candidate, or another current bundle, takes the old counts and sweeps away."""
+    pair = side(renamed)
+    pair.judge(A)
+    pair.shadow.stopping()
+    pair = side(renamed)
+    pair.judge(A)
+    assert (pair.written().compared, len(pair.kept())) == (2, 2)
+    pair.shadow.stopping()
+    pair = side(lambda b: renamed(b, "cccccccc"))
+    assert (pair.written().candidate, pair.written().compared, pair.kept()) == ("cccccccc", 0, [])
+    pair.judge(A)
+    pair.shadow.stopping()
+    other = replace(toy_bundle.load(tmp_path / "toy", known=None), id="dddddddd")
+    pair = Side(other, renamed(other, "cccccccc"), pair.folder)
+    assert (pair.written().current, pair.written().compared, pair.kept()) == ("dddddddd", 0, [])
+
+
+def test_a_candidate_that_kills_the_program_stays_away(side):
+    """Three starts without an end in order, none a minute old: no fourth; an end in order, or a minute, forgives them."""
+
+    def start(judged_s: float) -> Shadow:
+        pair = side()
+        pair.clock.sleep_until(pair.clock.now_ns() + round(judged_s * SECOND))
+        pair.judge(A)
+        return pair.shadow
+
+    for _ in range(2):
+        for lived_s in (1, 1, 61):
+            start(lived_s)._sweeps.close()  # what the death of the program does to its lock
+        for _ in range(2):
+            start(1)._sweeps.close()
+        start(1).stopping()
+    for _ in range(3):
+        start(1)._sweeps.close()
+    for _ in range(2):
+        with pytest.raises(ApplianceError, match=r"died 3 times.*agreement\.json"):
+            start(1)
+
+
+def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatch):
+    """Told once; verdicts go on being compared."""
+    pair = side(renamed)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(storage, "put_all", full)
+    pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
+    pair.shadow.stopping()
+    assert pair.shadow.agreement.compared == 4
+    assert [line.split(": ")[2] for line in pair.log] == [
+        "No space left on device; make room there; classifying goes on"
+    ]
+
+
+def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
+    """Another format, golden sweeps that come out otherwise, a folder that is a file: each an error, with what to try."""
+    with pytest.raises(BundleError, match="wants 4x4 uint8"):
+        side(lambda b: default_bundle)
+    with pytest.raises(BundleError, match="golden sweeps"):
+        side(lambda b: replace(b, golden_logits=b.golden_logits[:, ::-1].copy()))
+    assert shadow.read(tmp_path / "shadow").starts == 0  # refused is not died
+    shutil.rmtree(tmp_path / "shadow")
+    (tmp_path / "shadow").write_text("")
+    with pytest.raises(ApplianceError, match="see that it has room"):
+        side()
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"candidate": "x"}', '{"candidate": "x", "current": "y", "schema": 2}'])
+def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str):
+    """It is named in the log, and the counts begin with this start."""
+    (tmp_path / "shadow").mkdir()
+    (tmp_path / "shadow" / shadow.FILE).write_text(text)
+    pair = side()
+    assert "cannot be read" in pair.log[0]
+    assert pair.written().starts == 1
+
+
+def test_the_interval_is_wilson_s():
+    """As scipy has it."""
+    stats = pytest.importorskip("scipy.stats", reason="scipy comes with the desktop's tools (make test)")
+    for k, n in ((0, 1), (118, 120), (7, 9), (20, 20)):
+        want = stats.binomtest(k, n).proportion_ci(method="wilson")
+        assert statistics.wilson(k, n) == pytest.approx((want.low, want.high), abs=1e-6)
+
+
+def test_the_robot_notices_nothing(rigged, default_bundle: Bundle, tmp_path: Path):
+    """On the rig, with a candidate that is always wrong: the same sentences, and each sweep kept."""
+    heard = []
+    for beside in (False, True):
+        clock = rig.VirtualClock()
+        made: list[Rigged] = []
+        ghost = Shadow(
+            renamed(default_bundle), default_bundle, tmp_path / "shadow", clock,
+            judge=lambda b, clock=clock: Classifier(b, clock),
+            circumstances=lambda made=made: made[0].box.circumstances(), log=print,
+        )  # fmt: skip
+        made.append(rigged(keepers=[ghost] if beside else [], pulses=[ghost] if beside else []))
+        verdicts = made[0].until(lambda made=made: made[0].box.answered >= 3)
+        heard.append([line for line in made[0].heard if ",RES," in line])
+        ghost.stopping()
+    assert heard[0] == heard[1]
+    assert len(heard[0]) == 3
+    named = {v.label for v in verdicts}
+    found = shadow.read(tmp_path / "shadow")
+    assert found
+    assert (found.compared, found.agreed, set(found.pairs)) == (3, 0, named)
+    kept = sorted((tmp_path / "shadow").glob("*.npy"))
+    assert [types.load(path)[1] for path in kept] == [skin.FORMAT] * 3
+    about = json.loads(kept[0].with_suffix(".json").read_text())
+    assert about["candidate"]["bundle"] == "aaaaaaaa"
+    assert about["bundle"] == default_bundle.id == bundle.load(bundle.DEFAULT).id

@@ -1,0 +1,156 @@
+"""Signatures: whom a box believes, and what it says where it does not or cannot tell."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from appliance.bundle import bundle
+from appliance.bundle.manifest import Manifest
+from appliance.core.errors import BundleError, ConfigError
+from appliance.deployment import signature
+from tests.factories import deliveries
+from tests.factories.deliveries import SIGNER, line
+from train.export import sign
+
+pytestmark = deliveries.NEEDED
+MESSAGE = b'{"name": "any manifest"}\n'
+
+
+class Signers:
+    """Two keys, and a file that believes the first."""
+
+    def __init__(self, folder: Path) -> None:
+        self.ours, self.theirs = deliveries.key(folder, "ours"), deliveries.key(folder, "theirs")
+        self.file = folder / "allowed_signers"
+        self.write(line(self.ours))
+
+    def write(self, *lines: str) -> None:
+        """Have the file hold these lines."""
+        self.file.write_text("".join(lines))
+
+    def verify(self, signed: bytes | None = None, message: bytes = MESSAGE) -> str:
+        """Who signed; by default our key."""
+        return signature.verify(message, signed or signature.sign(MESSAGE, self.ours), self.file)
+
+
+@pytest.fixture
+def signers(tmp_path: Path) -> Signers:
+    """Two keys, and a file that believes the first."""
+    return Signers(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["ed25519", "rsa", "ecdsa"])
+def test_a_signer_is_named(tmp_path: Path, kind: str):
+    """Of several, in a file with comments, empty lines and the namespace in an option."""
+    own, other = deliveries.key(tmp_path, "own", kind), deliveries.key(tmp_path, "other")
+    file = tmp_path / "signers"
+    file.write_text("# who may\n\n" + line(other, "ben") + line(own, "anna", 'namespaces="git,palpate-bundle" '))
+    assert signature.verify(MESSAGE, signature.sign(MESSAGE, own), file) == "anna"
+    assert signature.verify(MESSAGE, signature.sign(MESSAGE, other), file) == "ben"
+
+
+def test_what_is_not_signed_by_one_who_is_believed_is_refused(signers: Signers):
+    """Another's key, another namespace, another message, cut, empty or huge: each with its reason."""
+    good = signature.sign(MESSAGE, signers.ours)
+    other = subprocess.run(
+        ["ssh-keygen", "-q", "-Y", "sign", "-n", "git", "-f", signers.ours], input=MESSAGE, stdout=-1, check=True
+    )
+    for signed, message, why in (
+        (signature.sign(MESSAGE, signers.theirs), MESSAGE, "signed by none of those in .*No principal matched"),
+        (other.stdout, MESSAGE, f"signature of {SIGNER} does not fit .*namespace does not match"),
+        (good, MESSAGE + b" ", f"signature of {SIGNER} does not fit .*incorrect signature"),
+        (good[:100], MESSAGE, "signed by none"),
+        (b"", MESSAGE, "signed by none"),
+        (good + b"\n" * signature.MOST_SIGNATURE, MESSAGE, "more than 16384 bytes"),
+    ):
+        with pytest.raises(BundleError, match=why):
+            signature.verify(message, signed, signers.file)
+    assert signers.verify(good) == SIGNER
+
+
+def test_a_key_for_something_else_is_not_believed(signers: Signers):
+    """The option `namespaces` of the file of signers is kept to."""
+    signers.write(line(signers.ours, SIGNER, 'namespaces="git" '))
+    with pytest.raises(BundleError, match="not permitted for use in signature namespace"):
+        signers.verify()
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "names nobody"),
+        ("# nobody\n\n", "names nobody"),
+        ("anna valid-before=20300101 {key}", "line 1: valid-before is not used here, a box may not know the time"),
+        ('{line}anna namespaces="git",Valid-After="20200101" {key}', "line 2: Valid-After is not used here"),
+        ("anna cert-authority {key}", "cert-authority is not used here"),
+        ("*@lab {key}", "line 1: it is not understood"),
+        ("anna,ben {key}", "line 1: it is not understood"),
+        ("{key}", "line 1: it is not understood"),
+        ("anna ssh-ed25519 AAAA", "line 1: it is not understood"),
+        ("anna ssh-ed25519 !", "line 1: it is not understood"),
+        ("anna ssh-dss {blob}", "line 1: it is not understood"),
+        ("anna ssh-rsa {blob}", "line 1: it is not understood"),
+        ("# anna\u2028ben {key}", "names nobody"),
+        ("anna\u00a0{key}", "line 1: it is not understood"),
+        ("{line}anna ssh-ed25519 {blob}\r\n", "line 2: it is not understood"),
+        ("anna no-such-option {key}", "line 1: it is not understood"),
+        ("\udcff\n", "cannot be read"),
+        ("#" * 300_000, "more than 262144 bytes"),
+    ],
+)
+def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(signers: Signers, text: str, why: str):
+    """What ssh-keygen would pass over in silence, or would want the time for, is named with its line."""
+    key = line(signers.ours).removeprefix(f"{SIGNER} ")
+    text = text.replace("{key}", key).replace("{line}", line(signers.ours)).replace("{blob}", key.split()[1])
+    signers.file.write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(ConfigError, match=why):
+        signers.verify()
+
+
+def test_a_missing_file_of_signers_is_named(signers: Signers):
+    """And what belongs there."""
+    signers.file.unlink()
+    with pytest.raises(ConfigError, match=r"No such file.*put a line `NAME KEY` there"):
+        signers.verify()
+
+
+def test_a_box_without_ssh_keygen_says_what_to_install(signers: Signers, monkeypatch: pytest.MonkeyPatch):
+    """And one whose ssh-keygen hangs does not hang with it."""
+    good = signature.sign(MESSAGE, signers.ours)
+    monkeypatch.setenv("PATH", str(signers.file.parent))
+    with pytest.raises(ConfigError, match="apt install openssh-client"):
+        signers.verify(good)
+    program = signers.file.parent / "ssh-keygen"
+    program.write_text("#!/bin/sh\nexec /bin/sleep 60\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(signature, "DEADLINE_S", 0.1)
+    with pytest.raises(ConfigError, match=r"timed out after 0\.1 s"):
+        signers.verify(good)
+
+
+def test_a_key_that_cannot_sign_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """A file that is none."""
+    with pytest.raises(ConfigError, match="none does not sign"):
+        signature.sign(MESSAGE, tmp_path / "none")
+    assert "No such file" in capfd.readouterr().err
+
+
+def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.CaptureFixture[str]):
+    """`palpate-train sign` puts the counter into the manifest and the signature beside it; without a counter it refuses."""
+    folder = deliveries.put(tmp_path / "bundle", deliveries.files(0, None))
+    with pytest.raises(BundleError, match="counter 0, which no box takes"):
+        sign.sign(folder, signers.ours)
+    assert not (folder / bundle.SIGNATURE).exists()
+    for counter, again in ((7, 7), (8, None), (9, 9)):
+        made = sign.sign(folder, signers.ours, again)
+        text = (folder / bundle.MANIFEST).read_bytes()
+        assert Manifest.parse(text) == made
+        assert made.counter == (counter if again else 7)
+        assert signature.verify(text, (folder / bundle.SIGNATURE).read_bytes(), signers.file) == SIGNER
+    bundle.load(folder)
+    (folder / bundle.MODEL).write_bytes(b"altered")
+    with pytest.raises(BundleError, match="was altered"):
+        sign.sign(folder, signers.ours, 10)

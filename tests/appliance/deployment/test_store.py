@@ -1,0 +1,416 @@
+"""The store: what a box takes, what it runs, what it goes back to."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle
+from appliance.cli import bundle_list
+from appliance.core.config import StoreConfig
+from appliance.core.errors import ApplianceError, BundleError, ConfigError
+from appliance.deployment import store
+from appliance.deployment.state import MOST_STARTS, PACKAGED
+from tests.campaigns import flips
+from tests.factories import deliveries
+from tests.factories.deliveries import Delivery
+
+pytestmark = deliveries.NEEDED
+Ways = Callable[[Delivery], object]
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Delivery:
+    """A box that has seen no bundle yet."""
+    return Delivery(tmp_path)
+
+
+def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
+    """Nothing was deployed: no current bundle, nothing to commit, nothing to go back to, no store folder needed."""
+    assert box.start() == PACKAGED
+    assert not box.store.commit()
+    with pytest.raises(BundleError, match="no committed bundle to go back to"):
+        box.store.rollback()
+    nowhere = store.Store(StoreConfig(folder=str(box.folder / "none")), prove=lambda b: None)
+    assert nowhere.choose(box.logged.append).bundle.id == nowhere.running().id == bundle.load(bundle.DEFAULT).id
+    assert nowhere.candidate() is None
+
+
+def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery):
+    """Accept, start on trial, commit, the next one, commit, and back and forth between the two."""
+    one = box.accepted(1)
+    chosen = box.store.choose(box.logged.append)
+    assert chosen.trial
+    assert (chosen.folder.name, chosen.bundle.manifest.counter) == (one, 1)
+    assert box.logged == [f"bundle {one[:8]} is on trial, start 1 of 3"]
+    assert box.store.commit()
+    assert box.store.choose(box.logged.append).trial is None
+    two = box.committed(2)
+    assert box.start() == two
+    for back in (one, two, one):
+        assert box.store.rollback() == back
+        assert box.start() == back
+    assert len(box.logged) == 1
+
+
+def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
+    """What was packaged is what was before, in a trial and by hand, and by hand forward again."""
+    one = box.accepted(1)
+    assert box.store.rollback() == PACKAGED == box.start()
+    assert box.accepted(1) == one
+    box.store.commit()
+    assert box.store.rollback() == PACKAGED == box.start()
+    assert box.store.rollback() == one == box.start()
+
+
+def test_three_uncommitted_starts_go_back(box: Delivery):
+    """The fourth start runs what was committed before, says so in one line, and `bundles` says why."""
+    one, two = box.committed(1), box.accepted(2)
+    assert [box.start() for _ in range(MOST_STARTS)] == [two] * MOST_STARTS
+    box.logged.clear()
+    assert [box.start(), box.start()] == [one, one]
+    assert box.logged == [
+        f"<4>bundle {two[:8]} has failed its trial, and {one[:8]} runs again: it was started 3 times without being committed"
+    ]
+    told = {e.sha: e for e in bundle_list.entries(box.store)}
+    assert (told[two].role, told[two].detail) == ("left", "it was started 3 times without being committed")
+    assert told[one].role == "current"
+
+
+def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
+    """Not to the first trial, which nobody had committed."""
+    one, two, three = box.committed(1), box.accepted(2), box.accepted(3)
+    assert box.start() == three
+    assert box.store.rollback() == one
+    told = {e.sha: e.role for e in bundle_list.entries(box.store)}
+    assert told == {one: "current", two: "left", three: "left", PACKAGED: "previous"}
+    assert box.store.rollback() == PACKAGED
+
+
+def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
+    """What the committed bundle goes back to is still there, however many were tried in between."""
+    one, two = box.committed(1), box.committed(2)
+    box.accepted(3)
+    box.accepted(4)
+    assert [box.start() for _ in range(MOST_STARTS + 1)][-1] == two
+    assert box.store.rollback() == one == box.start()
+
+
+def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
+    """Committed once, left by hand, deployed again and failed: going back from the other one does not end there."""
+    one, two = box.committed(1), box.committed(2)
+    assert box.store.rollback() == one
+    assert box.accepted(2) == two
+    assert [box.start() for _ in range(MOST_STARTS + 1)][-1] == one
+    with pytest.raises(BundleError, match="no committed bundle to go back to"):
+        box.store.rollback()
+
+
+def test_deploying_again_what_runs_changes_nothing(box: Delivery):
+    """A committed bundle stays committed; one on trial gets its three starts anew."""
+    one = box.committed(1)
+    assert box.accepted(1) == one
+    assert box.store.ledger.of(one).committed
+    two = box.accepted(2)
+    box.start()
+    assert box.accepted(2) == two
+    assert (box.store.ledger.of(two).starts, box.store.ledger.of(two).previous) == (0, one)
+
+
+def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
+    """It is current and committed as before; what was on trial is left."""
+    one, two = box.committed(1), box.accepted(2)
+    assert box.accepted(1) == one
+    assert box.store.current == one
+    assert box.store.ledger.of(one).committed
+    assert not box.store.ledger.of(two).committed
+
+
+def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
+    """The counter must be above what was ever committed, also after going back; the newest itself may come again."""
+    one, two = box.committed(1), box.committed(2)
+    box.store.rollback()
+    for counter in (1, 2):
+        with pytest.raises(BundleError, match=f"counter {counter}, and 2 was committed here before"):
+            box.store.accept(box.made(counter, version="other"))
+    assert box.store.current == one
+    assert box.accepted(2) == two
+    assert box.start() == two
+
+
+def test_a_trial_does_not_raise_the_least_counter(box: Delivery):
+    """What was never committed may be replaced by one with a lower counter."""
+    box.committed(1)
+    box.accepted(9)
+    assert box.start() != box.accepted(2) == box.start()
+
+
+def alter(name: str) -> Ways:
+    """A way to alter a file of a bundle."""
+
+    def way(box: Delivery) -> Path:
+        folder = box.made(1)
+        data = bytearray((folder / name).read_bytes())
+        data[len(data) // 2] ^= 1
+        (folder / name).write_bytes(data)
+        return folder
+
+    return way
+
+
+def unsigned(box: Delivery) -> Path:
+    """A bundle without a signature."""
+    return deliveries.put(box.folder / "in", deliveries.files(1, None))
+
+
+def strange(box: Delivery) -> Path:
+    """A bundle signed with a key that nobody knows."""
+    return deliveries.put(box.folder / "in", deliveries.files(1, deliveries.key(box.folder / "theirs")))
+
+
+def linked(box: Delivery) -> Path:
+    """A bundle whose model is a link to the right one."""
+    folder = box.made(1)
+    (folder / bundle.MODEL).rename(box.folder / "model")
+    (folder / bundle.MODEL).symlink_to(box.folder / "model")
+    return folder
+
+
+def huge(box: Delivery) -> Path:
+    """A bundle whose model is a sparse file of 10 GB."""
+    folder = box.made(1)
+    os.truncate(folder / bundle.MODEL, 10 << 30)
+    return folder
+
+
+def piped(box: Delivery) -> Path:
+    """A bundle whose manifest is a pipe that nobody writes to."""
+    folder = box.made(1)
+    (folder / bundle.MANIFEST).unlink()
+    os.mkfifo(folder / bundle.MANIFEST)
+    return folder
+
+
+BAD: dict[str, tuple[Ways, str]] = {
+    "unsigned": (unsigned, "is not signed"),
+    "another's key": (strange, "signed by none of those in"),
+    "no bundle": (lambda box: box.folder, "no bundle at"),
+    "too new": (lambda box: box.made(1, runtime="99.0.0"), r"needs palpate 99\.0\.0"),
+    "never counted": (lambda box: box.made(0), "has counter 0"),
+    "model altered": (alter(bundle.MODEL), "was altered"),
+    "golden altered": (alter(bundle.GOLDEN), "was altered"),
+    "manifest altered": (alter(bundle.MANIFEST), "cannot be read|does not fit|must|is not"),
+    "signature altered": (alter(bundle.SIGNATURE), "signed by none|does not fit"),
+    "link": (linked, "cannot be read"),
+    "huge": (huge, "more than"),
+    "pipe": (piped, "no plain file"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
+    """Refused with its reason; the current bundle, the ledger and the folder of bundles are as before."""
+    one = PACKAGED if name == "never counted" else box.committed(1)  # which is also below that one
+    before = box.store.ledger
+    make, why = BAD[name]
+    with pytest.raises(BundleError, match=why):
+        box.store.accept(make(box))
+    assert (box.store.current, box.store.ledger) == (one, before)
+    assert [p.name for p in box.store.shelf.folder.glob("*")] == [one] * bool(one)
+
+
+def test_what_else_lies_there_is_not_taken(box: Delivery):
+    """A file that the manifest does not name stays where it is."""
+    folder = box.made(1)
+    (folder / "extra").write_bytes(b"x")
+    sha = box.store.accept(folder)
+    names = {bundle.MANIFEST, bundle.SIGNATURE, bundle.MODEL, bundle.GOLDEN, bundle.MEANS}
+    assert {p.name for p in box.store.shelf.at(sha).iterdir()} <= names
+
+
+def test_what_was_checked_is_what_is_written(box: Delivery):
+    """A folder whose owner changes it after the check: the bundle on the shelf is the one that was checked."""
+    folder = box.made(1)
+
+    def change(held: Bundle) -> None:
+        for path in folder.iterdir():
+            path.write_bytes(b"changed")
+
+    changing = store.Store(box.how, change)
+    sha = changing.accept(folder)
+    assert box.store.shelf.get(sha).sha == sha
+
+
+@pytest.mark.parametrize(
+    ("does", "why"),
+    [
+        (lambda b: os.kill(os.getpid(), signal.SIGKILL), "killed the process that tried it .SIGKILL"),
+        (lambda b: bytearray(1 << 30), "asks for more than 256 MB"),
+        (lambda b: [][0], "cannot be run: IndexError"),
+    ],
+    ids=["dies", "asks for memory", "raises"],
+)
+def test_a_model_that_kills_its_runtime_is_refused(tmp_path: Path, does: Callable[[Bundle], object], why: str):
+    """It is tried apart: this process lives on, and says what the other one died of."""
+    box = Delivery(tmp_path, does)
+    with pytest.raises(BundleError, match=why):
+        box.accepted(1)
+    assert box.store.current == PACKAGED
+
+
+def test_a_model_that_hangs_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The deadline ends it."""
+    monkeypatch.setattr("appliance.deployment.sandbox.DEADLINE_S", 0.2)
+
+    def hang(held: Bundle) -> None:
+        while True:
+            pass
+
+    with pytest.raises(BundleError, match=r"not run within 0\.2 s"):
+        Delivery(tmp_path, hang).accepted(1)
+
+
+def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: Delivery):
+    """Its files have rotted, or the golden sweeps differ, or it does not fit the settings: what was before runs."""
+    one = box.committed(1)
+    two = box.accepted(2)
+    (box.store.shelf.at(two) / bundle.MODEL).write_bytes(b"rotten")
+    assert box.start() == one
+    assert "was altered" in box.logged[-1]
+    for counter, error in ((3, BundleError("golden sweeps differ")), (4, ConfigError("no early heads"))):
+
+        def prove(held: Bundle, error: Exception = error) -> None:
+            raise error
+
+        box.accepted(counter)
+        assert store.Store(box.how, prove).choose(box.logged.append).folder.name == one
+        assert str(error) in box.logged[-1]
+
+
+def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
+    """Nothing is guessed: the error names the way back, and that way works."""
+    one, two = box.committed(1), box.committed(2)
+    shutil.rmtree(box.store.shelf.at(two))
+    with pytest.raises(BundleError, match="committed; `palpate rollback` goes back"):
+        box.start()
+    assert box.store.rollback() == one == box.start()
+
+
+def test_another_bundle_in_a_bundles_place_is_refused(box: Delivery):
+    """Whole and signed as it is, it is not the one that the link names."""
+    one, two = box.committed(1), box.committed(2)
+    shutil.rmtree(box.store.shelf.at(two))
+    shutil.copytree(box.store.shelf.at(one), box.store.shelf.at(two))
+    with pytest.raises(BundleError, match="holds another bundle"):
+        box.start()
+
+
+def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
+    """Also the current one: its folder is exchanged for a whole one."""
+    one = box.committed(1)
+    (box.store.shelf.at(one) / bundle.MODEL).write_bytes(b"rotten")
+    assert [e.role for e in bundle_list.entries(box.store)] == ["previous", "damaged"]
+    assert box.accepted(1) == one == box.start()
+    assert os.listdir(box.store.shelf.folder) == [one]
+
+
+def test_leftovers_and_old_bundles_go_at_the_next_accept(box: Delivery):
+    """What an interruption left, and bundles that nothing goes back to."""
+    shas = [box.committed(n) for n in range(1, 5)]
+    left = box.store.shelf.folder / f".{shas[0]}-abc"
+    left.mkdir()
+    (left / "model.onnx").write_bytes(b"half")
+    five = box.accepted(5)
+    assert set(os.listdir(box.store.shelf.folder)) == {five, *shas[2:]} == set(box.store.ledger.standings)
+    assert box.store.rollback() == shas[3]
+    assert box.store.rollback() == shas[2]
+
+
+def test_a_candidate_waits_and_is_promoted(box: Delivery):
+    """It changes nothing about what runs; promoted it is on trial."""
+    one = box.committed(1)
+    two = box.store.accept(box.made(2), shadow=True)
+    assert box.start() == one
+    candidate = box.store.candidate()
+    assert candidate
+    assert candidate.id == two[:8]
+    assert [(e.role, e.sha) for e in bundle_list.entries(box.store)][-1] == ("candidate", two)
+    assert box.store.promote() == two == box.start()
+    assert box.store.candidate() is None
+    with pytest.raises(BundleError, match="no candidate"):
+        box.store.promote()
+    assert box.store.rollback() == one
+    box.store.accept(box.made(3), shadow=True)
+    box.committed(4)
+    with pytest.raises(BundleError, match="counter 3, and 4 was committed"):
+        box.store.promote()
+
+
+def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
+    """Another one is waited for, not for ever; and nobody but the folder's owner changes it."""
+    monkeypatch.setattr(store, "LOCK_S", 0.1)
+    box.accepted(1)
+    with box.store._held(), pytest.raises(ApplianceError, match="in use by another command"):
+        store.Store(box.how, lambda b: None).commit(wait_s=0.1)
+    monkeypatch.setattr(os, "geteuid", lambda: 4711)
+    with pytest.raises(ConfigError, match="do this as that user"):
+        box.store.commit()
+
+
+def test_a_disk_that_takes_no_note_runs_what_was_committed(box: Delivery, monkeypatch: pytest.MonkeyPatch):
+    """A start that cannot be counted is none of a bundle on trial: a loop of crashes could not be told."""
+
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    for committed in (lambda: PACKAGED, lambda: box.committed(1)):
+        before, tried = committed(), box.accepted(2)
+        with monkeypatch.context() as patch:
+            patch.setattr("appliance.core.storage.put", full)
+            assert box.start() == before
+            assert "No space left on device, so no bundle can be on trial" in box.logged[-1]
+        assert box.start() == tried
+        box.store.rollback()
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"standings": {}, "floor": 1}', '{"standings": {"": {"starts": "many"}}}']
+)
+def test_a_ledger_that_cannot_be_read_is_named(box: Delivery, text: str):
+    """What it said is not guessed."""
+    box.accepted(1)
+    Path(box.how.folder, "ledger.json").write_text(text)
+    with pytest.raises(BundleError, match=r"ledger\.json cannot be read"):
+        box.start()
+
+
+def test_a_link_out_of_the_store_is_refused(box: Delivery):
+    """Somebody has set it by hand."""
+    Path(box.how.folder, "current").symlink_to("/etc")
+    with pytest.raises(BundleError, match="leads to '/etc'"):
+        box.start()
+
+
+def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
+    """One line a bundle: role, id, name, counter, signer, trial."""
+    one, two = box.committed(1), box.store.accept(box.made(2, name="tubes", version="7"))
+    box.start()
+    lines = bundle_list.lines(bundle_list.entries(box.store))
+    assert [line.split()[0] for line in lines] == ["role", "on", "previous", "kept"]
+    assert f"on trial  {two[:8]}  tubes 7" in lines[1]
+    assert "2        anna@lab   start 1 of 3, 0 of 5 sweeps, 0 of 600 s" in lines[1]
+    assert one[:8] in lines[2]
+
+
+def test_no_altered_bundle_is_accepted(tmp_path: Path):
+    """A sample of `make flips`: bits of each file, files swapped with another signed bundle's, cut, unsigned, older."""
+    found = flips.campaign(tmp_path, 50, seed=2)
+    assert found[flips.FLIPPED]["tried"] == 50
+    assert len(found) >= 14
+    assert not any(count["accepted"] or count["believed"] or count["changed"] for count in found.values())

@@ -1,0 +1,250 @@
+"""A bundle on trial: which starts count, what ends the trial, and that no trouble with the disk ends the classifying."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.core.errors import ApplianceError, BundleError, LineError
+from appliance.core.health import Health
+from appliance.core.types import Status, Verdict
+from appliance.deployment.state import MOST_STARTS, Standing
+from appliance.deployment.trial import Trial
+from appliance.sim import devices, rig, script, skin
+from tests.factories import deliveries
+from tests.factories.deliveries import Delivery
+from tests.factories.simulated_box import Rigged, idle_world
+
+pytestmark = deliveries.NEEDED
+SECOND = 1_000_000_000
+
+
+def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
+    """How the box is at this time."""
+    return Health(
+        time_ns=round(time_s * SECOND), skin="streaming" if streams else "absent", trouble="", streams=streams,
+        sweeping=sweeping, answered=0, frames=0, lost_frames=0, garbage_bytes=0, enumerations=1, dropped=0,
+        bundle="", source="sim",
+    )  # fmt: skip
+
+
+def verdict(label: str = "Canvas") -> Verdict:
+    """An answer, by default with a label."""
+    status = Status.OK if label else Status.NO_CONTACT
+    return Verdict(1, 0, status, label, 1.0, 1.0, np.empty(0), 1, 0, 0, "", "")
+
+
+class Trying(Delivery):
+    """A box with bundle 1 committed and bundle 2 on trial. Its trial ends after 5 sweeps or 600 s."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.one, self.two = self.committed(1), self.accepted(2)
+
+    def tried(self) -> Trial:
+        """One more start: its trial."""
+        trial = self.store.choose(self.logged.append).trial
+        assert trial
+        return trial
+
+    @property
+    def standing(self) -> Standing:
+        """What the ledger says of the bundle on trial."""
+        return self.store.ledger.of(self.two)
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Trying:
+    """A box with a bundle on trial."""
+    return Trying(tmp_path)
+
+
+def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
+    """One that dies leaves its count behind; an orderly end takes it back, once."""
+    trial = box.tried()
+    assert box.standing.starts == 1
+    trial.stopping()
+    trial.stopping()
+    assert box.standing.starts == 0
+    for n in range(MOST_STARTS):
+        box.tried()
+        assert box.standing.starts == n + 1
+    assert box.start() == box.one
+
+
+def test_a_skin_that_is_unplugged_never_counts(box: Trying):
+    """However often the box is started without it; and once it streams, the start counts."""
+    for _ in range(3 * MOST_STARTS):
+        trial = box.tried()
+        assert box.standing.starts == 1
+        for t in range(5):
+            trial.turn(health(t, streams=False))
+        assert box.standing.starts == 0
+    trial.turn(health(5))
+    assert box.standing.starts == 1
+    trial.turn(health(6, streams=False))
+    assert box.standing.starts == 0
+
+
+def test_nothing_is_written_while_nothing_is_new(box: Trying):
+    """A turn comes each millisecond or so; the card has a file written only where a fact has changed."""
+    trial = box.tried()
+    trial.turn(health(0))
+    book = Path(box.how.folder, "ledger.json")
+    before = book.stat().st_mtime_ns, book.stat().st_ino
+    for t in range(100):
+        trial.turn(health(t))
+    assert before == (book.stat().st_mtime_ns, book.stat().st_ino)
+
+
+def test_enough_sweeps_commit(box: Trying):
+    """Those that got a label, and not while a sweep is open; from then on older bundles are refused."""
+    trial = box.tried()
+    for _ in range(box.how.probation_sweeps - 1):
+        trial.send(verdict())
+    for _ in range(10):
+        trial.send(verdict(label=""))
+    trial.turn(health(1))
+    assert trial.text == "on trial: 4 of 5 sweeps, 0 of 600 s"
+    trial.send(verdict())
+    trial.turn(health(2, sweeping=True))
+    assert not box.standing.committed
+    trial.turn(health(3))
+    assert box.standing.committed
+    assert box.logged[-1] == f"bundle {box.two[:8]} has stood its trial and is committed"
+    assert (box.store.ledger.counter, box.store.ledger.highest, trial.text) == (2, box.two, "")
+    trial.stopping()
+    trial.turn(health(4, streams=False))
+    assert box.store.ledger.of(box.two) == Standing(box.one, 2)
+    assert box.start() == box.two
+
+
+def test_enough_time_commits(box: Trying):
+    """Time during which the skin streamed, not the time between."""
+    trial = box.tried()
+    for t in range(0, 400):
+        trial.turn(health(t))
+    for t in range(400, 2000):
+        trial.turn(health(t, streams=False))
+    assert not box.standing.committed
+    for t in range(2000, 2201):
+        trial.turn(health(t))
+    assert not box.standing.committed
+    trial.turn(health(2202))
+    assert box.standing.committed
+
+
+def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
+    """A robot that is switched off each evening commits its bundle all the same; what dies has shown nothing."""
+    for n in range(2):
+        trial = box.tried()
+        trial.turn(health(0))
+        trial.turn(health(100))
+        trial.send(verdict())
+        trial.send(verdict())
+        trial.stopping()
+        assert (box.standing.sweeps, box.standing.streamed_s) == (2 * (n + 1), 100 * (n + 1))
+    dies = box.tried()
+    dies.send(verdict())
+    trial = box.tried()
+    assert trial.text == "on trial: 4 of 5 sweeps, 200 of 600 s"
+
+
+@pytest.mark.parametrize(
+    ("error", "counts"),
+    [(None, 0), (LineError("no chip"), 0), (KeyboardInterrupt(), 0), (BundleError("bad"), 1), (IndexError("bug"), 1)],
+    ids=repr,
+)
+def test_what_ends_the_program_decides_whether_the_start_counts(box: Trying, error: BaseException | None, counts: int):
+    """Missing hardware and a person do not; what may be the bundle's doing does."""
+    with suppress(type(error)), box.tried():
+        if error:
+            raise error
+    assert box.standing.starts == counts
+
+
+def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pytest.MonkeyPatch):
+    """Nothing raises; the commit comes when there is room again."""
+    trial = box.tried()
+    calls: list[float] = []
+
+    def full(path: Path, data: bytes) -> None:
+        calls.append(1)
+        raise OSError(28, "No space left on device", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("appliance.core.storage.put", full)
+        for t in range(100):
+            trial.turn(health(t / 10, streams=False))
+        assert len(calls) == 1
+        for _ in range(5):
+            trial.send(verdict())
+        for t in range(100, 200):
+            trial.turn(health(t / 10))
+        trial.stopping()
+    assert len(calls) == 3
+    assert box.logged[1:] == [
+        f"<4>trial of bundle {box.two[:8]}: the ledger cannot be written: No space left on device; it is tried again"
+    ]
+    trial.turn(health(30))
+    assert box.standing.committed
+
+
+def test_another_command_is_not_waited_for(box: Trying):
+    """The loop goes on; what was to be written is written later."""
+    trial = box.tried()
+    with box.store._held():
+        trial.turn(health(0, streams=False))
+    assert box.standing.starts == 1
+    assert "in use by another command" in box.logged[-1]
+    trial.turn(health(11, streams=False))
+    assert box.standing.starts == 0
+
+
+def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
+    """Another was deployed, or a person went back, while this one still runs."""
+    for way in (lambda: box.accepted(3), box.store.rollback):
+        trial = box.tried()
+        way()
+        for _ in range(5):
+            trial.send(verdict())
+        trial.turn(health(1))
+        assert trial.text == ""
+        assert not box.standing.committed
+        assert box.store.ledger.counter == 1
+        box.store.accept(box.made(2))
+
+
+def test_a_person_may_commit_while_it_runs(box: Trying):
+    """The program notes it and says nothing of it; its end changes nothing."""
+    trial = box.tried()
+    assert box.store.commit()
+    trial.turn(health(0, streams=False))
+    trial.stopping()
+    assert box.standing.committed
+    with pytest.raises(ApplianceError, match="counter 1"):
+        box.store.accept(box.made(1, version="x"))
+
+
+def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
+    """The whole way on the rig: five sweeps of the simulated robot, each with its answer."""
+    trial = box.tried()
+    world = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
+    running = rigged(world, model=bundle.load(box.store.shelf.at(box.two)), also=[trial], pulses=[trial])
+    running.until(lambda: running.box.answered >= 5 and not trial.text)
+    assert box.standing.committed
+
+
+def test_a_box_without_a_skin_takes_its_start_back(box: Trying, rigged: Callable[..., Rigged]):
+    """The whole way on the rig, with nothing on the bus."""
+    trial = box.tried()
+    world = idle_world()
+    world.backend.unplug()
+    running = rigged(world, model=bundle.load(box.store.shelf.at(box.two)), also=[trial], pulses=[trial])
+    running.seconds(1)
+    assert box.standing.starts == 0

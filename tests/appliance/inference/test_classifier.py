@@ -1,0 +1,603 @@
+"""Bundle and classifier: what is altered is refused, what is refused says why, and fusing is what the paper and Bayes say."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle, Early, Thresholds
+from appliance.bundle.manifest import SCHEMA
+from appliance.core.errors import BundleError
+from appliance.core.types import Frames, Status, Sweep
+from appliance.inference.classifier import Classifier, fuse, inspect, softmax
+from appliance.sim import skin
+from appliance.sim.rig import VirtualClock
+from tests.factories import toy_bundle
+
+LIMITS = Thresholds(contact=10, full_scale=255, saturated=0.01)
+BARE = np.zeros((4, 4))
+
+
+def moving(level: float = 80, shape: tuple[int, ...] = (300, 4, 4)) -> np.ndarray:
+    """A skin that is loaded everywhere and moves."""
+    return np.random.default_rng(0).integers(level - 5, level + 5, shape).astype(np.uint8)
+
+
+def sweep_of(taxels: np.ndarray, **more) -> Sweep:
+    """A sweep with this window."""
+    n = np.arange(len(taxels))
+    return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels), **more)
+
+
+def test_a_sound_window_passes():
+    """A loaded skin that moves is fine; so is one whose last row is off the tube."""
+    taxels = moving()
+    assert inspect(taxels, BARE, LIMITS).status is Status.OK
+    taxels[:, 3] = 0
+    assert inspect(taxels, BARE, LIMITS).status is Status.OK
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "status", "detail"),
+    [
+        (np.s_[:, :, :], 0, Status.NO_CONTACT, "0.0 digits"),
+        (np.s_[:, 1, 2], 90, Status.STUCK_TAXEL, "taxel 2.3"),
+        (np.s_[:, 1, 2], 0, Status.DEAD_TAXEL, "taxel 2.3"),
+        (np.s_[:, 0, 0], 0, Status.DEAD_TAXEL, "taxel 1.1"),
+        (np.s_[:, 0, 1], 255, Status.SATURATED, "taxel 1.2"),
+        (np.s_[:60, 2:, 2:], 255, Status.SATURATED, "taxel 3.3 3.4 4.3 4.4"),
+    ],
+)
+def test_a_spoiled_window_is_named(place, value: int, status: Status, detail: str):
+    """Each kind of trouble, and where it is (row.column from 1)."""
+    taxels = moving()
+    taxels[place] = value
+    found = inspect(taxels, BARE, LIMITS)
+    assert found.status is status
+    assert detail in found.detail
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_taxel_that_gives_no_number_is_dead(value: float):
+    """One frame of it is enough, at the edge too, and however many dead ones the bundle bears."""
+    taxels = moving().astype(np.float32)
+    taxels[150, 0, 3] = value
+    found = inspect(taxels, BARE, replace(LIMITS, dead_taxels=3))
+    assert (found.status, found.detail) == (Status.DEAD_TAXEL, "taxel 1.4")
+
+
+def test_a_bundle_that_bears_dead_taxels():
+    """As many dead taxels as the bundle allows are let through."""
+    taxels = moving()
+    taxels[:, 1, 2] = 0
+    assert inspect(taxels, BARE, replace(LIMITS, dead_taxels=1)).status is Status.OK
+
+
+def test_tare_counts():
+    """A load is what is above the tare."""
+    assert inspect(moving(80), np.full((4, 4), 75.0), LIMITS).status is Status.NO_CONTACT
+
+
+@given(st.integers(1, 40), st.integers(1, 5), st.integers(1, 5), st.integers(0, 255), st.integers(0, 2**32 - 1))
+def test_any_window_gets_a_status(n: int, rows: int, cols: int, spread: int, seed: int):
+    """Any digits of any shape, one frame long or constant: a status, never an error."""
+    taxels = np.random.default_rng(seed).integers(0, spread + 1, (n, rows, cols)).astype(np.uint8)
+    assert inspect(taxels, np.zeros((rows, cols)), LIMITS).status in Status
+
+
+def test_softmax_is_equation_10():
+    """The formula as printed, and no overflow."""
+    z = np.array([1.0, 2.0, -3.0])
+    assert softmax(z) == pytest.approx(np.exp(z) / np.exp(z).sum())
+    assert softmax(np.array([1e4, 0.0])).tolist() == [1.0, 0.0]
+
+
+def test_product_is_bayes():
+    """Two sweeps: the product of probabilities, normalized."""
+    a, b = np.array([0.6, 0.3, 0.1]), np.array([0.2, 0.7, 0.1])
+    assert fuse([a, b], "product") == pytest.approx(a * b / (a * b).sum())
+
+
+def test_no_sweep_can_veto():
+    """A sweep that is sure beyond all measure does not outweigh three that say otherwise."""
+    sure, other = np.array([1.0, 0.0]), np.array([1e-5, 1 - 1e-5])
+    assert fuse([sure, other, other, other], "product").argmax() == 1
+
+
+def test_vote_is_the_papers():
+    """The most frequent label wins, of equally frequent ones the first: with two sweeps the first always does."""
+    a, b, c = np.eye(3) * 0.8 + 0.1
+    assert fuse([b, a], "vote").argmax() == 1
+    assert fuse([a, b, b], "vote").argmax() == 1
+    assert fuse([a, b, c], "vote").argmax() == 0
+    assert fuse([c, b, b, c], "vote").argmax() == 2
+
+
+def test_golden_sweeps_pass(default_bundle: Bundle):
+    """This machine runs the default bundle as it was exported."""
+    assert Classifier(default_bundle, VirtualClock()).self_test() < bundle.GOLDEN_TOLERANCE
+
+
+def test_golden_sweeps_can_fail(default_bundle: Bundle):
+    """Logits that the model does not give are found."""
+    other = replace(default_bundle, golden_logits=-default_bundle.golden_logits)
+    with pytest.raises(BundleError, match="get another label"):
+        Classifier(other, VirtualClock()).self_test()
+
+
+def test_verdict_carries_what_is_known(default_bundle: Bundle):
+    """Label, probability, margin, fused, bundle id of a classified sweep; probabilities add up to one."""
+    clock = VirtualClock()
+    v = Classifier(default_bundle, clock)(sweep_of(default_bundle.golden[0], lost=1))
+    assert v.status in (Status.OK, Status.UNSURE)
+    assert v.label == default_bundle.manifest.labels[v.scores.argmax()]
+    assert v.scores.sum() == pytest.approx(1)
+    assert v.probability == v.scores.max()
+    assert v.margin == pytest.approx(np.diff(np.sort(v.scores))[-1])
+    assert (v.fused, v.lost, v.bundle) == (1, 1, default_bundle.id)
+
+
+def test_below_the_threshold_is_unsure(default_bundle: Bundle):
+    """The label is still told, but not as `ok`."""
+    strict = replace(default_bundle.manifest, thresholds=replace(default_bundle.manifest.thresholds, unsure=1.1))
+    v = Classifier(replace(default_bundle, manifest=strict), VirtualClock())(sweep_of(default_bundle.golden[0]))
+    assert v.status is Status.UNSURE
+    assert v.label
+
+
+@pytest.mark.parametrize("status", [s for s in Status if not s.classified])
+def test_refused_sweeps_keep_their_status(default_bundle: Bundle, status: Status):
+    """What the recorder refused is not classified."""
+    sweep = replace(sweep_of(default_bundle.golden[0]), status=status)
+    v = Classifier(default_bundle, VirtualClock())(sweep)
+    assert (v.status, v.label, v.fused, len(v.scores)) == (status, "", 0, 0)
+
+
+def test_features_go_through_the_same_runtime(default_bundle: Bundle, tmp_path: Path):
+    """A bundle with input L gets features, not digits: a linear model on them gives the logits that numpy gives."""
+    onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
+    from appliance.signal import features
+
+    weights = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
+    graph = onnx.helper.make_graph(
+        [onnx.helper.make_node("MatMul", ["features", "W"], ["logits"])], "g",
+        [onnx.helper.make_tensor_value_info("features", 1, [1, 3])],
+        [onnx.helper.make_tensor_value_info("logits", 1, [1, 6])],
+        [onnx.numpy_helper.from_array(weights, "W")],
+    )  # fmt: skip
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+    files = {k: v for k, v in default_bundle.manifest.files.items() if k != bundle.MEANS}
+    manifest = replace(default_bundle.manifest, input="L", early=None, known=None, files=files)
+    classifier = Classifier(
+        replace(default_bundle, manifest=manifest, classes=None, model=model.SerializeToString()), VirtualClock()
+    )
+    window = default_bundle.golden[0]
+    want = features.compute("L", window, 750.0) @ weights
+    assert classifier.logits(window) == pytest.approx(want, rel=1e-5)
+
+
+def copy(tmp_path: Path) -> Path:
+    """A copy of the default bundle to be spoiled."""
+    return Path(shutil.copytree(bundle.DEFAULT, tmp_path / "bundle"))
+
+
+def edit(folder: Path, **changes) -> None:
+    """Change fields of a manifest."""
+    path = folder / bundle.MANIFEST
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def test_default_bundle_is_small():
+    """All files of the committed bundle together stay under 96 KB, the model under half of it."""
+    assert sum(f.stat().st_size for f in bundle.DEFAULT.iterdir()) < 96_000
+    assert (bundle.DEFAULT / bundle.MODEL).stat().st_size < 48_000
+
+
+@pytest.mark.parametrize("name", [bundle.MODEL, bundle.GOLDEN])
+def test_altered_and_missing_files_are_named(tmp_path: Path, name: str):
+    """One flipped byte, or no file: the file is named."""
+    folder = copy(tmp_path)
+    data = bytearray((folder / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (folder / name).write_bytes(data)
+    with pytest.raises(BundleError, match="was altered") as e:
+        bundle.load(folder)
+    assert name in str(e.value)
+    (folder / name).unlink()
+    with pytest.raises(BundleError, match="cannot be read") as e:
+        bundle.load(folder)
+    assert name in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "hint"),
+    [
+        ({"schema": 99}, "schema 99 is unknown"),
+        ({"input": "M"}, "input 'M' is unknown"),
+        ({"labels": ["one"]}, "at least two"),
+        ({"labels": ["a,b", "c"]}, "label 'a,b' cannot be sent"),
+        ({"labels": ["a", 3]}, "label 3 cannot be sent"),
+        ({"files": {}, "early": None, "known": None}, "does not name model.onnx"),
+        ({"format": {"rows": 4}}, "manifest cannot be read"),
+        ({"extra": 1}, "extra"),
+        ({"labels": ["a", "b"]}, "logits"),
+    ],
+)
+def test_broken_manifests_are_named(tmp_path: Path, changes: dict, hint: str):
+    """Unknown schema, input, key; labels that cannot be sent; files that are not named; labels that do not fit."""
+    folder = copy(tmp_path)
+    edit(folder, **changes)
+    with pytest.raises(BundleError, match=hint):
+        bundle.load(folder)
+
+
+def test_no_bundle(tmp_path: Path):
+    """A folder without a manifest, and a manifest that is no JSON."""
+    with pytest.raises(BundleError, match="no bundle at"):
+        bundle.load(tmp_path)
+    (tmp_path / bundle.MANIFEST).write_text("{")
+    with pytest.raises(BundleError, match="manifest cannot be read"):
+        bundle.load(tmp_path)
+
+
+def test_golden_sweeps_of_another_format(tmp_path: Path):
+    """Golden sweeps that do not fit the manifest's format are refused before the model is opened."""
+    folder = copy(tmp_path)
+    manifest = json.loads((folder / bundle.MANIFEST).read_text())
+    edit(folder, format=manifest["format"] | {"rows": 2})
+    with pytest.raises(BundleError, match="does not fit the format"):
+        bundle.load(folder)
+
+
+def test_pickles_are_not_opened(tmp_path: Path):
+    """Golden sweeps that hold Python objects are refused, not unpickled."""
+    folder = copy(tmp_path)
+    np.savez(folder / bundle.GOLDEN, samples=np.array([object()]), logits=np.zeros((1, 6)))
+    manifest = json.loads((folder / bundle.MANIFEST).read_text())
+    entry = bundle.file_entry((folder / bundle.GOLDEN).read_bytes())
+    edit(folder, files=manifest["files"] | {bundle.GOLDEN: entry})
+    with pytest.raises(BundleError, match=r"golden\.npz cannot be read"):
+        bundle.load(folder)
+
+
+def test_a_model_that_is_none_or_another(default_bundle: Bundle):
+    """Bytes that are no model, and a model whose input is not the manifest's."""
+    with pytest.raises(BundleError, match="refuses the model"):
+        Classifier(replace(default_bundle, model=b"nonsense"), VirtualClock())
+    manifest = replace(default_bundle.manifest, format=replace(skin.FORMAT, window=100))
+    with pytest.raises(BundleError, match="the manifest asks for"):
+        Classifier(replace(default_bundle, manifest=manifest), VirtualClock())
+
+
+EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
+KNOWN = {"limit": 9.0, "temperature": 2.0}
+
+
+def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **changes) -> Path:
+    """A toy bundle whose manifest says something else, or whose means.npz holds something else."""
+    folder = toy_bundle.put(tmp_path / "toy", toy_bundle.files())
+    if arrays is not None:
+        (folder / bundle.MEANS).write_bytes(toy_bundle.npz(**arrays))
+        files = json.loads((folder / bundle.MANIFEST).read_text())["files"]
+        changes["files"] = files | {bundle.MEANS: bundle.file_entry((folder / bundle.MEANS).read_bytes())}
+    edit(folder, **changes)
+    return folder
+
+
+def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bundle):
+    """Without the new fields; what is written now is read again as it was."""
+    folder = copy(tmp_path)
+    old = json.loads((folder / bundle.MANIFEST).read_text())
+    (folder / bundle.MANIFEST).write_text(
+        json.dumps(
+            {k: v for k, v in old.items() if k not in ("early", "known", "place", "runtime", "counter")}
+            | {"schema": 1, "files": {k: v for k, v in old["files"].items() if k != bundle.MEANS}}
+        )
+    )
+    read = bundle.load(folder)
+    assert (read.manifest.early, read.manifest.known, read.classes, read.enrolled) == (None, None, None, {})
+    new = toy_bundle.load(tmp_path / "toy", early=Early((0.9, 0.8, 2.0), 2), outputs=(*toy_bundle.OUTPUTS, "early"))
+    assert new.manifest.schema == SCHEMA
+    assert bundle.Manifest.parse(new.manifest.json()) == new.manifest
+    assert new.manifest.early == Early((0.9, 0.8, 2.0), 2)
+    assert new.manifest.known == toy_bundle.KNOWN
+    assert new.classes is not None
+    assert new.classes.means.tolist() == toy_bundle.MEANS.tolist()
+    arrays = {k: v for k, v in toy_bundle.means().items() if k != "spread"}
+    plain = toy_bundle.load(tmp_path / "plain", arrays=arrays).classes
+    assert plain is not None
+    assert plain.spread.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "hint"),
+    [
+        ({"early": EARLY | {"least": []}}, "one for each step"),
+        ({"early": EARLY | {"least": [0.5, 0.0]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": [0.5, -1]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": [0.5, float("nan")]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": [0.5, True]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": [0.5, "0.5"]}}, "numbers above 0"),
+        ({"early": EARLY | {"least": 0.5}}, "manifest cannot be read"),
+        ({"early": EARLY | {"agree": 0}}, "from 1 on"),
+        ({"early": EARLY | {"agree": 1.0}}, "from 1 on"),
+        ({"early": EARLY | {"agree": True}}, "from 1 on"),
+        ({"early": {"least": [0.9]}}, "agree"),
+        ({"early": {"agree": 1}}, "least"),
+        ({"early": [0.9]}, "manifest cannot be read"),
+        ({"early": EARLY | {"extra": 1}}, "extra"),
+        ({"early": EARLY, "input": "L"}, "needs the whole window"),
+        ({"known": KNOWN | {"limit": 0}}, "known.limit 0 must"),
+        ({"known": KNOWN | {"limit": float("inf")}}, "known.limit inf must"),
+        ({"known": KNOWN | {"temperature": -1.0}}, "known.temperature -1.0 must"),
+        ({"known": KNOWN | {"temperature": None}}, "known.temperature None must"),
+        ({"known": {"limit": 9.0}}, "temperature"),
+        ({"known": None}, "both `known` and means.npz"),
+        ({"schema": 1}, "schema 1 has no"),
+    ],
+)
+def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: str):
+    """Numbers that make no sense, fields that are missing or unknown, one half without the other."""
+    with pytest.raises(BundleError, match=hint):
+        bundle.load(spoiled(tmp_path, **changes))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "hint"),
+    [
+        (toy_bundle.means(means=toy_bundle.MEANS[:2]), "means float32 "),
+        (toy_bundle.means(means=toy_bundle.MEANS[:, :0]), "means float32 "),
+        (toy_bundle.means(means=toy_bundle.MEANS[0]), "means float32 "),
+        (toy_bundle.means(means=toy_bundle.MEANS.astype(float)), "means float64"),
+        (toy_bundle.means(means=toy_bundle.MEANS * np.float32("nan")), "means that are not finite"),
+        (toy_bundle.means(bias=np.zeros(2, np.float32)), "bias float32 "),
+        (toy_bundle.means(bias=np.float32([0, np.inf, 0])), "bias that are not finite"),
+        (toy_bundle.means(spread=np.ones(3)), "spread float64"),
+        (toy_bundle.means(spread=np.float32([1, 1])), "spread float32 "),
+        (toy_bundle.means(spread=np.float32([1, 1, 0])), "spread .* must be above 0"),
+        (toy_bundle.means(sweeps=np.zeros(3, np.int32)), "sweeps int32"),
+        (toy_bundle.means(sweeps=np.array([0, 0, -1])), "trained labels .0. come first"),
+        (toy_bundle.means(sweeps=np.array([0, 5, 0])), "trained labels .0. come first"),
+        (toy_bundle.means(sweeps=np.array([5, 0, 0])), "trained labels .0. come first"),
+        (toy_bundle.means(sweeps=np.array([5, 5, 5])), "trained labels .0. come first"),
+        ({k: v for k, v in toy_bundle.means().items() if k != "bias"}, "means.npz cannot be read"),
+        (toy_bundle.means(bias=np.array([object()] * 3)), "means.npz cannot be read"),
+    ],
+)
+def test_broken_means_are_named(tmp_path: Path, arrays: dict, hint: str):
+    """Counts against labels, types, numbers that are none, an order that is none, objects."""
+    with pytest.raises(BundleError, match=hint):
+        bundle.load(spoiled(tmp_path, arrays))
+
+
+def test_early_heads_and_enrolled_labels_exclude_each_other(tmp_path: Path):
+    """A head that was never trained on a label would never name it."""
+    with pytest.raises(BundleError, match="do not know the enrolled labels"):
+        bundle.load(spoiled(tmp_path, toy_bundle.means(sweeps=np.array([0, 0, 5])), early=EARLY))
+
+
+@pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"nonsense", toy_bundle.npy(np.arange(3))])
+def test_means_that_are_no_npz(tmp_path: Path, data: bytes):
+    """Whatever the file holds, it is named."""
+    folder = spoiled(tmp_path)
+    (folder / bundle.MEANS).write_bytes(data)
+    files = json.loads((folder / bundle.MANIFEST).read_text())["files"]
+    edit(folder, files=files | {bundle.MEANS: bundle.file_entry(data)})
+    with pytest.raises(BundleError, match=r"means\.npz cannot be read"):
+        bundle.load(folder)
+    (folder / bundle.MEANS).write_bytes(b"other")
+    with pytest.raises(BundleError, match=r"means\.npz was altered"):
+        bundle.load(folder)
+
+
+@pytest.mark.parametrize(
+    ("more", "fine"),
+    [
+        ({"known": None, "outputs": ("logits",)}, True),
+        ({"known": None, "outputs": ("logits", "embedding", "early")}, True),
+        ({"outputs": ("logits", "embedding", "early"), "early": Early((0.9,) * 3, 1)}, True),
+        ({"outputs": ("logits",)}, False),  # known without embedding
+        ({"early": Early((0.9,) * 3, 1)}, False),  # no early
+        ({"outputs": ("logits", "embedding", "early"), "early": Early((0.9,) * 2, 1)}, False),  # another D
+        ({"known": None, "outputs": ("embedding",)}, False),  # no logits
+        ({"known": None, "outputs": ("logits", "more")}, False),
+        ({"known": None, "outputs": ("logits",), "labels": 2}, False),  # another K
+        ({"arrays": toy_bundle.means(means=np.eye(3, 5, dtype=np.float32))}, False),  # another r
+        ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5]))}, False),  # K0 = 2, the model knows 3
+        ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}, True),
+    ],
+)
+def test_outputs_of_the_model_are_those_of_the_manifest(tmp_path: Path, more: dict, fine: bool):
+    """What is needed is there, what is there fits, what is unknown is refused."""
+    refused = pytest.raises(BundleError, match=r"must not be opened|the manifest asks for")
+    with contextlib.nullcontext() if fine else refused:
+        Classifier(toy_bundle.load(tmp_path / "toy", **more), VirtualClock())
+
+
+def test_a_far_sweep_is_unknown(tmp_path: Path):
+    """Squared distance to the nearest mean against the limit: at 3 deviations known, beyond not; no label, no score."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
+    assert it(toy_bundle.sweep(-3, 0)).label == "a"
+    v = it(toy_bundle.sweep(-3, -0.5))
+    assert (v.status, v.label, v.probability, v.margin, v.fused, len(v.scores)) == (Status.UNKNOWN, "", 0, 0, 0, 0)
+    assert v.detail == "squared distance 9.25 from a, limit 9"
+    assert it(toy_bundle.sweep(6, 6)).status is Status.UNKNOWN
+    assert it(toy_bundle.sweep(9, 0)).label == "b"
+
+
+def test_a_faulty_window_is_not_unknown(tmp_path: Path):
+    """What the window itself tells comes first."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
+    assert it(sweep_of(np.zeros((20, 2, 2), np.int16))).status is Status.NO_CONTACT
+
+
+def test_an_unknown_sweep_does_not_count_for_its_object(tmp_path: Path):
+    """The object's other sweeps stay, and are not diluted."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
+    one = it(toy_bundle.sweep(2.9, 0, object=1))
+    assert it(toy_bundle.sweep(30, 30, object=1)).status is Status.UNKNOWN
+    two = it(toy_bundle.sweep(2.9, 0, object=1))
+    assert (one.fused, two.fused) == (1, 2)
+    assert two.scores == pytest.approx(fuse([one.scores, one.scores], "product"))
+
+
+def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
+    """A float skin far beyond all reason overflows the network: no label, no NaN, and the object is not poisoned."""
+    fmt = replace(toy_bundle.FORMAT, dtype="float32")
+    made = toy_bundle.files(fmt=fmt, outputs=("logits",), known=None)
+    limits = replace(bundle.Manifest.parse(made[bundle.MANIFEST]).thresholds, full_scale=3e38)
+    made[bundle.MANIFEST] = replace(bundle.Manifest.parse(made[bundle.MANIFEST]), thresholds=limits).json()
+    it = Classifier(bundle.load(toy_bundle.put(tmp_path / "toy", made)), VirtualClock())
+    far = toy_bundle.sweep(0, 0, object=1, fmt=fmt)
+    far.frames.taxels[::2, 0, :] = 2e38
+    with np.errstate(invalid="ignore"):
+        v = it(far)
+    assert (v.status, v.label, v.probability, v.detail) == (Status.UNKNOWN, "", 0, "the model gives no number")
+    assert it(toy_bundle.sweep(0, 0, object=1, fmt=fmt)).fused == 1
+
+
+def borderline(**more) -> tuple[Sweep, float]:
+    """A sweep that is "a" with a probability of 1 / (1 + exp(-.6)) = .65 (two labels count), and that probability."""
+    return toy_bundle.sweep(2.8, -1, **more), 1 / (1 + np.exp(-0.6))
+
+
+def test_sweeps_are_asked_for_until_one_is_sure(tmp_path: Path):
+    """Unsure, unsure, ok: after n sweeps the odds are those of one to the power n. A further one is fused too."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), sure=0.85, most_sweeps=5)
+    given = [it(borderline(object=1)[0]) for _ in range(4)]
+    p = borderline()[1]
+    assert [v.status for v in given] == [Status.UNSURE, Status.UNSURE, Status.OK, Status.OK]
+    assert [v.fused for v in given] == [1, 2, 3, 4]
+    for v in given:
+        assert v.label == "a"
+        odds = (p / (1 - p)) ** v.fused
+        assert v.probability == pytest.approx(odds / (1 + odds), abs=2e-3)
+    assert it(borderline(object=2)[0]).status is Status.UNSURE
+
+
+def test_at_the_limit_the_answer_is_final(tmp_path: Path):
+    """Undecided with label and probability; a robot that goes on is answered by the same rule, and may become sure."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), sure=0.85, most_sweeps=2)
+    given = [it(borderline(object=1)[0]) for _ in range(3)]
+    assert [v.status for v in given] == [Status.UNSURE, Status.UNDECIDED, Status.OK]
+    assert given[1].label == "a"
+    assert 0.7 < given[1].probability < 0.85
+    against = it(replace(toy_bundle.sweep(3.2, -1), object=1))
+    assert (against.status, against.fused) == (Status.UNDECIDED, 4)
+
+
+@pytest.mark.parametrize("more", [{"object": 0}, {"object": 1, "how": "none"}])
+def test_sweeps_that_stand_alone_never_reach_the_limit(tmp_path: Path, more: dict):
+    """Without NEW OBJECT, or with fusing off, each sweep is one; a limit of one makes it final."""
+    how = more.pop("how", "product")
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), how, sure=0.85, most_sweeps=2)
+    assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNSURE] * 3
+    it = Classifier(it.bundle, VirtualClock(), how, sure=0.85, most_sweeps=1)
+    assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNDECIDED] * 3
+
+
+def test_sure_is_the_bundles_where_none_is_given(tmp_path: Path):
+    """0 stands for thresholds.unsure; without a limit nothing is ever undecided."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
+    assert it.sure == toy_bundle.LIMITS.unsure
+    assert it(borderline()[0]).status is Status.OK
+    it = Classifier(it.bundle, VirtualClock(), sure=1.1)
+    assert {it(borderline(object=1)[0]).status for _ in range(20)} == {Status.UNSURE}
+
+
+def test_what_is_not_ok_need_not_count(tmp_path: Path):
+    """An early answer that would not be ok is none, and leaves the object as it was."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), sure=0.85)
+    first = it(borderline(object=1)[0])
+    for object in (1, 2):
+        half = replace(toy_bundle.sweep(0, 0), object=object, share=0.5)
+        assert it.conclude_if_ok(half, np.array([0.6, 0.4, 0.0])) is None
+    assert it(borderline(object=1)[0]).fused == 2
+    v = it.conclude_if_ok(replace(toy_bundle.sweep(0, 0), object=1, share=0.5), np.array([0.9, 0.1, 0.0]))
+    assert v is not None
+    assert (v.status, v.label, v.fused, v.share) == (Status.OK, "a", 3, 0.5)
+    assert it(borderline(object=1)[0]).fused == 4
+    assert first.share == 1
+
+
+def test_early_logits(tmp_path: Path):
+    """One row a step."""
+    it = toy_bundle.load(tmp_path / "toy", early=Early((0.9,) * 3, 1), outputs=("logits", "early", "embedding"))
+    rows = Classifier(it, VirtualClock()).early(toy_bundle.window(1, 0))
+    assert rows.tolist() == pytest.approx(np.outer([1, 2, 3], [0, -6, -9]), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("more", "asked"),
+    [
+        ({"known": None, "outputs": ("logits", "embedding", "early")}, ["logits"]),
+        ({"outputs": ("logits", "embedding", "early")}, ["logits", "embedding"]),
+        ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}, ["embedding"]),
+    ],
+)
+def test_only_what_is_needed_is_asked_for(tmp_path: Path, more: dict, asked: list[str], monkeypatch):
+    """onnxruntime is asked for no output that nobody looks at."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy", **more), VirtualClock())
+    seen = []
+
+    class Spy:
+        def run(self, outputs, given, inner=it._session):
+            seen.append(outputs)
+            return inner.run(outputs, given)
+
+    monkeypatch.setattr(it, "_session", Spy())
+    assert it(toy_bundle.sweep(1, 0)).label == "a"
+    assert seen == [asked]
+
+
+def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
+    """(means . z + bias) / temperature for every label; the nearest one wins, and its spread is wider by 1 + 1 / n."""
+    bias = np.float32([0, -18, -18 + 2 / 4])
+    arrays = toy_bundle.means(bias=bias, sweeps=np.array([0, 0, 2]))
+    it = Classifier(toy_bundle.load(tmp_path / "toy", arrays=arrays, labels=2), VirtualClock())
+    z = np.array([1.0, 2.0])
+    have = it.logits(toy_bundle.window(*z)).astype(float)
+    assert have - have[0] == pytest.approx((toy_bundle.MEANS @ z + bias - bias[0]) / 2, abs=1e-4)
+    assert it.self_test() < 1e-5
+    assert it(toy_bundle.sweep(0, 6)).label == "c"
+    # c lies 1.5 times as far as its sweeps say: 13.5 counts 9, as b's 9
+    assert it(toy_bundle.sweep(0, 6 + 3.6)).label == "c"
+    v = it(toy_bundle.sweep(0, 6 + 3.7))
+    assert (v.status, v.detail) == (Status.UNKNOWN, "squared distance 9.127 from c, limit 9")
+    wide = toy_bundle.load(tmp_path / "wide", arrays=arrays | {"spread": np.float32([1, 1, 4])}, labels=2)
+    it = Classifier(wide, VirtualClock())
+    assert it(toy_bundle.sweep(0, 6 + 7.3)).label == "c"
+    assert it(toy_bundle.sweep(0, 6 + 7.4)).status is Status.UNKNOWN
+    assert it(toy_bundle.sweep(9.1, 0)).status is Status.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        toy_bundle.means(means=toy_bundle.MEANS[[1, 0, 2]], bias=np.float32([-18, 0, -18])),
+        toy_bundle.means(bias=np.float32([0, 30, -18])),
+    ],
+)
+def test_means_of_another_training_are_found(tmp_path: Path, arrays: dict):
+    """Class means that name a golden sweep otherwise than the model's own logits are refused."""
+    it = Classifier(bundle.load(spoiled(tmp_path, arrays)), VirtualClock())
+    with pytest.raises(BundleError, match=r"means\.npz and the model's own logits call a golden sweep"):
+        it.self_test()
+
+
+def test_of_equal_probabilities_the_first_label_is_told(default_bundle: Bundle):
+    """As argmax has it: neighbours that vote alike, or logits in few steps, must not name otherwise than export did."""
+    it = Classifier(default_bundle, VirtualClock())
+    window = default_bundle.golden[0]
+    sweep = Sweep(1, 0, 0, Status.OK, Frames(np.arange(len(window)), np.arange(len(window)), window))
+    verdict = it.conclude(sweep, np.array([0.0, 0.4, 0.0, 0.4, 0.1, 0.1]))
+    assert (verdict.label, verdict.margin) == (default_bundle.manifest.labels[1], 0.0)

@@ -1,0 +1,272 @@
+"""The sinks: sentences that others can read, a port that is never waited for, class bits that settle first."""
+
+import fcntl
+import itertools
+import os
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pynmea2
+import pytest
+import serial
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.core.config import OutputConfig, SerialConfig
+from appliance.core.errors import ConfigError
+from appliance.core.types import Status, Verdict
+from appliance.io import robot_link as sink_room
+from appliance.io.gpio_lines import Lines
+from appliance.io.robot_link import (
+    COMMANDS,
+    MAX_LINE,
+    Command,
+    SerialSink,
+    StdoutPort,
+    checksum,
+    parse,
+    result,
+    sentence,
+)
+from appliance.io.verdict_lines import LineSink
+from appliance.sim import gpio, rig
+from appliance.tools import pseudo_terminal
+from tests.factories.paths import ROOT
+
+TIOCGEXCL = 0x80045440
+"""Asks whether a terminal is shut to others (asm-generic/ioctls.h)."""
+PROTOCOL = (ROOT / "firmware_config" / "PROTOCOL.md").read_text()
+
+
+def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: str = "") -> Verdict:
+    """A verdict as the classifier makes it."""
+    return Verdict(
+        7, 5_021_384_000_000, status, label, 0.987, 0.981, np.array([0.987, 0.013]), 1, 0, 410_000, "9f3c2a1b", detail
+    )
+
+
+def test_result_is_the_documents_example():
+    """The RES sentence in PROTOCOL.md is what the code sends, with the checksum that belongs there."""
+    line = result(verdict(), "usb").decode().strip()
+    assert f"`{line[:-2]}hh`" in PROTOCOL
+
+
+def test_every_status_is_documented():
+    """PROTOCOL.md's table lists exactly the statuses that there are."""
+    table = PROTOCOL.split("| status | meaning")[1].split("\n\n")[0]
+    assert re.findall(r"^\| `([a-z-]+)` \|", table, re.M) == [str(s) for s in Status]
+
+
+def test_every_command_is_documented():
+    """PROTOCOL.md's table lists exactly the commands that there are."""
+    table = PROTOCOL.split("| command | does |")[1].split("\n\n")[0]
+    assert tuple(re.findall(r"^\| `([A-Z]+)` \|", table, re.M)) == COMMANDS
+
+
+@given(st.text(max_size=200), st.text(max_size=40), st.sampled_from(list(Status)))
+def test_pynmea2_parses_every_sentence(detail: str, label: str, status: Status):
+    """Whatever the texts are, an independent parser accepts the checksum and finds the fields in their places."""
+    line = result(verdict(label, status, detail), "sim").decode("ascii")
+    assert len(line) <= MAX_LINE
+    parsed = pynmea2.parse(line.strip(), check=True)
+    assert isinstance(parsed, pynmea2.ProprietarySentence)
+    assert parsed.manufacturer == "PLP"
+    assert parsed.data[1:3] == ["RES", "7"]
+    assert parsed.data[4] == status
+
+
+@given(st.text(alphabet=st.characters(codec="latin-1")))
+def test_checksums_agree(text: str):
+    """Ours and pynmea2's exclusive or are the same."""
+    body = sentence("ANS", text).decode("ascii")[1:-5]
+    assert int(checksum(body), 16) == pynmea2.NMEASentence.checksum(body)
+
+
+@pytest.mark.parametrize(
+    ("line", "want"),
+    [
+        (b"$PPLP,ID*" + checksum("PPLP,ID").encode(), Command("ID")),
+        (b"$PPLP,TARE", Command("TARE")),
+        (b"PPLP,NEW", Command("NEW")),
+        (b"\0$PPLP,ID", Command("ID")),
+        (b"$PPLP,TAR\xff$PPLP,ABORT", Command("ABORT")),
+        (b"$PPLP,ABORT*" + checksum("PPLP,ABORT").lower().encode(), Command("ABORT")),
+    ],
+)
+def test_commands_are_read(line: bytes, want: Command):
+    """With checksum or without, as a program or a person sends it; what a break or noise left before the $ is nothing."""
+    assert parse(line + b"\r\n") == ([want], b"")
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        (b"$PPLP,ID*00", "checksum 00 should be"),
+        (b"$PPLP,JUMP", "known are ID"),
+        (b"$GPGGA,1,2", "not a command"),
+        (b"hello", "send for example"),
+        (b"\xff\xfe\x00", "not a command"),
+    ],
+)
+def test_bad_commands_are_answered(line: bytes, hint: str):
+    """A wrong checksum, an unknown command, another protocol, noise: an error that says what to send."""
+    (command,), rest = parse(line + b"\n")
+    assert hint in command.error
+    assert rest == b""
+
+
+def test_a_line_without_end_is_dropped():
+    """Noise without a line end is told once and does not pile up."""
+    (command,), rest = parse(b"x" * 1000)
+    assert "without an end" in command.error
+    assert len(rest) == MAX_LINE + 1
+    assert parse(b"x" * 1000, rest) == ([], rest)
+    # its end is not a line of its own
+    assert parse(b"PPLP,ABORT\nPPLP,ID\n", rest) == ([Command("ID")], b"")
+
+
+@given(st.binary(max_size=300), st.lists(st.integers(0, 300), max_size=5))
+def test_parse_never_raises_and_splits_anywhere(data: bytes, cuts: list[int]):
+    """Any bytes, cut anywhere, give the same commands as at once."""
+    edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
+    rest, got = b"", []
+    for a, b in itertools.pairwise(edges):
+        found, rest = parse(data[a:b], rest)
+        got += found
+    assert (got, rest) == parse(data)
+
+
+def sink_on(name: str, clock=None, **settings) -> SerialSink:
+    """A sink on a port."""
+    return SerialSink(SerialConfig(port=name, **settings), clock or rig.VirtualClock(), "sim")
+
+
+def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
+    """A missing port is named with what to do, sentences wait up to the queue's length, and it is opened when it comes."""
+    clock = rig.VirtualClock()
+    sink = sink_on(str(tmp_path / "ttyUSB0"), clock)
+    sink.send(verdict())
+    assert "ttyUSB0 cannot be opened" in sink.trouble
+    assert "group dialout" in sink.trouble
+    with pseudo_terminal.pair() as (far, name):
+        (tmp_path / "ttyUSB0").symlink_to(name)
+        assert sink.commands() == []
+        assert sink.trouble
+        clock.sleep_until(clock.now_ns() + 1_500_000_000)
+        sink.commands()
+        assert sink.trouble == ""
+        assert os.read(far, 4096) == result(verdict(), "sim")
+        sink.close()
+
+
+def test_a_port_that_goes_away_while_open():
+    """The other end closes (an adapter is pulled): trouble is told, nothing is raised, the next port is opened."""
+    clock = rig.VirtualClock()
+    with pseudo_terminal.pair() as (_, name):
+        sink = sink_on(name, clock)
+        assert sink.commands() == []
+    sink.send(verdict())
+    sink.commands()
+    assert "failed" in sink.trouble or "cannot be opened" in sink.trouble
+    sink.close()
+
+
+def test_a_port_that_another_program_holds():
+    """A second program on the port: the error is told, not raised."""
+    with pseudo_terminal.pair() as (_, name):
+        first, second = sink_on(name), sink_on(name)
+        first.commands()
+        second.commands()
+        # root may open a port that is held exclusively (TIOCEXCL), so flock has to tell
+        assert "end the program that has it" in second.trouble
+        first.close()
+
+
+def is_shut(port: int) -> bool:
+    """Whether the kernel refuses a port to all but root."""
+    return bool(struct.unpack("i", fcntl.ioctl(port, TIOCGEXCL, bytes(4)))[0])
+
+
+def test_a_port_is_kept_from_others(monkeypatch: pytest.MonkeyPatch):
+    """While the box has a port the kernel refuses it to others; when it is closed it is free, also if one had it open."""
+    monkeypatch.setattr(sink_room, "PSEUDO_TERMINALS", range(0))
+    with pseudo_terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
+        sink = sink_on(name)
+        assert not is_shut(other.fileno())
+        sink.commands()
+        assert is_shut(other.fileno())
+        sink.close()
+        assert not is_shut(other.fileno())
+
+
+def test_a_pseudo_terminal_is_not_shut():
+    """It would stay so, also for the box, when the box is killed while the other end is open."""
+    with pseudo_terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
+        sink = sink_on(name)
+        sink.commands()
+        assert sink.trouble == ""
+        assert not is_shut(other.fileno())
+        sink.close()
+
+
+def test_an_opener_that_refuses():
+    """pyserial's own errors become trouble."""
+
+    def refuse(*args, **kwargs):
+        raise serial.SerialException(13, "permission denied")
+
+    sink = SerialSink(SerialConfig(port="/dev/x"), rig.VirtualClock(), "sim", refuse)
+    sink.say(b"x")
+    assert "permission denied" in sink.trouble
+
+
+def test_stdout_port_prints(capsysbinary: pytest.CaptureFixture[bytes]):
+    """Without a port the sentences are printed."""
+    port = StdoutPort("sim")
+    port.send(verdict())
+    assert capsysbinary.readouterr().out == result(verdict(), "sim")
+    assert port.commands() == []
+
+
+LABELS = ("metal", "wood", "plastic rough")
+
+
+def lines_on(bits: int) -> tuple[Lines, gpio.SimGpio]:
+    """Output lines on a simulated chip."""
+    names = tuple(f"C{i}" for i in range(bits))
+    clock = rig.VirtualClock()
+    chip = gpio.SimGpio(clock, {"/dev/gpiochip0": ["VALID", *names]})
+    return Lines(OutputConfig(result_valid="VALID", class_bits=names), chip, clock), chip
+
+
+def levels(chip: gpio.SimGpio) -> dict[str, bool]:
+    """Where the lines are now."""
+    return {name: level for _, name, level in chip.written}
+
+
+def test_class_bits_settle_before_result_valid():
+    """The code stands before RESULT VALID rises, by the configured time."""
+    lines, chip = lines_on(2)
+    LineSink(lines, LABELS).send(verdict())
+    assert levels(chip) == {"VALID": True, "C0": True, "C1": True}
+    when = {name: t for t, name, level in chip.written if level}
+    assert when["VALID"] - max(when["C0"], when["C1"]) >= 200_000
+
+
+@pytest.mark.parametrize("status", [Status.UNSURE, Status.NO_CONTACT, Status.SENSOR_LOST])
+def test_what_is_not_ok_is_code_zero(status: Status):
+    """An unsure or refused sweep raises RESULT VALID with code 0."""
+    lines, chip = lines_on(2)
+    sink = LineSink(lines, LABELS)
+    sink.send(verdict())
+    sink.send(verdict("metal" if status is Status.UNSURE else "", status))
+    assert levels(chip) == {"VALID": True, "C0": False, "C1": False}
+
+
+def test_too_few_class_bits():
+    """Labels that do not fit the bits are refused at start, with the numbers."""
+    lines, _ = lines_on(1)
+    with pytest.raises(ConfigError, match="3 labels and the code 0 do not fit"):
+        LineSink(lines, LABELS)

@@ -1,0 +1,219 @@
+"""Captures and saved sweeps: what was seen once can be judged again, bit for bit."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.bundle.bundle import Bundle
+from appliance.core.config import SweepConfig
+from appliance.core.errors import FormatError
+from appliance.core.types import Frames, Status, Sweep, Verdict, load, save
+from appliance.inference.classifier import Classifier
+from appliance.io import packets
+from appliance.io.robot_link import StdoutPort
+from appliance.recording.capture import CaptureWriter, Playback
+from appliance.recording.sweep_window import Recorder
+from appliance.runtime.loop import Box
+from appliance.sim import devices, rig, script, skin
+from tests.factories.simulated_box import SECOND, Rigged
+
+
+def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
+    """Verdicts and sweeps of a capture."""
+    play = Playback(path)
+    sweeps: list[Sweep] = []
+    verdicts: list[Verdict] = []
+    port = StdoutPort("replay", play.commands)
+    recorder, classifier = Recorder(play.format, SweepConfig()), Classifier(model, play)
+    box = Box(play, play, recorder, classifier, play, port=port, keepers=[lambda sweep, verdict: sweeps.append(sweep)])
+    while not play.finished:
+        verdicts += box.step()
+    return verdicts, sweeps
+
+
+def test_a_capture_gives_the_same_verdicts_bit_for_bit(
+    rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
+):
+    """Drift, spikes, lost transfers, an unplugged skin, NEW OBJECT: windows, times and scores are the same when replayed."""
+    rng = np.random.default_rng(5)
+    acts = list(script.tubes(1010, 8))
+    acts[3] = rig.Act(acts[3].frames, acts[3].start, acts[3].stop, acts[3].label, new_object=True)
+    world = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
+    world.backend.board = rig.Board(
+        skin.FORMAT, world.robot, world.clock, ppm=80,
+        latency=lambda: int(rng.exponential(100_000) + (rng.random() < 0.01) * rng.uniform(5e6, 4e7)),
+    )  # fmt: skip
+    world.backend.mangle = lambda data: b"" if rng.random() < 0.001 else data
+    begin = world.clock.now_ns()
+    world.backend.at(begin + 9 * SECOND, world.backend.unplug)
+    world.backend.at(begin + 10 * SECOND, world.backend.plug)
+    capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
+    box = rigged(world, capture=capture)
+    first = box.until(lambda: world.finished(box.box.answered))
+    capture.close()
+    verdicts, sweeps = played(tmp_path / "capture", default_bundle)
+    assert [(v.sweep, v.status, v.label, v.fused, v.lost) for v in verdicts] == [
+        (v.sweep, v.status, v.label, v.fused, v.lost) for v in first
+    ]
+    assert {str(v.status) for v in first} >= {"sensor-lost"}
+    assert max(v.fused for v in first) > 1
+    for a, b in zip(first, verdicts, strict=True):
+        assert a.scores.tobytes() == b.scores.tobytes()
+    for a, b in zip(box.kept, sweeps, strict=True):
+        assert a.frames.taxels.tobytes() == b.frames.taxels.tobytes()
+        assert (a.frames.t_ns == b.frames.t_ns).all()
+
+
+def test_commands_are_part_of_a_capture(rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path):
+    """NEW and ABORT change what comes after them, so they are captured: replayed sweeps fuse and end as they did."""
+    world = devices.build(skin.FORMAT, script.tubes(1014, 5), rig.VirtualClock(), "sim")
+    capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
+    box = rigged(world, capture=capture)
+    first = box.until(lambda: box.box.answered == 1)
+    assert ",NEW,ok" in box.ask("$PPLP,NEW")
+    first += box.until(lambda: box.box.answered == 3)
+    first += box.seconds(2)
+    os.write(box.far_end, b"$PPLP,ABORT\r\n")
+    first += box.until(lambda: world.finished(box.box.answered))
+    capture.close()
+    verdicts, _ = played(tmp_path / "capture", default_bundle)
+    assert [v.fused for v in first] == [1, 1, 2, 0, 3]
+    assert [(v.status, v.label, v.fused) for v in verdicts] == [(v.status, v.label, v.fused) for v in first]
+    for a, b in zip(first, verdicts, strict=True):
+        assert a.scores.tobytes() == b.scores.tobytes()
+
+
+def test_a_capture_of_a_skin_that_sent_another_form(
+    rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
+):
+    """Packets of another grid in mid stream: the sweep is `sensor-lost` when it happens and when it is replayed."""
+    world = devices.build(skin.FORMAT, script.tubes(1015, 2), rig.VirtualClock(), "sim")
+    count = itertools.count()
+    other = packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
+    world.backend.mangle = lambda data: other if next(count) == 200 else data
+    capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
+    box = rigged(world, capture=capture)
+    first = box.until(lambda: world.finished(box.box.answered))
+    capture.close()
+    verdicts, _ = played(tmp_path / "capture", default_bundle)
+    assert first[0].status == "sensor-lost"
+    assert [v.status for v in verdicts] == [v.status for v in first]
+
+
+def test_a_capture_that_was_cut_off_plays_up_to_there(
+    rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
+):
+    """A power cut in mid record: everything before it is played."""
+    world = devices.build(skin.FORMAT, script.tubes(1011, 2), rig.VirtualClock(), "sim")
+    capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
+    box = rigged(world, capture=capture)
+    box.until(lambda: box.box.answered == 2)
+    capture.close()
+    data = (tmp_path / "capture").read_bytes()
+    (tmp_path / "cut").write_bytes(data[: len(data) - 7])
+    assert len(played(tmp_path / "cut", default_bundle)[0]) == 1
+    (tmp_path / "half").write_bytes(data[: len(data) * 2 // 3])
+    assert len(played(tmp_path / "half", default_bundle)[0]) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "hint"),
+    [
+        (b"GIF89a", "not a capture"),
+        (b"PPLPCAP1\x02\x00\x00\x00{}", "head cannot be read"),
+        (b"PPLPCAP1\x05\x00\x00\x00{nope", "head cannot be read"),
+    ],
+)
+def test_other_files_are_named(tmp_path: Path, content: bytes, hint: str):
+    """A file that is no capture says so."""
+    (tmp_path / "x").write_bytes(content)
+    with pytest.raises(FormatError, match=hint):
+        Playback(tmp_path / "x")
+
+
+def test_a_missing_capture(tmp_path: Path):
+    """No file."""
+    with pytest.raises(FormatError, match="cannot be read"):
+        Playback(tmp_path / "x")
+
+
+def test_an_unknown_record(tmp_path: Path):
+    """A record of a kind that this version does not know."""
+    capture = CaptureWriter(tmp_path / "x", skin.FORMAT)
+    capture.transfer(1, b"data")
+    capture.close()
+    data = bytearray((tmp_path / "x").read_bytes())
+    data[-17] = 9
+    (tmp_path / "x").write_bytes(data)
+    with pytest.raises(FormatError, match="kind 9"):
+        Playback(tmp_path / "x")
+
+
+def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_path: Path):
+    """Frames, times, numbers, status: all come back; nothing is left over beside the two files."""
+    world = devices.build(skin.FORMAT, script.tubes(1012, 1), rig.VirtualClock(), "sim")
+    box = rigged(world)
+    box.until(lambda: world.finished(box.box.answered))
+    (sweep,) = box.kept
+    save(tmp_path / "s.npy", sweep, skin.FORMAT)
+    again, fmt = load(tmp_path / "s.npy")
+    assert fmt == skin.FORMAT
+    assert (again.id, again.status, again.start_ns, again.stop_ns) == (
+        sweep.id,
+        sweep.status,
+        sweep.start_ns,
+        sweep.stop_ns,
+    )
+    for k in ("t_ns", "seq", "taxels"):
+        assert (getattr(again.frames, k) == getattr(sweep.frames, k)).all()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["s.json", "s.npy"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "hint"),
+    [
+        (lambda d: (d / "s.json").unlink(), "not a recorded sweep"),
+        (lambda d: (d / "s.json").write_text("{}"), "not a recorded sweep"),
+        (
+            lambda d: (d / "s.json").write_text((d / "s.json").read_text().replace('"schema": 2', '"schema": 7')),
+            "schema 7",
+        ),
+        (
+            lambda d: (d / "s.json").write_text((d / "s.json").read_text().replace('"rows": 4', '"rows": 3')),
+            "do not fit",
+        ),
+        (lambda d: (d / "s.json").write_text("3"), "not a recorded sweep"),
+        (lambda d: (d / "s.npy").write_bytes(b"nonsense"), "not a recorded sweep"),
+        (lambda d: (d / "s.npy").write_bytes(b""), "not a recorded sweep"),
+        (lambda d: np.save(d / "s.npy", np.array([{}]), allow_pickle=True), "not a recorded sweep"),
+    ],
+)
+def test_broken_recordings_are_named(rigged: Callable[..., Rigged], tmp_path: Path, spoil, hint: str):
+    """A missing or broken sidecar, an unknown schema, another grid, a broken array, a pickle."""
+    world = devices.build(skin.FORMAT, script.tubes(1013, 1), rig.VirtualClock(), "sim")
+    box = rigged(world)
+    box.until(lambda: world.finished(box.box.answered))
+    save(tmp_path / "s.npy", box.kept[0], skin.FORMAT)
+    spoil(tmp_path)
+    with pytest.raises(FormatError, match=hint):
+        load(tmp_path / "s.npy")
+
+
+def kept(n: int) -> Sweep:
+    """Sweep number `n` of 40 frames."""
+    frames = Frames(np.arange(40), np.arange(40), np.full((40, 4, 4), n, np.uint8))
+    return Sweep(n, 0, 40, Status.OK, frames)
+
+
+def test_a_name_that_cannot_be_taken_leaves_nothing(tmp_path: Path):
+    """The second of the two files cannot get its name: the first one goes too."""
+    (tmp_path / "sweep-000001.npy").mkdir()
+    with pytest.raises(OSError, match="directory"):
+        save(tmp_path / "sweep-000001.npy", kept(1), skin.FORMAT)
+    assert [p.name for p in tmp_path.iterdir()] == ["sweep-000001.npy"]

@@ -1,0 +1,400 @@
+"""Recordings: which sweep a label is of, what is told of each, and a disk that is full, shut or taken."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pynmea2
+import pytest
+
+from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.types import Frames, Status, Sweep, Verdict, load, sidecar
+from appliance.recording import recording
+from appliance.recording.recording import Labels, Recording, SweepFolder, told
+from appliance.sim import devices, rig, script, skin
+from tests.factories import toy_bundle
+from tests.factories.simulated_box import Rigged
+
+WOOD, NONE = Labels("wood"), Labels()
+
+
+class Desk:
+    """A recording without a box: what it says and logs, and a clock that stands where a test puts it."""
+
+    def __init__(self, folder: Path, labels: Labels = WOOD) -> None:
+        self.t_ns, self.said, self.logged = 0, [], []
+        self.recording = Recording(
+            folder, toy_bundle.FORMAT, labels, self, circumstances=lambda: {"bundle": "b"}, say=self.hear,
+            log=self.logged.append,
+        )  # fmt: skip
+
+    def now_ns(self) -> int:
+        """Clock."""
+        return self.t_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Clock."""
+
+    def hear(self, line: bytes) -> None:
+        """Take a sentence apart: its fields after the kind."""
+        self.said.append(line.decode().split("*")[0].split(",")[2:])
+
+    def do(self, name: str, text: str = "") -> list[object]:
+        """Carry out a command."""
+        return self.recording.commands[name](text)
+
+    def sweep(self, number: int, start_ns: int = 0, status: Status = Status.OK) -> list[str]:
+        """Give a sweep; the REC sentence's fields."""
+        self.recording.keep(*judged(number, start_ns, status))
+        return self.said[-1]
+
+
+def judged(number: int, start_ns: int = 0, status: Status = Status.OK) -> tuple[Sweep, Verdict]:
+    """A sweep with a window where the status has one, and a verdict on it."""
+    windowless = status in (Status.SHORT, Status.GAP)
+    frames = Frames.empty(toy_bundle.FORMAT) if windowless else toy_bundle.sweep(0, 0).frames
+    sweep = Sweep(number, start_ns, start_ns + 1, status if windowless else Status.OK, frames)
+    scores = np.array([1 / 3, 2 / 3, 0]) if status.classified else np.empty(0)
+    return sweep, Verdict(number, 5, status, "b", 2 / 3, 1 / 3, scores, 1, 0, 1, "b", own=scores)
+
+
+def names(folder: Path) -> list[str]:
+    """What lies in a folder."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+def pairs(*numbers: int) -> list[str]:
+    """The names of these sweeps' files."""
+    return sorted(f"sweep-{n:06d}.{kind}" for n in numbers for kind in ("json", "npy"))
+
+
+@pytest.fixture
+def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Callable[..., Rigged]:
+    """Builds boxes that record to `tmp_path`."""
+
+    def make(world: devices.SimWorld, labels: Labels = NONE) -> Rigged:
+        box: Rigged
+        recording = Recording(
+            tmp_path, skin.FORMAT, labels, world.clock, circumstances=lambda: box.box.circumstances(),
+            say=lambda line: box.port.say(line), log=print,
+        )  # fmt: skip
+        box = rigged(world, keepers=[recording.keep], obey=recording.commands)
+        return box
+
+    return make
+
+
+def heard(box: Rigged) -> list[list[str]]:
+    """The REC sentences that the robot has read: their fields after the kind."""
+    return [line.split("*")[0].split(",")[2:] for line in box.heard if ",REC," in line]
+
+
+def test_a_label_is_of_the_sweeps_that_start_after_it(recorded: Callable[..., Rigged], tmp_path: Path):
+    """Over the serial line, with real edges: what is sent while a sweep is open is of the next one."""
+    first, *others = script.tubes(1, 3)
+    before = np.zeros((3 * 750, 4, 4), np.uint8)  # time enough for the first command
+    first = rig.Act(np.concatenate([before, first.frames]), len(before) + first.start, len(before) + first.stop, "")
+    world = devices.build(skin.FORMAT, [first, *others], rig.VirtualClock(), "sim")
+    box = recorded(world, Labels(session="first day"))
+    box.seconds(0.1)
+    assert ",MATERIAL,ok,wood,,first day*" in box.ask("$PPLP,MATERIAL,wood")
+    box.until(lambda: box.box.health.sweeping)
+    assert ",POSITION,ok,wood,1,first day*" in box.ask("$PPLP,POSITION,1")
+    assert ",MATERIAL,ok,metal,1,first day*" in box.ask("$PPLP,MATERIAL,metal")
+    box.until(lambda: box.box.answered == 1)
+    box.until(lambda: box.box.health.sweeping)
+    assert ",NEXT,ok,metal,2,first day*" in box.ask("$PPLP,NEXT")
+    box.until(lambda: world.finished(box.box.answered))
+    want = [("wood", "", "first day"), ("metal", "1", "first day"), ("metal", "2", "first day")]
+    sweeps = [load(tmp_path / f"sweep-{n:06d}.npy")[0] for n in (1, 2, 3)]
+    assert [(s.material, s.position, s.session) for s in sweeps] == want
+    box.seconds(0.1)
+    assert [tuple(rec[3:6]) for rec in heard(box)] == want
+    for line in box.heard:
+        pynmea2.parse(line, check=True)
+
+
+def test_a_sidecar_tells_all(recorded: Callable[..., Rigged], tmp_path: Path):
+    """Verdict bit for bit, board, clock, tare, rule, bundle and run stand beside the frames, in plain JSON."""
+    world = devices.build(skin.FORMAT, script.tubes(2, 1), rig.VirtualClock(), "sim")
+    box = recorded(world, Labels("wood", "3", "monday"))
+    (verdict,) = box.until(lambda: world.finished(box.box.answered))
+    about = json.loads((tmp_path / "sweep-000001.json").read_text())
+    assert about["verdict"] == told(verdict)
+    assert np.array(about["verdict"]["own"]).tobytes() == verdict.own.tobytes()
+    assert about["device"]["serial"] == "SIM0001"
+    assert about["clock"]["late_ms"] >= 0
+    assert np.shape(about["tare"]) == (4, 4)
+    assert (about["bundle"], about["run"], about["lost"]) == (box.box.circumstances()["bundle"], 0, 0)
+    assert about["rule"]["how"] == "product"
+    assert (about["material"], about["position"], about["session"]) == ("wood", "3", "monday")
+    again, fmt = load(tmp_path / "sweep-000001.npy")
+    assert fmt == skin.FORMAT
+    assert again.frames.taxels.tobytes() == box.kept[0].frames.taxels.tobytes()
+
+
+def test_a_recording_is_a_set_to_train_on(recorded: Callable[..., Rigged], tmp_path: Path):
+    """What the box records is what `palpate-train --set DIR` reads: materials, positions, sessions, windows."""
+    files = pytest.importorskip(
+        "train.data.readers", reason="the desktop's tools are not here; make test installs them"
+    )
+    from appliance.core.sweep_set import SweepSet
+
+    world = devices.build(skin.FORMAT, script.tubes(3, 2), rig.VirtualClock(), "sim")
+    box = recorded(world, Labels("wood", "1", "a"))
+    box.until(lambda: box.box.answered == 1)
+    for command in ("MATERIAL,metal", "POSITION,2"):
+        box.ask(f"$PPLP,{command}")
+    box.until(lambda: world.finished(box.box.answered))
+    made = files.read(tmp_path, SweepSet)
+    assert [made.materials[k] for k in made.labels] == ["wood", "metal"]
+    assert made.groups["position"].tolist() == [1, 2]
+    assert (made.samples[1] == box.kept[1].frames.taxels).all()
+
+
+def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
+    """Stored with its count, its labels and its file; a doubt about the window; skipped where there is none."""
+    desk = Desk(tmp_path, Labels("wood", "3", "a b"))
+    assert desk.sweep(1) == ["1", "stored", "1", "wood", "3", "a b", "sweep-000001"]
+    assert desk.sweep(2, status=Status.SHORT) == ["2", "skipped", "1", "wood", "3", "a b", "short"]
+    assert desk.sweep(3, status=Status.NO_CONTACT)[1:3] + desk.said[-1][6:] == [
+        "stored",
+        "2",
+        "sweep-000003 no-contact",
+    ]
+    assert desk.sweep(4, status=Status.UNKNOWN)[6] == "sweep-000004"
+    desk.do("MATERIAL")
+    assert desk.sweep(5)[3:] == ["", "3", "a b", "sweep-000005 no material"]
+    assert names(tmp_path) == pairs(1, 3, 4, 5)
+    longest = "x" * 24
+    for name in ("MATERIAL", "POSITION", "SESSION"):
+        desk.do(name, longest)
+    assert desk.sweep(999_999)[3:7] == [longest, longest, longest, "sweep-999999"]
+
+
+def test_the_label_at_the_start_edge_counts(tmp_path: Path):
+    """Whatever came since: each sweep has what held when it began, also where it is answered after a younger one."""
+    desk = Desk(tmp_path, Labels())
+    for t_ns, material in ((100, "a"), (200, "b"), (300, "c")):
+        desk.t_ns = t_ns
+        desk.do("MATERIAL", material)
+    assert [desk.sweep(n, start)[3] for n, start in ((1, 299), (2, 100), (3, 99), (4, 300))] == ["b", "a", "", "c"]
+
+
+def test_more_changes_than_are_remembered_lose_labels_and_mix_none(tmp_path: Path):
+    """A sweep that began before all changes that are remembered is told as unlabelled, not as what came later."""
+    desk = Desk(tmp_path)
+    for desk.t_ns in range(1, recording.MOST_CHANGES + 1):
+        desk.do("MATERIAL", "metal")
+    assert desk.sweep(1, 0)[3] == ""
+    assert desk.sweep(2, 1)[3] == "metal"
+
+
+@pytest.mark.parametrize(
+    ("text", "after"),
+    [("1", "2"), ("9", "10"), ("09", "10"), ("", None), ("left", None), ("2.5", None), ("9" * 24, None)],
+)
+def test_next_position(tmp_path: Path, text: str, after: str | None):
+    """A whole number counts on by one; anything else says why not, and stays."""
+    desk = Desk(tmp_path, Labels("wood", text))
+    if after:
+        assert desk.do("NEXT") == ["wood", after, ""]
+        return
+    with pytest.raises(ApplianceError, match=r"POSITION,1|1 to 24"):
+        desk.do("NEXT")
+    assert desk.sweep(1)[4] == text
+
+
+@pytest.mark.parametrize("text", ["-1", "a,b", "blé", "x" * 25, "a\nb", "$"])
+def test_labels_that_cannot_be_sent(tmp_path: Path, text: str):
+    """They are refused, by command and as an option, and the label before stays."""
+    desk = Desk(tmp_path)
+    with pytest.raises(ApplianceError, match="1 to 24 letters"):
+        desk.do("MATERIAL", text)
+    assert desk.sweep(1)[3] == "wood"
+    with pytest.raises(ConfigError, match="session"):
+        Labels(session=text)
+
+
+def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
+    """Down to the first sweep of this run; those of an earlier run stay, and no number is given twice."""
+    before = Desk(tmp_path)
+    before.sweep(1)
+    before.recording.close()
+    desk = Desk(tmp_path)
+    for n in (1, 2, 3):
+        desk.sweep(n)
+    desk.sweep(4, status=Status.SHORT)
+    assert desk.do("DISCARD") == [3, 2, "sweep-000004"]
+    assert names(tmp_path) == pairs(1, 2, 3)
+    assert desk.sweep(5) == ["5", "stored", "3", "wood", "", "", "sweep-000006"]
+    assert [desk.do("DISCARD")[0] for _ in range(3)] == [5, 2, 1]
+    with pytest.raises(ApplianceError, match="no sweep of this run"):
+        desk.do("DISCARD")
+    assert names(tmp_path) == pairs(1)
+
+
+def test_discard_that_fails_can_be_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A disk that fails in the middle is told; the sweep still counts as stored, and DISCARD takes the rest of it."""
+    desk = Desk(tmp_path)
+    desk.sweep(1)
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "unlink", failing(Path.unlink, ".json"))
+        with pytest.raises(ApplianceError, match="sweep 1 cannot be discarded: Input/output error"):
+            desk.do("DISCARD")
+    assert names(tmp_path) == ["sweep-000001.json"]
+    assert desk.do("DISCARD") == [1, 0, "sweep-000001"]
+    assert names(tmp_path) == []
+
+
+def failing(unlink: Callable[..., None], suffix: str) -> Callable[..., None]:
+    """`Path.unlink` on a disk that fails for names that end so."""
+
+    def broken(path: Path, missing_ok: bool = False) -> None:
+        if path.suffix == suffix:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        unlink(path, missing_ok)
+
+    return broken
+
+
+def test_a_later_run_writes_nothing_over(tmp_path: Path):
+    """It counts on from what it finds; half a file of a killed run goes, and nothing else; a half sweep keeps its number."""
+    first = Desk(tmp_path)
+    first.sweep(1)
+    first.recording.close()
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    (tmp_path / "sweep-000002.json").write_text("{}")
+    for left in ("sweep-000003.json.part", "sweep-000003.npy.part", "mine.part"):
+        (tmp_path / left).write_bytes(b"half")
+    assert Desk(tmp_path).sweep(1)[6] == "sweep-000004"
+    after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert before.items() <= after.items()
+    assert sorted(after.keys() - before.keys()) == ["mine.part", "sweep-000002.json", *pairs(4)]
+    about = sidecar(tmp_path / "sweep-000004.npy")
+    assert (about["run"], about["id"]) == (3, 1)
+
+
+def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
+    """A second one would count from the same number on; it is told, and the first goes on."""
+    first = Desk(tmp_path)
+    with pytest.raises(ConfigError, match="another program keeps sweeps there"):
+        Desk(tmp_path)
+    assert first.sweep(1)[1] == "stored"
+    first.recording.close()
+    Desk(tmp_path).sweep(1)
+    assert names(tmp_path) == pairs(1, 2)
+
+
+@pytest.mark.parametrize(
+    ("blocks", "left", "detail"),
+    [(1 << 20, 16383, "67.1 MB left of 67.1 for the system"), (1000, 49, "0.2 MB left of 0.2 for the system")],
+)
+def test_no_room_for_the_system_stops_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blocks: int, left: int, detail: str
+):
+    """Below what is kept free nothing is written; it is told, logged once, tried again with the next sweep, and logged."""
+    free = [left]
+    monkeypatch.setattr(
+        os, "statvfs", lambda path: os.statvfs_result((4096, 4096, blocks, blocks, free[0], 9, 9, 9, 0, 255))
+    )
+    desk = Desk(tmp_path)
+    assert [desk.sweep(n)[1:3] + desk.said[-1][6:] for n in (1, 2)] == [["full", "0", detail]] * 2
+    assert names(tmp_path) == []
+    free[0] += 1
+    assert desk.sweep(3)[1:3] == ["stored", "1"]
+    desk.recording.close()
+    assert desk.logged == [
+        f"<4>record: sweep 1 is not stored: {detail}; make room in {tmp_path}; classifying goes on",
+        "record: sweeps are stored again, from sweep 3 on",
+        f"record: sweeps of this run in {tmp_path}: 1",
+    ]
+
+
+@pytest.mark.parametrize(("code", "outcome"), [(errno.ENOSPC, "full"), (errno.EDQUOT, "full"), (errno.EROFS, "failed")])
+def test_a_disk_that_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, outcome: str):
+    """No space and no quota are `full`, anything else is `failed`, with the reason."""
+    desk = Desk(tmp_path)
+
+    def refused(*args: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(recording, "save", refused)
+    assert desk.sweep(1) == ["1", outcome, "0", "wood", "", "", os.strerror(code)]
+    assert len(desk.logged) == 1
+
+
+def test_what_cannot_be_written_leaves_nothing(tmp_path: Path):
+    """The disk ends after n bytes, for n across both files: failed, nothing stays, what was there is whole."""
+    desk = Desk(tmp_path)
+    desk.sweep(1)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in range(0, max(map(len, before.values())), 50):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+        try:
+            assert desk.sweep(2)[1] == "failed"
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert len(desk.logged) == 1
+    assert desk.sweep(2)[1:3] == ["stored", "2"]
+
+
+def test_a_folder_that_is_taken_away(tmp_path: Path):
+    """Its sweeps fail and say so; once it is there again recording goes on."""
+    desk = Desk(tmp_path / "a" / "b")
+    shutil.rmtree(tmp_path / "a")
+    assert desk.sweep(1)[1:3] + desk.said[-1][6:] == ["failed", "0", "No such file or directory"]
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    assert desk.sweep(2)[1] == "stored"
+    assert "stored again" in desk.logged[-1]
+
+
+@pytest.mark.parametrize("folder", ["/proc/x", "/dev/null"])
+def test_a_folder_that_cannot_be_made(folder: str):
+    """It is told before the robot has swept."""
+    with pytest.raises(ConfigError, match=f"--out {folder}: .*name a folder that can be written"):
+        Desk(Path(folder))
+
+
+def test_folders_are_on_the_disk_before_their_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Each is synced into the one above it, at every start: a power cut cannot take them all away later."""
+    synced: list[Path] = []
+    monkeypatch.setattr(recording.storage, "sync", synced.append)
+    for _ in range(2):
+        SweepFolder(tmp_path / "a" / "b", toy_bundle.FORMAT).close()
+        assert {tmp_path, tmp_path / "a"} <= set(synced)
+        synced.clear()
+
+
+def test_a_disk_that_is_full_costs_no_answer(recorded: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch):
+    """On the whole box: each sweep is answered, each REC says full, no frame is lost."""
+
+    def full(path: Path, sweep: Sweep, fmt: object, about: Mapping[str, object]) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(recording, "save", full)
+    world = devices.build(skin.FORMAT, script.tubes(4, 2), rig.VirtualClock(), "sim")
+    box = recorded(world, Labels("wood"))
+    verdicts = box.until(lambda: world.finished(box.box.answered))
+    box.seconds(0.1)
+    assert len(verdicts) == 2
+    assert [rec[1] for rec in heard(box)] == ["full", "full"]
+    assert box.box.tally.lost_frames == 0
+
+
+def test_numbers_in_a_verdict_come_back_bit_for_bit():
+    """Floats through JSON: the same bits, also where they have no short form; and no field is left out."""
+    _, verdict = judged(1)
+    again = json.loads(json.dumps(told(verdict)))
+    assert again == told(verdict)
+    assert np.array(again["scores"]).tobytes() == verdict.scores.tobytes()
+    assert again.keys() == set(Verdict.__slots__)

@@ -1,0 +1,325 @@
+"""The whole way on the rig: USB bytes and GPIO edges in, sentences and lines out, and every way in which it can fail."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+
+import numpy as np
+import pynmea2
+import pytest
+
+from appliance.bundle import bundle
+from appliance.core import config
+from appliance.core.types import Status
+from appliance.io.robot_link import StdoutPort
+from appliance.runtime import assembly
+from appliance.service.journal import WARNING
+from appliance.sim import devices, rig, script, skin
+from appliance.tools.score import Answer
+from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
+
+RATE = round(skin.FORMAT.rate_hz)
+
+
+def answers(box: Rigged) -> list[Answer]:
+    """The RES sentences that the robot has read."""
+    return [a for a in map(Answer.read, box.heard) if a]
+
+
+def touched(frames: np.ndarray) -> list[rig.Act]:
+    """One act: idle, three seconds of `frames` [2250, 4, 4], idle."""
+    off = np.zeros((RATE // 2, 4, 4), np.uint8)
+    return [rig.Act(np.concatenate([off, frames, off]), len(off), len(off) + len(frames), "")]
+
+
+def slide(label: str = "wood", seed: int = 3) -> np.ndarray:
+    """Three seconds of sliding [2250, 4, 4]."""
+    place = skin.placements("T-LAB", seed)[0]
+    return skin.sweep(label, place, np.random.default_rng(seed), rest_s=0, slide_s=3, after_s=0)
+
+
+def world_of(acts: list[rig.Act] | Iterator[rig.Act]) -> devices.SimWorld:
+    """A world that plays `acts`."""
+    return devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
+
+
+def quiet() -> devices.SimWorld:
+    """A world in which the skin is idle for a minute; a test drives the lines itself."""
+    off = np.zeros((60 * RATE, 4, 4), np.uint8)
+    return world_of([rig.Act(off, 10**7, 10**7 + 1, "")])
+
+
+def test_sweeps_become_sentences(rigged: Callable[..., Rigged]):
+    """Twelve sweeps: each answered once, with a right checksum, nothing lost, at the far end of the serial line."""
+    world = world_of(script.tubes(1000, 12))
+    box = rigged(world)
+    verdicts = box.until(lambda: world.finished(box.box.answered))
+    box.seconds(0.1)
+    heard = answers(box)
+    assert [a.sweep for a in heard] == list(range(1, 13))
+    assert [a.label for a in heard] == [v.label for v in verdicts]
+    assert {a.status for a in heard} <= {"ok", "unsure"}
+    assert sum(a.lost for a in heard) == 0
+    assert box.box.tally.lost_frames == 0
+    for line in box.heard:
+        pynmea2.parse(line, check=True)
+    assert all(",sim," in line for line in box.heard if ",RES," in line)
+
+
+def test_windows_are_the_middle_of_what_was_slid(rigged: Callable[..., Rigged]):
+    """The window that reaches the network is, digit for digit, the middle of the act that the robot played."""
+    world = world_of(script.tubes(1001, 3))
+    box = rigged(world)
+    box.until(lambda: world.finished(box.box.answered))
+    for sweep, act in zip(box.kept, world.robot.played, strict=True):
+        middle = (act.start + act.stop) // 2
+        near = [(act.frames[middle - 750 + k : middle + 750 + k] == sweep.frames.taxels).all() for k in (-1, 0, 1)]
+        assert any(near)
+
+
+def test_lines_follow_the_sweep(rigged: Callable[..., Rigged]):
+    """READY falls and BUSY rises with the sweep; class bits, then RESULT VALID; both fall when the next one starts."""
+    world = world_of(script.tubes(1002, 2))
+    box = rigged(world)
+    box.until(lambda: world.finished(box.box.answered))
+    box.seconds(0.1)
+
+    def changes(*names: str) -> list[tuple[int, str, bool]]:
+        return [w for w in world.gpio.written if w[1] in names]
+
+    cycle = [(devices.READY, False), (devices.BUSY, True), (devices.READY, True), (devices.BUSY, False)]
+    assert [w[1:] for w in changes(devices.READY, devices.BUSY)] == [(devices.READY, True), *cycle, *cycle]
+    assert [level for _, _, level in changes(devices.RESULT_VALID)] == [True, False, True]
+    falls = changes(devices.RESULT_VALID)[1][0]
+    second = [t for t, _, level in changes(devices.BUSY) if level][1]
+    assert falls == second
+
+
+def test_dead_process_is_not_ready(default_bundle: bundle.Bundle):
+    """A killed process closes nothing: the kernel takes its lines back, and READY reads low."""
+    world = quiet()
+    box = assembly.box(config.load(None), default_bundle, world, StdoutPort("sim"), ExitStack())
+    for _ in range(5):
+        box.step()
+    assert [v for _, n, v in world.gpio.written if n == devices.READY] == [True]
+    for request in list(world.gpio.requests):
+        request.release()
+    assert [v for _, n, v in world.gpio.written if n == devices.READY] == [True, False]
+
+
+def test_unplugged_during_a_sweep(rigged: Callable[..., Rigged]):
+    """The sweep is answered `sensor-lost` at once; FAULT; a trigger meanwhile is `not-ready`; after replugging all is well."""
+    world = world_of(script.tubes(1003, 3))
+    box = rigged(world)
+    box.until(lambda: box.box.answered == 1)
+    begin = world.clock.now_ns()
+    world.backend.at(begin + 2 * SECOND, world.backend.unplug)
+    world.backend.at(begin + round(3.9 * SECOND), world.backend.plug)
+    lost = box.until(lambda: box.box.answered == 2)
+    assert lost[0].status is Status.SENSOR_LOST
+    assert world.clock.now_ns() - begin < 2.2 * SECOND
+    box.until(lambda: world.finished(box.box.answered))
+    box.seconds(0.1)
+    assert [a.status for a in answers(box)][1:] in (
+        ["sensor-lost", "ok"],
+        ["sensor-lost", "not-ready"],
+        ["sensor-lost", "unsure"],
+    )
+    fault = [level for _, name, level in world.gpio.written if name == devices.FAULT]
+    assert fault == [True, False]
+
+
+def test_trigger_while_not_ready_is_answered(rigged: Callable[..., Rigged]):
+    """No skin: the start edge gets its answer, its stop edge none."""
+    world = quiet()
+    world.backend.unplug()
+    box = rigged(world)
+    box.pulse(devices.START, 0.5)
+    box.pulse(devices.STOP, 3)
+    verdicts = box.seconds(4)
+    assert [v.status for v in verdicts] == [Status.NOT_READY]
+
+
+@pytest.mark.parametrize(
+    ("edges", "want"),
+    [
+        ([(devices.START, 0.5), (devices.STOP, 1.5)], ["short"]),
+        ([(devices.START, 0.5)], ["long"]),
+        ([(devices.START, 0.5), (devices.STOP, 14)], ["long"]),
+        ([(devices.STOP, 0.5)], ["no-start"]),
+        ([(devices.START, 0.5), (devices.START, 1.5), (devices.STOP, 4.5)], ["no-stop", "no-contact"]),
+        ([(devices.START, 0.5), (devices.STOP, 3.5)], ["no-contact"]),
+    ],
+)
+def test_triggers_out_of_order(rigged: Callable[..., Rigged], edges: list[tuple[str, float]], want: list[str]):
+    """Short, long, lone and double edges: a defined answer each, as sentences."""
+    box = rigged(quiet())
+    for name, after_s in edges:
+        box.pulse(name, after_s)
+    box.seconds(16)
+    assert [a.status for a in answers(box)] == want
+
+
+def test_storm_of_edges(rigged: Callable[..., Rigged]):
+    """10,000 edges in a second: answered `edges-lost`, no frame lost, and the next sweep is fine."""
+    frames = slide()
+    quiet_act = rig.Act(np.zeros((6 * RATE, 4, 4), np.uint8), 10**7, 10**7 + 1, "")
+    world = world_of([quiet_act, *touched(frames)])
+    box = rigged(world)
+    box.seconds(0.5)
+    for i in range(10_000):
+        box.edge(devices.START, 0.5 + i * 1e-4, i % 2 == 0)
+    box.seconds(4)
+    storm = box.box.answered
+    assert 1 <= storm <= 10
+    box.until(lambda: box.box.answered == storm + 1)
+    box.seconds(0.1)
+    heard = answers(box)
+    assert "edges-lost" in {a.status for a in heard[:-1]}
+    assert heard[-1].status in ("ok", "unsure")
+    assert box.box.tally.lost_frames == 0
+
+
+@pytest.mark.parametrize(("packet_frames", "statuses"), [(2, {"ok", "unsure"}), (4, {"gap"})])
+def test_missing_frames(rigged: Callable[..., Rigged], packet_frames: int, statuses: set[str]):
+    """A lost packet within the window: two frames are interpolated and counted, four make it a `gap`."""
+    world = world_of(touched(slide()))
+    world.backend.board = rig.Board(skin.FORMAT, world.robot, world.clock, packet_frames=packet_frames)
+    count = itertools.count()
+    world.backend.mangle = lambda data: b"" if next(count) == 1500 // packet_frames else data
+    box = rigged(world)
+    box.until(lambda: box.box.answered == 1)
+    box.seconds(0.1)
+    (answer,) = answers(box)
+    assert answer.status in statuses
+    assert answer.lost == box.box.tally.lost_frames == packet_frames
+
+
+def spoiled(how: str) -> np.ndarray:
+    """A slide with a skin that is not as it should be."""
+    frames = slide("plastic rough")
+    if how == "saturated":
+        frames[:, 1:3, 1:3] = 255 - (np.arange(len(frames)) % 7 == 0)[:, None, None]
+    elif how == "stuck-taxel":
+        frames[:, 1, 2] = 77
+    elif how == "dead-taxel":
+        frames[:, 2, 1] = 0
+    elif how == "no-contact":
+        frames = np.random.default_rng(0).integers(0, 2, frames.shape).astype(np.uint8)
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("how", "detail"),
+    [("saturated", "taxel 2.2"), ("stuck-taxel", "taxel 2.3"), ("dead-taxel", "taxel 3.2"), ("no-contact", "digits")],
+)
+def test_a_spoiled_skin_is_seen_before_the_network_is_asked(rigged: Callable[..., Rigged], how: str, detail: str):
+    """Saturation, stuck and dead taxels, no contact: a status with the place, and no label."""
+    box = rigged(world_of(touched(spoiled(how))))
+    (verdict,) = box.until(lambda: box.box.answered == 1)
+    assert (verdict.status, verdict.label) == (how, "")
+    assert detail in verdict.detail
+    assert len(verdict.scores) == 0
+
+
+def test_sweeps_of_one_object_are_fused(rigged: Callable[..., Rigged]):
+    """Before NEW OBJECT sweeps stand alone; after it they count together, until the next one."""
+    acts = [replace(a, new_object=i in (1, 4)) for i, a in enumerate(script.tubes(1005, 6))]
+    box = rigged(world_of(acts))
+    verdicts = box.until(lambda: box.box.answered == 6)
+    assert [v.fused for v in verdicts] == [1, 1, 2, 3, 1, 2]
+
+
+def test_fusing_can_be_turned_off(rigged: Callable[..., Rigged]):
+    """With `classifier.fuse=none` NEW OBJECT changes nothing."""
+    acts = [replace(a, new_object=i == 0) for i, a in enumerate(script.tubes(1005, 3))]
+    box = rigged(world_of(acts), sets=("classifier.fuse=none",))
+    assert [v.fused for v in box.until(lambda: box.box.answered == 3)] == [1, 1, 1]
+
+
+def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):
+    """Identity, state, self-test, tare, new object, abort: each is answered; a bad one says what would be right."""
+    box = rigged(quiet())
+    box.seconds(1)
+    assert default_bundle.id in box.ask("$PPLP,ID")
+    assert "SIM0001" in box.ask("$PPLP,ID")
+    assert ",streaming,0,0," in box.ask("$PPLP,STATE")
+    assert ",TEST,ok," in box.ask("$PPLP,TEST")
+    assert ",TARE,ok,largest 0.0 digits" in box.ask("$PPLP,TARE")
+    assert ",NEW,ok" in box.ask("$PPLP,NEW")
+    assert ",ABORT,error,no sweep is open" in box.ask("$PPLP,ABORT")
+    assert "known are" in box.ask("$PPLP,DANCE")
+
+
+def test_tare_moves_the_contact_threshold(rigged: Callable[..., Rigged]):
+    """An offset that looks like a touch is none after a tare; a tare during a sweep is refused."""
+    offset = np.random.default_rng(0).integers(40, 42, (9 * RATE, 4, 4)).astype(np.uint8)
+    box = rigged(world_of([rig.Act(offset, 10**7, 10**7 + 1, "")]))
+    box.seconds(1)
+    assert "largest 4" in box.ask("$PPLP,TARE")
+    box.pulse(devices.START, 0.1)
+    box.pulse(devices.STOP, 3)
+    box.seconds(0.2)
+    assert ",TARE,error,tare needs" in box.ask("$PPLP,TARE")
+    assert [v.status for v in box.until(lambda: box.box.answered == 1)] == [Status.NO_CONTACT]
+
+
+def test_abort_answers_the_open_sweep(rigged: Callable[..., Rigged]):
+    """ABORT: the sweep is answered, its stop edge gets nothing more."""
+    box = rigged(quiet())
+    box.pulse(devices.START, 0.2)
+    box.pulse(devices.STOP, 3)
+    box.seconds(0.5)
+    assert ",ABORT,ok" in box.ask("$PPLP,ABORT")
+    box.seconds(4)
+    assert [a.status for a in answers(box)] == ["aborted"]
+
+
+def test_stopping_answers_what_is_open(rigged: Callable[..., Rigged]):
+    """The loop ends when told, and the sweep that was open is answered `aborted`."""
+    box = rigged(quiet())
+    box.pulse(devices.START, 0.2)
+    end = box.world.clock.now_ns() + SECOND
+    box.box.run(lambda: box.world.clock.now_ns() > end)
+    box.listen(SETTLE_S)
+    assert [a.status for a in answers(box)] == ["aborted"]
+
+
+def test_state_is_said_once_a_second(rigged: Callable[..., Rigged]):
+    """One STA sentence a second, with the frames so far."""
+    box = rigged(quiet())
+    box.seconds(10)
+    states = [h.split(",") for h in box.heard if ",STA," in h]
+    assert len(states) in (10, 11)
+    assert int(states[-1][6]) > 6500
+    assert {s[3] for s in states[1:]} == {"streaming"}
+
+
+def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]):
+    """The line is full: sentences are dropped and counted, every frame and every sweep is still taken."""
+    world = world_of(script.tubes(1006, 20))
+    box = rigged(world, sets=("serial.queue=4", "serial.state_s=0.05"))
+    while not world.finished(box.box.answered):
+        box.box.step()
+    assert box.port.dropped > 0
+    assert box.box.tally.lost_frames == 0
+    assert box.box.answered == 20
+
+
+def test_trouble_is_logged_once(rigged: Callable[..., Rigged]):
+    """What goes wrong is logged when it begins and when it ends, not at every turn."""
+    lines: list[str] = []
+    world = quiet()
+    box = rigged(world, log=lines.append)
+    box.seconds(1)
+    world.backend.unplug()
+    box.seconds(2)
+    world.backend.plug()
+    box.seconds(1)
+    skin_lines = [line.removeprefix(WARNING) for line in lines if "skin: " in line]
+    assert skin_lines[0] == "skin: streaming"
+    assert skin_lines[-1] == "skin: streaming"
+    assert 3 <= len(skin_lines) <= 4

@@ -1,0 +1,244 @@
+"""What a person is told: the status file and its reader, and the lines of the journal."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import ApplianceError, FormatError
+from appliance.core.health import Health
+from appliance.core.types import Status, Verdict
+from appliance.service import journal, status
+from appliance.service.status import StatusFile
+from appliance.sim import rig
+from tests.factories.simulated_box import SECOND, Rigged
+
+HEALTH = Health(
+    time_ns=0, skin="streaming", trouble="", streams=True, sweeping=False, answered=7, frames=5_000_000, lost_frames=3,
+    garbage_bytes=0, enumerations=1, dropped=0, bundle="9f3c2a1b", source="usb",
+)  # fmt: skip
+AWAY = replace(HEALTH, skin="absent", trouble="no skin on USB; check cable", streams=False)
+OK = Verdict(
+    sweep=7, time_ns=0, status=Status.OK, label="plastic rough", probability=0.987, margin=0.9, scores=np.ones(2) / 2,
+    fused=1, lost=0, latency_ns=1_200_000, bundle="9f3c2a1b",
+)  # fmt: skip
+SHORT = replace(OK, sweep=8, status=Status.SHORT, label="", probability=0.0, fused=0, scores=np.empty(0))
+
+
+class Teller:
+    """A status file on a virtual clock."""
+
+    def __init__(self, folder: Path, **more: object) -> None:
+        self.clock, self.path, self.log = rig.VirtualClock(), folder / "status.json", []
+        self.file = StatusFile(self.path, self.clock, log=self.log.append, **more)
+
+    def turns(self, seconds: float, health: Health = HEALTH, step_s: float = 0.01) -> int:
+        """Take turns; how often the file was written anew."""
+        inodes, end_ns = [], self.clock.now_ns() + round(seconds * SECOND)
+        while self.clock.now_ns() < end_ns:
+            self.file.turn(health)
+            inodes.append(self.path.stat().st_mtime_ns if self.path.exists() else 0)
+            self.clock.sleep_until(self.clock.now_ns() + round(step_s * SECOND))
+        return len(set(inodes))
+
+    def read(self) -> dict:
+        """What a reader makes of it now."""
+        return status.read(self.path, self.clock.now_ns())
+
+    def said(self) -> str:
+        """The same in words."""
+        return "\n".join(status.lines(self.read(), self.clock.now_ns()))
+
+
+@pytest.fixture
+def teller(tmp_path: Path) -> Teller:
+    """A status file that nobody has written yet."""
+    return Teller(tmp_path)
+
+
+def test_it_is_written_once_a_second_and_soon_after_news(teller: Teller):
+    """Four times in four seconds of turns; a verdict, and a lost skin, are there a tenth of a second later."""
+    assert teller.turns(4) in (4, 5)
+    teller.file.turn(HEALTH)
+    teller.file.send(OK)
+    teller.turns(0.12)
+    assert [v["sweep"] for v in teller.read()["verdicts"]] == [7]
+    teller.turns(0.12, AWAY)
+    assert teller.read()["skin"] == "absent"
+
+
+def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(teller: Teller):
+    """Verdicts with every turn: one write in a tenth of a second, and the last twenty are kept."""
+    written = 0
+    for i in range(100):
+        teller.file.send(replace(SHORT, sweep=i))
+        before = teller.path.stat().st_ino if teller.path.exists() else None
+        teller.file.turn(HEALTH)
+        written += teller.path.stat().st_ino != before
+        teller.clock.sleep_until(teller.clock.now_ns() + SECOND // 100)
+    assert 9 <= written <= 11
+    assert len(teller.read()["verdicts"]) == 20
+
+
+def test_every_user_may_read_it_whole(teller: Teller):
+    """Mode 644 under the service's umask; the file is replaced, so a reader that had it open still has it whole."""
+    before = os.umask(0o027)
+    try:
+        teller.turns(0.01)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(teller.path.stat().st_mode) == 0o644
+    with teller.path.open() as f:
+        teller.turns(2)
+        assert json.load(f)["answered"] == 7
+    assert [p.name for p in teller.path.parent.iterdir()] == ["status.json"]
+
+
+def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
+    """Since when, skin, bundle, further facts, the last verdicts newest first; advice where something is wrong."""
+    teller = Teller(tmp_path, more=lambda: {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]})
+    teller.file.send(replace(OK, sweep=6, detail="moved 2.1 mm too far towards row 4"))
+    teller.file.send(OK)
+    teller.file.send(SHORT)
+    teller.turns(135)
+    said = teller.said().splitlines()
+    assert said[0] == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source usb)"
+    assert said[1:5] == [
+        "skin     streaming (5,000,000 frames, 3 lost)",
+        "bundle   9f3c2a1b",
+        "sweeps   7 answered",
+        "trial    start 1 of 3, 7 of 20 sweeps",
+    ]
+    assert [line.split()[1] for line in said[5:]] == ["8", "7", "6"]
+    assert "short        the stop edge came before a window" in said[5]
+    assert said[6].split()[-6:] == ["plastic", "rough", "98.7", "%", "1.2", "ms"]
+    assert said[7].endswith("1.2 ms; moved 2.1 mm too far towards row 4")
+    assert status.exit_code(teller.read()) == 0
+    teller.turns(1.5, replace(AWAY, garbage_bytes=9, enumerations=2, dropped=4))
+    said = teller.said()
+    assert "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, plugged in 2 t" in said
+    assert "serial   4 sentences dropped, since nobody read them" in said
+    assert status.exit_code(teller.read()) == 69
+
+
+def test_what_a_device_says_does_not_steer_a_terminal(teller: Teller):
+    """Escape characters from outside are shown as question marks."""
+    teller.turns(0.01, replace(AWAY, trouble="\x1b[2Jgone\n"))
+    assert "?[2Jgone?" in teller.said()
+
+
+def test_a_program_that_has_ended_is_not_running(teller: Teller):
+    """Stopped in order the file is gone; killed, hung, or of before the last boot it says why; all exit 1."""
+    assert status.exit_code(teller.read()) == 1
+    assert "does not run" in teller.said()
+    teller.turns(0.01)
+    assert teller.read()["running"]
+    written = json.loads(teller.path.read_text())
+    teller.clock.sleep_until(teller.clock.now_ns() + 11 * SECOND)
+    assert "has told nothing for 11 s, it hangs" in teller.said()
+    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    for wrong in ({"pid": int(gone.stdout)}, {"time_ns": 10**18}):
+        teller.path.write_text(json.dumps(written | {"time_ns": teller.clock.now_ns()} | wrong))
+        assert "has ended without a word" in teller.said()
+        assert status.exit_code(teller.read()) == 1
+    teller.file.stopping()
+    assert not teller.path.exists()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"schema": 2}', "[" * 100_000, '{"schema": 1, "pid": "x"}'])
+def test_a_file_of_another_form_is_named(teller: Teller, text: str):
+    """What is no status of this version is an error, not a guess."""
+    teller.path.write_text(text)
+    with pytest.raises(FormatError, match="not a status of this version"):
+        teller.read()
+
+
+def test_a_file_that_may_not_be_read_is_named(teller: Teller):
+    """A folder in its place: the error names the path and what to try."""
+    teller.path.mkdir()
+    with pytest.raises(ApplianceError, match="cannot be read"):
+        teller.read()
+
+
+def test_trouble_with_the_file_is_told_once(tmp_path: Path):
+    """Without its folder the box goes on; one line, and another only after it had worked in between."""
+    teller = Teller(tmp_path / "run")
+    teller.turns(5)
+    assert len(teller.log) == 1
+    assert "classifying goes on" in teller.log[0]
+    teller.path.parent.mkdir()
+    teller.turns(2)
+    assert teller.read()["running"]
+    teller.path.unlink()
+    teller.path.parent.rmdir()
+    teller.turns(2)
+    teller.file.stopping()
+    assert len(teller.log) == 2
+
+
+def test_a_box_at_work_tells_its_verdicts(rigged, tmp_path: Path):
+    """On the rig: skin, bundle and verdicts of the box itself, and the same verdicts in the journal."""
+    world_clock = rig.VirtualClock()
+    told = StatusFile(tmp_path / "status.json", world_clock)
+    lines: list[str] = []
+    box: Rigged = rigged(pulses=[told], also=[told, journal.Journal(lines.append)])
+    verdicts = box.until(lambda: box.box.answered >= 2)
+    world_clock.sleep_until(SECOND * 60)
+    box.seconds(0.2)
+    read = status.read(tmp_path / "status.json", world_clock.now_ns())
+    assert (read["skin"], read["answered"], read["bundle"]) == ("streaming", 2, verdicts[0].bundle)
+    assert [(v["sweep"], v["label"]) for v in read["verdicts"]] == [(v.sweep, v.label) for v in verdicts]
+    assert [line.split(",")[0] for line in lines] == [f"sweep {v.sweep}: {v.label}" for v in verdicts]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "line"),
+    [
+        (OK, "sweep 7: plastic rough, 98.7 % (1.2 ms)"),
+        (replace(OK, fused=3), "sweep 7: plastic rough, 98.7 % after 3 sweeps (1.2 ms)"),
+        (replace(OK, share=0.4), "sweep 7: plastic rough, 98.7 %, early at 40 % of the window (1.2 ms)"),
+        (replace(OK, status=Status.UNSURE), "sweep 7: unsure, perhaps plastic rough, 98.7 % (1.2 ms)"),
+        (replace(OK, moved="moved 2 mm", detail="moved 2 mm"), "<4>sweep 7: plastic rough, 98.7 % (1.2 ms); moved 2 mm"),
+        (SHORT, "<4>sweep 8: no answer, short: the stop edge came before a window's length had passed"),
+        (replace(SHORT, status=Status.STUCK_TAXEL, detail="taxel 2.3"),
+         "<4>sweep 8: no answer, stuck-taxel: a loaded taxel does not move; look at the skin; taxel 2.3"),
+        (replace(SHORT, status=Status.ABORTED), "sweep 8: no answer, aborted: by command, or because the box was stopping"),
+    ],
+)  # fmt: skip
+def test_the_journal_has_one_line_a_verdict(verdict: Verdict, line: str):
+    """In words; what asks for a look is a warning."""
+    lines: list[str] = []
+    journal.Journal(lines.append).send(verdict)
+    assert lines == [line]
+
+
+def test_every_status_without_a_label_has_its_reason():
+    """One list: a new status must say what to look at."""
+    assert set(journal.REASONS) == {s for s in Status if not s.classified}
+
+
+def test_levels_are_for_the_journal_alone():
+    """A terminal reads who speaks, and no level; the journal knows the former and wants the latter."""
+    assert journal.spoken("<4>skin: gone", True) == "<4>skin: gone"
+    assert journal.spoken("<4>skin: gone", False) == "palpate: skin: gone"
+    assert journal.spoken("skin: <4>", False) == "palpate: skin: <4>"
+    assert journal.spoken("skin: X\r\n<0>board", True) == "skin: X <0>board"
+
+
+def test_the_journal_is_known_by_its_stream(tmp_path: Path):
+    """JOURNAL_STREAM must name this very stream: a child with its output elsewhere is not in the journal."""
+    with (tmp_path / "out").open("w") as f:
+        held = os.fstat(f.fileno())
+        environ = {"JOURNAL_STREAM": f"{held.st_dev}:{held.st_ino}"}
+        assert journal.attached(environ, f.fileno())
+        assert not journal.attached({}, f.fileno())
+        assert not journal.attached(environ, 0)
+    assert not journal.attached(environ, 1_000_000)

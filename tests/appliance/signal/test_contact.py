@@ -1,0 +1,492 @@
+"""The room of the skin's place: the contact's centre, what is said of it, and `palpate place` in a terminal."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import io
+import math
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from appliance.alignment import live
+from appliance.alignment.live import Placing, View
+from appliance.alignment.terminal import ASCII, BLOCKS, ENTER, LEAVE, Canvas, Screen
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle, Manifest
+from appliance.core import config
+from appliance.core.clock import SystemClock
+from appliance.core.config import SensorConfig
+from appliance.core.errors import BundleError, FormatError
+from appliance.core.types import Status, Verdict
+from appliance.inference.classifier import Classifier
+from appliance.io.robot_link import MAX_LINE, result
+from appliance.signal.contact import Place, advice, centre, mended, moved
+from appliance.sim import devices, rig, script, skin
+from tests.factories.paths import NO_SITE
+from tests.factories.simulated_box import SECOND, idle_world
+from train.data import sets
+from train.data.sets import SweepSet
+from train.export import contact_positions
+
+TARE = np.zeros((4, 4))
+MIDDLE = Place(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
+NAN, INF = float("nan"), float("inf")
+
+
+def digits(load: Any) -> np.ndarray:
+    """Frames [2, R, C] with this load."""
+    return np.stack([np.asarray(load, float)] * 2)
+
+
+def patch(row: float, col: float) -> np.ndarray:
+    """Loads of a round contact with its centre there, in taxels; 1.2 taxels wide each way."""
+    r, c = np.mgrid[0:4, 0:4]
+    return np.maximum(0, 100 * (1 - ((r - row) ** 2 + (c - col) ** 2) / 1.3**2))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"pitch_mm": 0.0}, "pitch_mm"),
+        ({"pitch_mm": NAN}, "pitch_mm"),
+        ({"pitch_mm": "4"}, "pitch_mm"),
+        ({"limit_mm": -1.0}, "limit_mm"),
+        ({"limit_mm": INF}, "limit_mm"),
+        ({"pitch_mm": 1e7}, "pitch_mm"),
+        ({"rows_mm": (6.0, -1e7)}, "rows_mm"),
+        ({"limit_mm": True}, "limit_mm"),
+        ({"rows_mm": ()}, "rows_mm"),
+        ({"rows_mm": (6.0, NAN)}, "rows_mm"),
+        ({"rows_mm": [6.0, 6.4]}, "rows_mm"),
+        ({"cols_mm": (6.0, None)}, "cols_mm"),
+        ({"cols_mm": (6.0,)}, "1 cols_mm"),
+        ({"rows_mm": (6.0,) * 1001, "cols_mm": (6.0,) * 1001}, "1000"),
+    ],
+)
+def test_a_place_that_makes_no_sense_is_refused(wrong: dict[str, Any], told: str):
+    """Numbers that are none, not finite, too many or not in pairs: a BundleError that names them."""
+    with pytest.raises(BundleError, match=re.escape(told)):
+        replace(MIDDLE, **wrong)
+
+
+def test_a_place_goes_through_the_manifest(default_bundle: Bundle):
+    """Written as JSON and read again it is the same."""
+    manifest = replace(default_bundle.manifest, place=MIDDLE, schema=3)
+    assert Manifest.parse(manifest.json()).place == MIDDLE
+
+
+@pytest.mark.parametrize("at", [(1.5, 1.5), (1.0, 2.0), (1.8, 1.4), (2.0, 1.0)])
+def test_the_centre_of_a_contact_that_lies_on_the_skin(at: tuple[float, float]):
+    """It is found to .15 of a taxel, with any tare, and whatever lies below the threshold of contact."""
+    load = patch(*at)
+    for tare in (TARE, np.arange(16.0).reshape(4, 4)):
+        noisy = load + tare + 4 * (np.indices((4, 4)).sum(0) == 6)
+        assert centre(digits(noisy), tare, 5.0) == pytest.approx(at, abs=0.15)
+
+
+def test_without_contact_there_is_no_centre():
+    """Below the threshold, or where a floating-point skin gives no number: None, and nothing is moved."""
+    for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):
+        assert centre(digits(load), TARE, 5.0) is None
+        assert moved(digits(load), TARE, 5.0, MIDDLE) == ""
+    one = np.where(np.indices((4, 4)).sum(0) == 6, INF, patch(1.5, 1.5))
+    assert centre(digits(one), TARE, 5.0) == pytest.approx((1.5, 1.5))
+
+
+def test_a_threshold_below_zero_takes_no_pulled_taxel_along():
+    """A tared skin's threshold may be negative; what is pulled has no weight."""
+    load = np.array([[-3.0, 0, 0, 0], [0, 50, 50, 0], [0, 50, 50, 0], [0, 0, 0, -3]])
+    assert centre(digits(load), TARE, -10.0) == (1.5, 1.5)
+
+
+@pytest.mark.parametrize("dead", [(1, 1), (2, 2), (1, 0), (0, 2)])
+def test_a_dead_taxel_does_not_push_the_centre_away(dead: tuple[int, int]):
+    """Silent between two loaded ones it is filled in: the centre stays within .15 taxels; left silent it would not."""
+    load = patch(1.5, 1.5) + 30
+    whole = np.array(centre(digits(load), TARE, 5.0))
+    load[dead] = 0
+    there = np.array(centre(digits(load), TARE, 5.0))
+    assert np.hypot(*(there - whole)) < 0.15
+    silent = np.array([(load.sum(a) @ np.arange(4)) / load.sum() for a in (1, 0)])
+    assert np.hypot(*(silent - whole)) > 2 * np.hypot(*(there - whole))
+
+
+def test_the_rim_of_a_contact_is_not_filled_in():
+    """A taxel that is silent beside the contact, or at its corner, stays so."""
+    load = np.zeros((4, 4))
+    load[1:3, 0:3] = 50
+    load[1, 2] = 0
+    assert (mended(load) == load).all()
+
+
+@pytest.mark.parametrize(
+    ("along", "axis", "towards"), [("dx_mm", 0, ("row 4", "row 1")), ("dy_mm", 1, ("column 4", "column 1"))]
+)
+def test_the_simulated_skin_is_told_where_it_is(along: str, axis: int, towards: tuple[str, str]):
+    """A skin that sits ever further ahead: the centre goes ever further back, the advice names the right end."""
+    found = []
+    for mm in (-4.0, -3.0, 0.0, 3.0, 4.0):
+        window = skin.window("wood", skin.Placement(**{along: mm}, seed=3), np.random.default_rng(0))[:200]
+        found.append(centre(window, TARE, 5.4)[axis])
+        said = moved(window, TARE, 5.4, MIDDLE)
+        assert said == "" if mm == 0 else said.endswith(f"mm too far towards {towards[mm > 0]}")
+    assert (np.diff(found) < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("offset", "said"),
+    [
+        ((2.1, 0.0), "2.1 mm too far towards row 4"),
+        ((-2.1, 0.5), "2.1 mm too far towards row 1"),
+        ((0.2, -1.26), "1.3 mm too far towards column 1"),
+        ((1.0, 3.0), "3.0 mm too far towards column 5 and 1.0 mm towards row 4"),
+        ((-3.0, -1.0), "3.0 mm too far towards row 1 and 1.0 mm towards column 1"),
+    ],
+)
+def test_the_advice_names_direction_and_distance(offset: tuple[float, float], said: str):
+    """The larger direction first; one that hardly matters is left out."""
+    assert advice(offset, (4, 5)) == said
+
+
+def test_the_nearest_position_counts():
+    """Distance is to the nearest position, not to their middle; the limit itself is within."""
+    two = Place(2.0, (0.0, 6.0), (0.0, 0.0), 0.5)
+    assert two.offset((3.1, 0.0)) == pytest.approx((0.2, 0.0))
+    assert two.within((0.3, -0.4))
+    assert not two.within((0.3, -0.41))
+
+
+def test_a_sentence_keeps_what_matters_most_of_the_advice():
+    """Where a RES sentence is cut at its 128 characters, the larger direction is still in it."""
+    detail = f"moved {advice((-12.5, 11.5), (4, 4))}"
+    scores = np.array([0.98, 0.02])
+    v = Verdict(12345, 10**14, Status.OK, "plastic rough", 0.98, 0.96, scores, 1, 0, 400_000, "9f3c2a1b", detail)
+    line = result(v, "usb")
+    assert len(line) <= MAX_LINE
+    assert b"moved 12.5 mm too far towards row 1" in line
+
+
+@pytest.fixture
+def model(default_bundle: Bundle) -> Bundle:
+    """The default bundle, with trained positions."""
+    return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE, schema=3))
+
+
+def placing(world: devices.SimWorld, model: Bundle) -> tuple[Placing, Callable[[float], list[View]]]:
+    """A Placing on `world`, and what gives its Views of so many seconds."""
+    how = world.wire(config.load(None, [], site=NO_SITE))
+    one = Placing(how.sensor, model, world)
+
+    def views(seconds: float) -> list[View]:
+        seen, end_ns, next_ns = [], world.clock.now_ns() + round(seconds * SECOND), world.clock.now_ns()
+        while world.clock.now_ns() < end_ns:
+            one.read()
+            if world.clock.now_ns() >= next_ns:
+                next_ns = world.clock.now_ns() + live.LOOK_NS
+                seen.append(one.view())
+        return seen
+
+    return one, views
+
+
+def resting(seed: int = 1) -> devices.SimWorld:
+    """The simulated finger that rests on the tube while the skin is placed."""
+    return devices.build(skin.FORMAT, script.named("rest", skin.FORMAT, seed)[0], rig.VirtualClock(), "sim")
+
+
+def states(views: list[View]) -> list[str]:
+    """States one after another, each once."""
+    return [v.state for i, v in enumerate(views) if i == 0 or v.state != views[i - 1].state]
+
+
+def test_somebody_places_the_skin(model: Bundle):
+    """Finger off, then four touches, each nearer: what is said goes with it, to the last one that is in place."""
+    _, views = placing(resting(), model)
+    seen = views(17)
+    assert states(seen)[:4] == ["wait", "no-contact", "off", "no-contact"]
+    assert states(seen)[-3:] == ["no-contact", "in-place", "no-contact"]
+    off = [v for v in seen if v.state == "off"]
+    assert off[3].said.startswith("2.5 mm too far towards column 1 and ")
+    assert off[3].said.endswith("towards row 1")
+    last = [v for v in seen if v.state == "in-place"][-4]
+    assert last.said == "in place"
+    assert last.centre == pytest.approx((6, 6), abs=0.6)
+    assert math.dist(last.centre, last.nearest) < MIDDLE.limit_mm
+    assert last.full == pytest.approx(max(max(row) for v in seen for row in v.load), abs=0.1)
+    assert [v.turn for v in seen] == list(range(1, len(seen) + 1))
+
+
+def pressed(*loads: float) -> devices.SimWorld:
+    """A skin with these loads on all taxels but the last, a second each."""
+    on = np.concatenate([np.full((750, 4, 4), load, np.uint8) for load in loads])
+    on[:, 3, 3] = 3
+    return devices.build(skin.FORMAT, [rig.Act(on, 0, len(on) - 1, "")], rig.VirtualClock(), "sim")
+
+
+def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
+    """Until each taxel was unloaded once nothing is advised; then the touch is seen as it is."""
+    _, views = placing(pressed(80, 95, 2, 80), model)
+    seen = views(4)
+    assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
+    assert "80 digits" in next(v for v in seen if v.state == "lift").todo
+    assert seen[-1].load[0][0] == pytest.approx(78)
+    assert seen[-1].load[3][3] == 0
+
+
+def test_an_unplugged_skin_is_told_and_waited_for(model: Bundle):
+    """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is read anew."""
+    world = resting()
+    _, views = placing(world, model)
+    views(2)
+    world.backend.unplug()
+    gone = views(0.6)[-1]
+    assert gone.state == "no-skin"
+    assert gone.said in ("no skin: absent", "no skin: lost")
+    assert gone.todo
+    assert gone.load == ()
+    world.backend.plug()
+    assert states(views(4)) == ["no-skin", "wait", "lift", "no-contact", "off"]
+
+
+def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
+    """It says that it has none, and what to do; the centre is in taxels."""
+    without = replace(default_bundle, manifest=replace(default_bundle.manifest, place=None))
+    _, views = placing(resting(), without)
+    last = [v for v in views(14.5) if v.centre][-1]
+    assert last.state == "no-positions"
+    assert "export it again" in last.todo
+    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
+    assert last.nearest is None
+
+
+def test_another_skin_shape(model: Bundle):
+    """A skin of 2 x 3 taxels and float digits, some of which are no numbers."""
+    fmt = replace(model.format, rows=2, cols=3, dtype="float32")
+    other = replace(
+        model,
+        manifest=replace(model.manifest, format=fmt, place=replace(MIDDLE, rows_mm=(2.0, 2.0), cols_mm=(4.0, 4.0))),
+    )
+    load = np.zeros((3000, 2, 3), np.float32)
+    load[1000:, :, 1:] = 60.0
+    load[:, 0, 0] = np.nan
+    world = devices.build(fmt, [rig.Act(load, 0, 2999, "")], rig.VirtualClock(), "sim")
+    seen = placing(world, other)[1](3)
+    assert seen[-1].said == "2.0 mm too far towards column 3"
+    assert seen[-1].load[0][0] == 0
+    screen = Canvas(seen[-1], ASCII, 80, 24, "").lines(False)
+    assert any("row 2" in line and "60" in line for line in screen)
+
+
+VIEW = View(7, "sim", "default 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1", "move it", (4, 4),
+            tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4)), 80.0, (3.8, 6.0), (6.0, 6.0), MIDDLE)  # fmt: skip
+
+
+def test_a_pipe_gets_one_plain_line_a_second():
+    """No control characters; the words, the centre, and that it is simulated."""
+    out = io.StringIO()
+    with Screen(out, "http://127.0.0.1:8137") as screen:
+        for tenth in range(25):
+            screen.show(VIEW, tenth * SECOND // 10)
+    first, *lines = out.getvalue().splitlines()
+    assert first == "page: http://127.0.0.1:8137"
+    assert lines == ["SIMULATED  2.2 mm too far towards row 1  centre row 3.8 column 6.0 mm  (move it)"] * 3
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (132, 50), (40, 16), (20, 5), (1, 1)])
+@pytest.mark.parametrize("signs", [BLOCKS, ASCII])
+def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
+    """No line is longer and none is too many; at 80 x 24 all digits, both places, words and the key are there."""
+    lines = Canvas(VIEW, signs, width, height, "http://127.0.0.1:8137").lines(False)
+    plain = [re.sub(r"\033\[[0-9;]*m", "", line) for line in lines]
+    assert len(lines) == height
+    assert all(len(line) <= width for line in plain)
+    if width < 80:
+        return
+    text = "\n".join(plain)
+    wanted = [
+        "SIMULATED",
+        "2.2 mm too far towards row 1",
+        "move it",
+        "row 4",
+        "col 4",
+        "Ctrl-C ends",
+        "http://127.0.0.1:8137",
+    ]
+    assert all(word in text for word in wanted + [f"{20 * r + c} " for r in range(4) for c in range(4)])
+    row_1, row_4 = (
+        next(line for line in plain if f"row {n}" in line and "│" in line.replace("|", "│")) for n in (1, 4)
+    )
+    assert signs[0] * 4 in row_1.replace(" ", signs[0])
+    assert signs[3] in row_4
+    assert f"({signs[5]})" in text
+    assert signs[6] in "\n".join(plain[9:14])
+    assert all(ord(sign) < 128 for sign in text) == (signs is ASCII)
+
+
+def test_a_place_beside_the_skin_is_shown_at_its_edge():
+    """However far: a bundle may name any number."""
+    far = replace(VIEW, place=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
+    lines = Canvas(far, ASCII, 80, 24, "").lines(False)
+    assert [
+        line.index("+") for plain in lines if "+" in (line := re.sub(r"\033\[[0-9;]*m", "", plain)) and "|" in line
+    ] == [24, 8]
+
+
+def test_only_a_terminal_that_knows_colours_gets_them():
+    """38;5 for 256 colours; bold and inverse for all."""
+    assert any("38;5" in line for line in Canvas(VIEW, BLOCKS, 80, 24, "").lines(True))
+    plain = Canvas(VIEW, BLOCKS, 80, 24, "").lines(False)
+    assert not any("38;5" in line for line in plain)
+    assert any("\033[1;7m" in line for line in plain)
+
+
+def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
+    """Views come as fast as LOOK_NS allows, not one for each frame; `stopped` ends it and the skin is let go."""
+    world, out = resting(), io.StringIO()
+    end_ns = world.clock.now_ns() + 5 * SECOND
+    monkeypatch.setattr("appliance.alignment.terminal.LINE_NS", 0)
+    how = world.wire(config.load(None, [], site=NO_SITE))
+    live.run(how.sensor, model, world, out, lambda: world.clock.now_ns() >= end_ns)
+    assert 24 <= len(out.getvalue().splitlines()) <= 26
+    assert not world.backend.board.running
+
+
+def test_a_denied_skin_is_named(model: Bundle):
+    """What keeps the skin from being read is said with its remedy, and is no end."""
+    world = idle_world()
+    world.backend.errors["open"] = errno.EACCES
+    one = Placing(SensorConfig(), model, world)
+    one.read()
+    view = one.view()
+    assert (view.state, view.skin, view.said) == ("no-skin", "denied", "no skin: denied")
+    assert "udev" in view.todo
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle with trained positions, on disk."""
+    target = tmp_path_factory.mktemp("bundle")
+    for name in bundle.load(bundle.DEFAULT).manifest.files:
+        (target / name).write_bytes((bundle.DEFAULT / name).read_bytes())
+    manifest = Manifest.parse((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
+    (target / bundle.MANIFEST).write_bytes(replace(manifest, place=MIDDLE, schema=3).json())
+    return target
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """A terminal of 80 x 24: its far end and the one that programs get."""
+    far, near = os.openpty()
+    fcntl.ioctl(near, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    yield far, near
+    os.close(far)
+
+
+@pytest.mark.parametrize("kind", ["xterm-256color", "dumb"])
+def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal: tuple[int, int], kind: str):
+    """The command itself in a terminal: exit code 0; a screen of its own, left at the end; none where it is dumb."""
+    far, near = terminal
+    command = [sys.executable, "-m", "appliance", "place", "--sim", "rest", "--set", f"classifier.bundle={folder}"]
+    with subprocess.Popen(command, stdout=near, env=os.environ | {"TERM": kind}) as run:
+        os.close(near)
+        shown, pressed = b"", False
+        try:
+            while data := os.read(far, 65536):
+                shown += data
+                if b"SIMULATED" in shown and not pressed:
+                    pressed = True
+                    run.send_signal(signal.SIGINT)
+        except OSError:  # the terminal's end where the last writer has gone
+            pass
+        assert run.wait() == 0
+    text = shown.decode()
+    live = kind != "dumb"
+    assert (text.startswith(ENTER), text.endswith(LEAVE)) == (live, live)
+    assert ("\033" in text) == live
+    assert text.count("reading the unloaded skin") >= 1
+
+
+def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> SweepSet:
+    """A set with `each` sweeps at each of these places, in taxels."""
+    samples = np.stack([np.stack([patch(*at)] * 3) for at in places for _ in range(each)]).astype(np.float32)
+    n = len(samples)
+    numbers = {group: 7 + 2 * (np.arange(n) // each)}
+    return SweepSet(samples, np.arange(n) % 2, ("a", "b"), 100.0, numbers, "recorded")
+
+
+def test_the_places_of_a_training_set():
+    """One entry a position, in mm; where positions have no numbers, recordings; where neither, each sweep."""
+    at = [(1.5, 1.5), (1.0, 1.5), (2.0, 2.0)]
+    for group, each, entries in (("position", 2, 3), ("recording", 2, 3), ("force", 2, 6)):
+        found = contact_positions.place_of(trained(*at, group=group, each=each), 5.0, pitch_mm=2.0)
+        assert (found.pitch_mm, len(found.rows_mm)) == (2.0, entries)
+        every = [at[i * len(at) // entries] for i in range(entries)]
+        want = [centre(digits(patch(*one)), TARE, 5.0) for one in every]
+        assert np.stack([found.rows_mm, found.cols_mm], 1) == pytest.approx(2.0 * np.array(want), abs=1e-3)
+
+
+def test_the_limit_leaves_each_position_out():
+    """It is the farthest any sweep lies from the other positions; alone or all at one place, an eighth of the pitch."""
+    found = contact_positions.place_of(trained((1.5, 1.5), (1.5, 1.7), (1.5, 2.1)), 5.0, pitch_mm=4.0)
+    assert found.limit_mm == pytest.approx(found.cols_mm[2] - found.cols_mm[1], abs=0.01)
+    for positions in ([(1.5, 1.5)], [(1.5, 1.5)] * 3):
+        assert contact_positions.place_of(trained(*positions), 5.0, pitch_mm=4.0).limit_mm == 0.5
+
+
+def test_many_positions_are_thinned():
+    """A bundle names a thousand at most; of more, evenly drawn ones."""
+    found = contact_positions.place_of(trained(*[(1.5, 1 + i / 1100) for i in range(1100)], each=1), 5.0, pitch_mm=4.0)
+    assert len(found.rows_mm) == 1000
+    assert np.median(np.diff(found.cols_mm)) < 0.02
+    assert found.cols_mm[0] == 4.0
+    assert found.cols_mm[-1] > 7.9
+
+
+def test_sets_that_tell_no_place():
+    """Without a pitch, and where nothing was touched, there is none; simulated sets know theirs."""
+    assert contact_positions.place_of(trained((1.5, 1.5)), 5.0) is None
+    assert contact_positions.place_of(trained((1.5, 1.5)), 500.0, pitch_mm=4.0) is None
+    both = sets.join([sets.load("sim:T-LAB:1:1"), sets.load("sim:T-LAB:2:1")])
+    found = contact_positions.place_of(both, 5.0)
+    assert found.pitch_mm == skin.PITCH_MM
+    assert len(found.rows_mm) == 2
+    assert np.stack([found.rows_mm, found.cols_mm]) == pytest.approx(np.full((2, 2), 6.0), abs=1.5)
+
+
+def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
+    """A skin in its place is not flagged, one that sits a row ahead always is; figures, picture and lines agree."""
+    monkeypatch.setattr(contact_positions, "OFF_MM", (5.0,))
+    wide = replace(model, manifest=replace(model.manifest, place=Place(4.0, (5.5,), (6.0,), 1.2)))
+    told = contact_positions.measure(
+        Classifier(wide, SystemClock()), "sim:T-LAB:3:2", "sim:T-LAB:1:1", "sim:T-HARD:1:1", lambda line: None
+    )
+    assert told["other positions"]["moved"][0] == 0
+    assert told["T-HARD"]["moved"][0] == 1
+    back, home, ahead = told["moved"]["rows"]
+    assert (back["mm"], home["mm"], ahead["mm"]) == (-5, 0, 5)
+    assert home["accuracy"] == told["other positions"]["accuracy"]
+    assert (home["n"], home["tapings"], home["moved"][0], ahead["moved"][0]) == (12, 1, 0, 1)
+    assert back["told_mm"] > ahead["told_mm"] + 0.5  # the trained place is a little ahead
+    assert ahead["accuracy"][0] < home["accuracy"][0] > 0.8
+    assert told["rows, forwards"]["lost_at_mm"] == 5
+    assert ahead["told_mm"] > 1.2 > home["told_mm"]
+    text = "\n".join(contact_positions.lines(told))
+    assert "rows +5.0 mm" in text
+    assert "flagged" in contact_positions.chart(told)
+    with pytest.raises(FormatError, match="no positions"):
+        contact_positions.measure(
+            Classifier(replace(wide, manifest=replace(wide.manifest, place=None)), SystemClock()), "", "", "", print
+        )

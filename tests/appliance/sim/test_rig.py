@@ -1,0 +1,149 @@
+"""The virtual box's own rooms, without a guest: names of images, lines that are held, replies that cross, the table."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.core.clock import SystemClock
+from appliance.io import packets
+from appliance.sim import rig, skin
+from tests.factories import emulated_machines
+from tests.rig import image, notes
+from tests.rig.lines import HOLD_NS, GuestLines
+from tests.rig.usbredir import BULK, CANCEL, HELLO, Peer
+
+
+def test_an_image_is_named_by_what_goes_in(monkeypatch: pytest.MonkeyPatch):
+    """Another package, another ground; and another ground, another box on it."""
+    ground, box = image._ground_name(), image._box_name()
+    assert (image._ground_name(), image._box_name()) == (ground, box)
+    monkeypatch.setattr(image, "PACKAGES", (*image.PACKAGES, "nano"))
+    assert image._ground_name() != ground
+    assert image._box_name() != box
+
+
+def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
+    """A step that fails names its command and its words; no folder is there that looks like an image."""
+
+    def fail(part: Path) -> None:
+        (part / "half").touch()
+        image.run("ls", part / "nothing here")
+
+    with pytest.raises(image.Missing, match="nothing here"):
+        emulated_machines.whole(tmp_path / "made", fail)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_table_keeps_the_longest_run(tmp_path: Path):
+    """Of one fault the run with most repetitions counts, and of such the last."""
+    file = tmp_path / "faults.jsonl"
+    for outcome, times in (("early", 100), ("late", 100), ("short", 6)):
+        notes.write("tests/rig/test_a.py::test", "pulled", outcome, times, file)
+    notes.write("tests/rig/test_a.py::other", "cut", "back", 1, file)
+    assert notes.table(file)[2:] == ["| cut | back | 1 |", "| pulled | late | 100 |"]
+
+
+@pytest.fixture
+def qtest() -> Iterator[tuple[GuestLines, list[tuple[float, str]]]]:
+    """Lines on a socket that says OK to everything, and what it was asked, with times."""
+    ours, theirs = socket.socketpair()
+    asked: list[tuple[float, str]] = []
+
+    def answer() -> None:
+        for line in theirs.makefile():
+            asked.append((time.monotonic(), line.strip()))
+            theirs.sendall(b"OK\n")
+
+    threading.Thread(target=answer, daemon=True).start()
+    lines = GuestLines(ours, "/chip", ["START", "READY"])
+    yield lines, asked
+    lines.close()
+    theirs.close()
+
+
+def test_a_level_is_held_however_late_it_came(qtest: tuple[GuestLines, list[tuple[float, str]]]):
+    """A pulse of nothing becomes one of HOLD_NS, its edges in their order."""
+    lines, asked = qtest
+    now_ns = time.monotonic_ns()
+    lines.drive("START", False, now_ns + 1)
+    lines.drive("START", True, now_ns)
+    end = time.monotonic() + 10
+    while len(asked) < 3:
+        assert time.monotonic() < end, asked
+        time.sleep(0.01)
+    assert [line[-1] for _, line in asked[1:]] == ["1", "0"]
+    assert asked[2][0] - asked[1][0] > HOLD_NS / 1e9 - 0.01
+
+
+def test_a_line_that_the_box_drives_is_seen():
+    """The test socket's words become levels and a log."""
+    ours, theirs = socket.socketpair()
+    threading.Thread(target=lambda: (theirs.recv(99), theirs.sendall(b"OK\nIRQ raise 1\n")), daemon=True).start()
+    lines = GuestLines(ours, "/chip", ["START", "READY"])
+    assert lines.wait("READY", True, 10)
+    assert [entry[1:] for entry in lines.log] == [("READY", True)]
+    assert not lines.wait("START", True, 0.01)
+    lines.close()
+
+
+class Guest:
+    """QEMU's end of the cable."""
+
+    def __init__(self) -> None:
+        self._socket, far = socket.socketpair()
+        self._socket.settimeout(10)
+        self.peer = Peer(far)
+        assert self.hear(12)[0] == HELLO
+        self._socket.sendall(struct.pack("<III", HELLO, 68, 0) + bytes(64) + struct.pack("<I", 1 << 5 | 1 << 6))
+
+    def hear(self, head: int = 16) -> tuple[int, int, bytes]:
+        """The next message: kind, id, body."""
+        kind, length, ident = struct.unpack("<IIQ" if head == 16 else "<III", self._read(head))
+        return kind, ident, self._read(length)
+
+    def say(self, kind: int, ident: int, body: bytes = b"") -> None:
+        """Send a message."""
+        self._socket.sendall(struct.pack("<IIQ", kind, len(body), ident) + body)
+
+    def bulk(self, ident: int) -> None:
+        """Ask for a transfer."""
+        self.say(BULK, ident, struct.pack("<BBHIH", 0x81, 0, 4096, 0, 0))
+
+    def frames(self) -> int:
+        """First number of the packet that comes next."""
+        kind, _, body = self.hear()
+        assert kind == BULK
+        return packets.unpack(body[10:]).packets[0].seq
+
+    def _read(self, n: int) -> bytes:
+        data = b""
+        while len(data) < n:
+            data += self._socket.recv(n - len(data))
+        return data
+
+
+def test_a_reply_that_crosses_a_cancellation_comes_again():
+    """What QEMU throws away is not lost: the next transfer has the same frames, the one after it the next ones."""
+    guest = Guest()
+    clock = SystemClock()
+    hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()
+    board = rig.Board(skin.FORMAT, hand, clock)
+    guest.peer.plug(board)
+    for _ in range(3):
+        guest.hear()
+    guest.peer.do(lambda: board.request(packets.Request.START))
+    guest.bulk(1)
+    first = guest.frames()
+    guest.say(CANCEL, 1)
+    guest.bulk(2)
+    assert guest.frames() == first
+    guest.bulk(3)
+    assert guest.frames() == first + board.skin.packet_frames
+    guest.peer.close()

@@ -1,0 +1,82 @@
+"""umockdev as an underside: unmodified libusb, pyusb, libgpiod and gpiod over mocked device nodes, in real time.
+
+In: a process under umockdev-wrapper. Out: the skins of `skins`, a GPIO chip, and a pseudo-terminal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+from appliance.core import config
+from tests import backends
+from tests.backends import Skin, mocked_gpio, mocked_usb, mocks, real, skins, tty
+from tests.factories.paths import NO_SITE
+
+BOARD = "rpi5"
+
+
+class Mocked(real.Real):
+    """The lines are called as on a Raspberry Pi 5."""
+
+    name = "mocked"
+    can = backends.ALL
+
+    def __init__(self, stack: ExitStack, bench: mocks.Bench) -> None:
+        super().__init__(stack)
+        settings = config.load(BOARD, site=NO_SITE)
+        self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
+        self._inputs = [self.trigger.start, self.trigger.stop, self.trigger.new_object]
+        self._bench, self._socket = bench, mocked_usb.Socket(bench)
+        self._chip = mocked_gpio.Chip(bench, [f"GPIO{i}" for i in range(28)])
+        self._far = tty.FarEnd(stack)
+        self.serial = replace(settings.serial, port=str(self._far.path))
+        self.put, self.pull, self.say, self.hear = self._far.put, self._far.pull, self._far.say, self._far.hear
+        self.drive, self.unplug = self._chip.drive, self._socket.unplug
+
+    def reset(self) -> None:
+        """See Underside; the same below."""
+        self.settle()
+        self.deny(False)
+        self.plug(Skin())
+        for line in self._inputs:
+            self.drive(line, False)
+        self.pull()
+        self.put()
+
+    def plug(self, what: Skin) -> None:
+        """Another device on the bus."""
+        self._socket.plug(skins.board(what, self.clock))
+
+    def garble(self, on: bool) -> None:
+        """Mangle what the cable brings."""
+        assert self._socket.device
+        self._socket.device.mangle = skins.garbler() if on else lambda data: data
+
+    def silence(self) -> None:
+        """The board stops."""
+        assert self._socket.device
+        self._socket.device.board.running = False
+
+    def deny(self, on: bool) -> None:
+        """Close the device node."""
+        self._bench.close_to_all(self._socket.name, on)
+
+    def storm(self, line: str, edges: int) -> None:
+        """One edge after the other."""
+        for i in range(edges):
+            self.drive(line, i % 2 == 0)
+
+    def level(self, line: str) -> bool:
+        """What the chip drives."""
+        return self._chip.level(line)
+
+
+@contextmanager
+def opened() -> Iterator[Mocked]:
+    """A mocked machine. Raises Missing where umockdev is not there, or not below this process."""
+    with ExitStack() as stack:
+        bench = mocks.Bench()
+        stack.callback(bench.close)
+        yield Mocked(stack, bench)

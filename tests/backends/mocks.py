@@ -1,0 +1,130 @@
+"""umockdev for undersides: devices that open, read and ioctl of this process meet, answered by handlers in one thread.
+
+In: `umockdev-wrapper` around the process, and Debian's python3-gi. Out: a Bench with a testbed and its thread.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tests.backends import Missing
+
+DEBIAN = "/usr/lib/python3/dist-packages"
+PACKAGES = "umockdev gir1.2-umockdev-1.0 python3-gi"
+ANSWER_S = 10
+NOBODY = 65534
+
+
+def lacking() -> str:
+    """What has to be installed before a process can be run over umockdev; "" where it can."""
+    if not shutil.which("umockdev-wrapper"):
+        return f"no umockdev here; apt-get install {PACKAGES}"
+    try:
+        introspection()
+    except (ImportError, ValueError) as e:
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        return f"Python {version} cannot load umockdev ({e}); use Debian's Python, apt-get install {PACKAGES}"
+    return ""
+
+
+def introspection() -> tuple[Any, Any]:
+    """The modules (UMockdev, GLib). Raises ImportError or ValueError where they are not there."""
+    if DEBIAN not in sys.path:
+        sys.path.append(DEBIAN)  # PyGObject is in no wheel; behind the environment's own packages it shadows none
+    import gi
+
+    gi.require_version("UMockdev", "1.0")
+    from gi.repository import GLib, UMockdev
+
+    return UMockdev, GLib
+
+
+class Bench:
+    """A testbed, and the thread in which all handlers of its devices run."""
+
+    def __init__(self) -> None:
+        if missing := lacking():
+            raise Missing(missing)
+        if "libumockdev-preload" not in os.environ.get("LD_PRELOAD", ""):
+            raise Missing("umockdev is not below this process; start it with umockdev-wrapper")
+        umockdev, self._glib = introspection()
+        self._base = umockdev.IoctlBase
+        self.testbed = umockdev.Testbed.new()
+        self._root = Path(self.testbed.get_root_dir())
+        self._root.chmod(0o755)  # the nodes say who may open them
+        self._handlers: list[Any] = []  # umockdev does not keep them
+        self._context = self._glib.MainContext.new()
+        self._loop = self._glib.MainLoop.new(self._context, False)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self._context.push_thread_default()
+        self._loop.run()
+
+    def do(self, action: Callable[[], None]) -> None:
+        """Let the thread do something, and wait for it."""
+        done, failed = threading.Event(), list[BaseException]()
+
+        def once(*_: object) -> bool:
+            try:
+                action()
+            except BaseException as e:
+                failed.append(e)
+            done.set()
+            return False
+
+        self._context.invoke_full(self._glib.PRIORITY_DEFAULT, once)
+        assert done.wait(ANSWER_S), "the mock's thread does not answer"
+        if failed:
+            raise failed[0]
+
+    def node(self, name: str) -> Path:
+        """Where the device node /dev/NAME really lies."""
+        return self._root / "dev" / name
+
+    def close_to_all(self, name: str, on: bool) -> None:
+        """Let nobody open /dev/NAME, root neither: this thread is not root where files are opened."""
+        be_to_files = ctypes.CDLL(None).setfsuid
+        be_to_files(os.geteuid())
+        if (node := self.node(name)).exists():
+            node.chmod(0 if on else 0o644)
+            # umockdev asks for its own sake, too, and must not be refused
+            (self._root / "ioctl").chmod(0o755)
+            (self._root / "ioctl" / "dev" / name).chmod(0o777)
+        if on:
+            be_to_files(os.geteuid() or NOBODY)
+
+    def attach(self, name: str, answer: Callable[[int, Any, int], None]) -> None:
+        """Answer the ioctls of /dev/NAME: answer(number, argument, number of the open file); OSError is its errno."""
+
+        class Handler(self._base):  # type: ignore[misc,name-defined]
+            """umockdev's way of asking."""
+
+            def do_handle_ioctl(self, client: Any) -> bool:
+                try:
+                    answer(client.get_request() & 0xFFFF, client.get_arg(), hash(client))
+                    client.complete(0, 0)
+                except OSError as e:
+                    client.complete(-1, e.errno)
+                except Exception:
+                    traceback.print_exc()
+                    client.complete(-1, 5)
+                return True
+
+        handler = Handler()
+        self._handlers.append(handler)
+        self.do(lambda: self.testbed.attach_ioctl(f"/dev/{name}", handler))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._loop.quit()
+        self._thread.join(ANSWER_S)

@@ -1,0 +1,60 @@
+"""What undersides in real time share: the machine's clock and libraries. In: a skin's ids. Out: time, and a rival."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import gpiod
+import usb.core
+import usb.util
+
+from appliance.core.clock import SystemClock
+from appliance.core.config import SensorConfig
+from appliance.core.types import SweepFormat
+from appliance.sim import skin
+
+
+class Real:
+    """libusb and libgpiod of this machine, and its monotonic clock."""
+
+    gpio = gpiod
+    backend = None  # pyusb takes libusb
+    slack_s = 2.0  # a shared machine may stop for a second
+    pulse_s = 0.02
+    sensor: SensorConfig
+    format: SweepFormat = skin.FORMAT
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.clock = SystemClock()
+        self._rival: usb.core.Device | None = None
+        self._later: list[threading.Timer] = []
+        stack.callback(self.settle)
+
+    def settle(self) -> None:
+        """Nothing is planned, and no other program has the skin."""
+        for timer in self._later:
+            timer.cancel()
+            timer.join()
+        self._later.clear()
+        self.hold(False)
+
+    def wait(self, seconds: float) -> None:
+        """Sleep."""
+        self.clock.sleep_until(self.clock.now_ns() + round(seconds * 1e9))
+
+    def after(self, seconds: float, control: Callable[[], None]) -> None:
+        """In a thread of its own."""
+        self._later.append(threading.Timer(seconds, control))
+        self._later[-1].start()
+
+    def hold(self, on: bool) -> None:
+        """Claim the skin through a file of its own, as another program would."""
+        if self._rival:
+            usb.util.dispose_resources(self._rival)
+            self._rival = None
+        if on:
+            self._rival = usb.core.find(idVendor=self.sensor.vendor_id, idProduct=self.sensor.product_id)
+            assert self._rival, "no skin to hold"
+            usb.util.claim_interface(self._rival, 0)

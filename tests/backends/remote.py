@@ -1,0 +1,178 @@
+"""The virtual box as an underside: the drivers run in the guest, over its kernel; what is outside is asked for by wire.
+
+In: the guest's own settings, and JSON lines over a character device: one request, one reply. Outside, `serve` answers
+them with a bench, which has the controls of an Underside that are in CONTROLS; `able` gives what it can, as in `can`, and
+`reset` leaves the cable alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from typing import IO, Any
+
+import usb.core
+
+from appliance.core import config
+from tests.backends import Missing, Skin, real
+
+PORT = "/dev/virtio-ports/palpate.bench"
+CONTROLS = [
+    "able",
+    "reset",
+    "plug",
+    "unplug",
+    "garble",
+    "silence",
+    "drive",
+    "storm",
+    "level",
+    "say",
+    "hear",
+    "pull",
+    "put",
+]
+ANSWER_S = 60
+
+
+def serve(stream: IO[bytes], bench: Any) -> None:
+    """Do what comes in over `stream`, until it ends. bench: what is asked; what goes wrong there is told as text."""
+    for line in stream:
+        asked = json.loads(line)
+        try:
+            if asked["do"] not in CONTROLS:
+                raise ValueError(f"{asked['do']!r} is no control; known are {', '.join(CONTROLS)}")
+            reply = {"did": _pack(getattr(bench, asked["do"])(*map(_unpack, asked["with"])))}
+        except Exception as e:
+            reply = {"failed": f"{type(e).__name__}: {e}"}
+        stream.write(json.dumps(reply).encode() + b"\n")
+        stream.flush()
+
+
+def _pack(value: Any) -> Any:
+    """Bytes and skins as JSON has them."""
+    if isinstance(value, bytes):
+        return {"bytes": value.hex()}
+    return {"skin": asdict(value)} if isinstance(value, Skin) else value
+
+
+def _unpack(value: Any) -> Any:
+    """The reverse."""
+    if isinstance(value, dict) and "bytes" in value:
+        return bytes.fromhex(value["bytes"])
+    return Skin(**value["skin"]) if isinstance(value, dict) else value
+
+
+class Asker:
+    """The guest's end of the wire. Raises TimeoutError where nobody answers, AssertionError where it went wrong."""
+
+    def __init__(self, file: int) -> None:
+        self._file, self._one, self._rest = file, threading.Lock(), b""
+
+    def ask(self, control: str, *given: Any) -> Any:
+        """Have a control done outside; what it returned."""
+        request = json.dumps({"do": control, "with": [_pack(value) for value in given]}).encode() + b"\n"
+        with self._one:
+            while request:
+                request = request[os.write(self._file, request) :]
+            while b"\n" not in self._rest:
+                if not select.select([self._file], [], [], ANSWER_S)[0]:
+                    raise TimeoutError(f"nobody outside has done {control} within {ANSWER_S} s; is `serve` running?")
+                self._rest += os.read(self._file, 65536)
+            line, _, self._rest = self._rest.partition(b"\n")
+        reply = json.loads(line)
+        assert "failed" not in reply, f"{control} failed outside: {reply['failed']}"
+        return _unpack(reply["did"])
+
+
+class Remote(real.Real):
+    """The guest's kernel. An emulated processor may take its time, and looks at a line long after its interrupt."""
+
+    name = "remote"
+    slack_s = 20.0
+    pulse_s = 0.25
+
+    def __init__(self, stack: ExitStack, asker: Asker) -> None:
+        super().__init__(stack)
+        settings = config.load(None)
+        self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
+        self.serial = settings.serial
+        self._ask = asker.ask
+        self.can = frozenset(self._ask("able")) | {"hold"}
+
+    def reset(self) -> None:
+        """See Underside; the same below."""
+        self.settle()
+        self._ask("reset")
+        self.plug(Skin())
+
+    def plug(self, what: Skin) -> None:
+        """Asked for, and found by the guest's kernel and udev."""
+        self.unplug()
+        self._ask("plug", what)
+        self._until_there(True)
+
+    def unplug(self) -> None:
+        """Asked for, and noticed."""
+        self._ask("unplug")
+        self._until_there(False)
+
+    def _until_there(self, wanted: bool) -> None:
+        ids = {"idVendor": self.sensor.vendor_id, "idProduct": self.sensor.product_id}
+        end_ns = self.clock.now_ns() + ANSWER_S * 1_000_000_000
+        while (usb.core.find(**ids) is not None) != wanted:
+            assert self.clock.now_ns() < end_ns, "the kernel does not notice the skin's cable"
+            self.wait(0.01)
+
+    def garble(self, on: bool) -> None:
+        """Asked for."""
+        self._ask("garble", on)
+
+    def silence(self) -> None:
+        """Asked for."""
+        self._ask("silence")
+
+    def drive(self, line: str, level: bool) -> None:
+        """Asked for."""
+        self._ask("drive", line, level)
+
+    def storm(self, line: str, edges: int) -> None:
+        """Asked for."""
+        self._ask("storm", line, edges)
+
+    def level(self, line: str) -> bool:
+        """Asked for."""
+        return bool(self._ask("level", line))
+
+    def say(self, data: bytes) -> None:
+        """Asked for."""
+        self._ask("say", data)
+
+    def hear(self) -> bytes:
+        """Asked for."""
+        return bytes(self._ask("hear"))
+
+    def pull(self) -> None:
+        """Asked for."""
+        self._ask("pull")
+
+    def put(self) -> None:
+        """Asked for."""
+        self._ask("put")
+
+
+@contextmanager
+def opened() -> Iterator[Remote]:
+    """The machine that this runs in. Raises Missing where it has no bench outside."""
+    try:
+        file = os.open(PORT, os.O_RDWR)
+    except OSError as e:
+        raise Missing(f"no bench at {PORT} ({e.strerror}); this runs in the virtual box: make test-rig") from e
+    with ExitStack() as stack:
+        stack.callback(os.close, file)
+        yield Remote(stack, Asker(file))

@@ -1,0 +1,100 @@
+"""The simulator as an underside: appliance.sim below the drivers, a pseudo-terminal, and a clock that skips all waits."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+from appliance.core import config
+from appliance.sim import devices, rig, skin
+from tests import backends
+from tests.backends import Skin, skins, tty
+from tests.factories.paths import NO_SITE
+
+
+class Simulated:
+    """All that there is can be done to it, and it is done at once."""
+
+    name = "simulated"
+    can = backends.ALL
+    slack_s = 0.0
+    pulse_s = 0.02
+    format = skin.FORMAT
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.clock = rig.VirtualClock()
+        world = devices.build(self.format, [], self.clock, "sim")
+        settings = world.wire(config.load(None, site=NO_SITE))
+        self.gpio, self.backend = world.gpio, world.backend
+        self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
+        self._far = tty.FarEnd(stack)
+        self.serial = replace(settings.serial, port=str(self._far.path))
+        self.put, self.pull, self.say, self.hear = self._far.put, self._far.pull, self._far.say, self._far.hear
+
+    def reset(self) -> None:
+        """See Underside; the same below."""
+        self.backend.errors.clear()
+        self.garble(False)
+        self.plug(Skin())
+        for line in filter(None, (self.trigger.start, self.trigger.stop, self.trigger.new_object)):
+            self.drive(line, False)
+        self.pull()
+        self.put()
+
+    def wait(self, seconds: float) -> None:
+        """Skip."""
+        self.clock.sleep_until(self.clock.now_ns() + round(seconds * 1e9))
+
+    def after(self, seconds: float, control: Callable[[], None]) -> None:
+        """The bus looks at the agenda whenever it is asked for anything."""
+        self.backend.at(self.clock.now_ns() + round(seconds * 1e9), control)
+
+    def plug(self, what: Skin) -> None:
+        """Another board on the bus."""
+        self.backend.board = skins.board(what, self.clock)
+
+    def unplug(self) -> None:
+        """The board loses its power."""
+        self.backend.unplug()
+
+    def garble(self, on: bool) -> None:
+        """Mangle what the cable brings."""
+        self.backend.mangle = skins.garbler() if on else lambda data: data
+
+    def silence(self) -> None:
+        """The board stops."""
+        self.backend.board.running = False
+
+    def hold(self, on: bool) -> None:
+        """Claiming fails."""
+        self._fail("claim", errno.EBUSY, on)
+
+    def deny(self, on: bool) -> None:
+        """Opening fails."""
+        self._fail("open", errno.EACCES, on)
+
+    def _fail(self, call: str, code: int, on: bool) -> None:
+        self.backend.errors = {call: code} if on else {}
+
+    def drive(self, line: str, level: bool) -> None:
+        """An edge now."""
+        self.gpio.drive(line, level, self.clock.now_ns())
+
+    def storm(self, line: str, edges: int) -> None:
+        """One edge a microsecond."""
+        for i in range(edges):
+            self.wait(1e-6)
+            self.drive(line, i % 2 == 0)
+
+    def level(self, line: str) -> bool:
+        """What was written last."""
+        return {name: level for _, name, level in self.gpio.written}.get(line, False)
+
+
+@contextmanager
+def opened() -> Iterator[Simulated]:
+    """A simulated world."""
+    with ExitStack() as stack:
+        yield Simulated(stack)

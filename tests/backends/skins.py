@@ -1,0 +1,53 @@
+"""The skins that tests plug in. In: a Skin. Out: a board of the rig that numbers its frames, and what each must hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count, repeat
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.clock import Clock
+from appliance.core.types import EPOCH_BITS, SweepFormat
+from appliance.sim import rig, skin
+from tests.backends import Skin
+from tests.factories.simulated_box import numbered
+
+_PERIOD = 97
+_LENGTH = 30 * _PERIOD  # the script is one act for ever; frame i looks as frame i + 97
+_FIFO_S = 10
+"""Real boards have 0.25 s to 1 s. So deep a FIFO loses nothing however late a busy machine reads."""
+
+
+class Nowhere:
+    """Where the edges of a robot go that only slides."""
+
+    def drive(self, name: str, level: bool, t_ns: int) -> None:
+        """Nothing is wired."""
+
+    def forget(self, name: str, t_ns: int) -> None:
+        """Nothing was planned."""
+
+
+def board(what: Skin, clock: Clock) -> rig.Board:
+    """A board that answers as `what` and sends numbered frames of that form."""
+    fmt = SweepFormat(what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype)
+    act = rig.Act(numbered(_LENGTH, fmt), 10**9, 10**9 + 1, "")
+    robot = rig.Robot(repeat(act), Nowhere(), start="", stop="")
+    made = rig.Board(fmt, robot, clock, serial=what.serial, fifo_frames=round(_FIFO_S * what.rate_hz))
+    made.identity = replace(made.identity, protocol=what.protocol)
+    return made
+
+
+def digits(seq: NDArray[np.int64], fmt: SweepFormat) -> NDArray[Any]:
+    """What frames of these unwrapped numbers [n] must hold: [n, R, C]."""
+    return numbered(_PERIOD, fmt)[(seq & ((1 << EPOCH_BITS) - 1)) % _PERIOD]
+
+
+def garbler() -> Callable[[bytes], bytes]:
+    """A cable that brings every fifth transfer as zeros."""
+    number: Iterator[int] = count(1)
+    return lambda data: data if next(number) % 5 else bytes(len(data))

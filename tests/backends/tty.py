@@ -1,0 +1,47 @@
+"""The serial line of undersides without one: a pseudo-terminal under a name that stays. In: bytes. Out: bytes."""
+
+from __future__ import annotations
+
+import os
+import select
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+
+from appliance.tools import pseudo_terminal
+
+DELIVERY_S = 0.02
+"""The kernel passes on what one end wrote in its own time; under a virtual clock that has to be waited for."""
+
+
+class FarEnd:
+    """The robot's end. path: the name that the box opens, there while the port is put in."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "ttyPalpate"
+        self._port = stack.enter_context(ExitStack())
+        self._far = self._near = -1
+
+    def put(self) -> None:
+        """A new port under the old name."""
+        self._far, name = self._port.enter_context(pseudo_terminal.pair())
+        self._near = os.open(name, os.O_RDWR | os.O_NOCTTY)
+        self._port.callback(os.close, self._near)
+        self.path.symlink_to(name)
+
+    def pull(self) -> None:
+        """The port goes, and with it what it held."""
+        self._port.close()
+        self.path.unlink(missing_ok=True)
+
+    def say(self, data: bytes) -> None:
+        """Send, and wait until the near end can read."""
+        os.write(self._far, data)
+        assert select.select([self._near], [], [], 1)[0], "the pseudo-terminal does not deliver"
+
+    def hear(self) -> bytes:
+        """What has come."""
+        heard = b""
+        while select.select([self._far], [], [], DELIVERY_S)[0]:
+            heard += os.read(self._far, 65536)
+        return heard

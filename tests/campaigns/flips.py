@@ -1,0 +1,180 @@
+"""Altered bundles, all of them. In: a signed bundle. Out: how many of its alterations a box has accepted: none, or it fails.
+
+`PYTHONPATH=tests python -m flips --out build/flips.json` flips every bit of a manifest, random bits of the other files,
+swaps each file with that of another signed bundle, and tries bundles that are unsigned, wrongly signed, cut or older.
+Each one goes the way of a delivered bundle, `Store.accept`. Bits of the signature's own file are not counted: some of its
+line ends, say, may be others, and it is the same signature of the same manifest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import platform
+import random
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from appliance.bundle import bundle
+from appliance.core.errors import BundleError
+from appliance.core.provenance import commit
+from appliance.core.storage import put
+from appliance.deployment import signature
+from tests.factories import deliveries
+from tests.factories.deliveries import Delivery
+
+Files = dict[str, bytes]
+Case = tuple[str, str, Files]
+"""Of an alteration: its kind, which it is, and the files."""
+FLIPS = 1000
+FLIPPED = f"a bit of {bundle.MANIFEST} flipped"
+
+
+def flipped(files: Files, name: str, bit: int) -> Files:
+    """With one bit of one file flipped."""
+    data = bytearray(files[name])
+    data[bit // 8] ^= 1 << bit % 8
+    return files | {name: bytes(data)}
+
+
+def flips(files: Files, name: str, count: int | None, seed: int) -> Iterator[Case]:
+    """One file with each of its bits flipped (None), or `count` of them drawn."""
+    bits = range(8 * len(files[name]))
+    chosen = bits if count is None else sorted(random.Random(f"{seed} {name}").sample(bits, min(count, len(bits))))
+    return ((FLIPPED.replace(bundle.MANIFEST, name), f"bit {bit}", flipped(files, name, bit)) for bit in chosen)
+
+
+def swaps(one: Files, other: Files) -> Iterator[Case]:
+    """Each file, and each two of them, in place of another signed bundle's; the manifest with its signature is that one."""
+    names = sorted(one)
+    for i, name in enumerate(names):
+        yield "a file swapped", name, one | {name: other[name]}
+        for second in names[i + 1 :]:
+            yield "two files swapped", f"{name}, {second}", one | {n: other[n] for n in (name, second)}
+
+
+def another(key: Path) -> Files:
+    """A bundle of which no file is the default's: its golden sweeps and means are packed otherwise, its weights are a bit
+    off."""
+    held = deliveries.files(4, None)
+    model = bytearray(held[bundle.MODEL])
+    model[len(model) // 2] ^= 1
+    held[bundle.MODEL] = bytes(model)
+    for name in held.keys() & {bundle.GOLDEN, bundle.MEANS}:
+        with np.load(io.BytesIO(held[name])) as arrays:
+            packed = io.BytesIO()
+            np.savez(packed, **arrays)
+        held[name] = packed.getvalue()
+    return deliveries.signed(held, key)
+
+
+def others(files: Files, box: Delivery) -> Iterator[Case]:
+    """Unsigned, wrongly signed, cut, older."""
+    text = files[bundle.MANIFEST]
+    yield "not signed", "", {name: data for name, data in files.items() if name != bundle.SIGNATURE}
+    strange = deliveries.key(box.folder / "strange")
+    yield "signed by a stranger", "", files | {bundle.SIGNATURE: signature.sign(text, strange)}
+    for space in ("file", "git", "palpate", "palpate-bundle2", " "):
+        yield "signed for another use", space, files | {bundle.SIGNATURE: _signed_for(space, text, box.key)}
+    for name, data in sorted(files.items()):
+        yield "a file missing", name, {n: d for n, d in files.items() if n != name}
+        for kept in (0, 1, len(data) // 2, len(data) - 1)[: 4 - (name == bundle.SIGNATURE)]:
+            yield "a file cut", f"{name} at {kept}", files | {name: data[:kept]}
+        if name != bundle.SIGNATURE:
+            yield "a file longer", name, files | {name: data + b"\0"}
+    yield "counter not higher", "", deliveries.files(2, box.key, version="other")
+    yield "older", "", deliveries.files(1, box.key)
+    yield "never counted", "", deliveries.files(0, box.key)
+    yield "runtime too new", "", deliveries.files(9, box.key, runtime="99.0.0")
+
+
+def _signed_for(space: str, text: bytes, key: Path) -> bytes:
+    """A signature of ours for another use."""
+    made, signature.NAMESPACE = signature.NAMESPACE, space
+    try:
+        return signature.sign(text, key)
+    finally:
+        signature.NAMESPACE = made
+
+
+def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]:
+    """All alterations of a bundle that the box would take. manifest_bits: of all bits of its manifest so many are drawn."""
+    good, other = deliveries.files(3, box.key), another(box.key)
+    assert not any(good[name] == other[name] for name in good)
+    yield from others(good, box)
+    yield from swaps(good, other)
+    yield from flips(good, bundle.MANIFEST, manifest_bits, seed)
+    for name in sorted(good.keys() - {bundle.MANIFEST, bundle.SIGNATURE}):
+        yield from flips(good, name, FLIPS if manifest_bits is None else 10, seed)
+
+
+def tried(box: Delivery, case: Case) -> str:
+    """What the box says to one alteration; "" where it accepts it."""
+    incoming = box.folder / "altered"
+    shutil.rmtree(incoming, ignore_errors=True)
+    deliveries.put(incoming, case[2])
+    try:
+        box.store.accept(incoming)
+    except BundleError as e:
+        return str(e)
+    return ""
+
+
+def believed(box: Delivery, files: Files) -> bool:
+    """Whether the signature by itself fits the manifest."""
+    try:
+        return bool(signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], Path(box.how.signers)))
+    except BundleError:
+        return False
+
+
+def campaign(folder: Path, manifest_bits: int | None, seed: int, every: int = 0) -> dict[str, dict[str, int]]:
+    """By kind of alteration: how many were tried, how many accepted, how many refusals changed what runs; and how many
+    flipped manifests the signature alone let pass, which the box asks after it has read them.
+
+    every: after so many alterations a line on standard output, 0 for none.
+    """
+    box = Delivery(folder)
+    box.committed(1)
+    current = box.committed(2)
+    counts: dict[str, Counter[str]] = {}
+    for n, case in enumerate(cases(box, manifest_bits, seed), 1):
+        count = counts.setdefault(case[0], Counter(tried=0, accepted=0, believed=0, changed=0))
+        said = tried(box, case)
+        count["tried"] += 1
+        count["accepted"] += not said
+        count["believed"] += case[0] == FLIPPED and "does not fit the manifest" not in said and believed(box, case[2])
+        count["changed"] += box.store.current != current
+        if every and n % every == 0:
+            print(f"{n}: {case[0]}, {case[1]}", flush=True)
+    for n, good in enumerate((deliveries.files(3, box.key), another(box.key))):  # else all of this would prove nothing
+        box.store.accept(deliveries.put(folder / f"good{n}", good))
+    return {kind: dict(count) for kind, count in counts.items()}
+
+
+def main() -> int:
+    """Run the campaign and write its figures; 1 where anything was accepted."""
+    parser = argparse.ArgumentParser(prog="flips", description="Counts the altered bundles that a box accepts.")
+    parser.add_argument("--out", type=Path, default=Path("build/flips.json"))
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        found = campaign(Path(folder), None, args.seed, every=1000)
+    total = {
+        name: sum(count[name] for count in found.values()) for name in ("tried", "accepted", "believed", "changed")
+    }
+    told = {"total": total, "kinds": found, "seed": args.seed, "commit": commit(), "machine": platform.machine()}
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    put(args.out, (json.dumps(told, indent=1) + "\n").encode())
+    print("\n".join(f"{kind}: {count}" for kind, count in [*found.items(), ("total", total)]))
+    return int(total["accepted"] + total["believed"] + total["changed"] > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,198 @@
+"""The campaign of fuzzed models: our own, changed at random, through the box's check, onnxruntime and a run.
+
+`PYTHONPATH=tests python tests/hostile_fuzz.py --count 10000 --seed 1 --out FILE.json` (make it `nice`; a stopped one goes
+on where it was). Each model is opened in a child that may take 256 MB more than it had and ten seconds; what matters is
+how many hung it, killed it, or went beyond that memory. Seed and number name a model for ever.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from appliance.bundle.bundle import Manifest, Thresholds
+from appliance.bundle.onnx_check import check
+from appliance.core import storage
+from appliance.core.errors import BundleError
+from appliance.inference.session import session
+from tests.factories.grown_models import FORM, grown
+from tests.factories.mutated_models import Own, mutated, own_models
+from train.metrics.score import provenance
+
+DEADLINE_S = 10.0
+MOST_MORE = 256 << 20
+"""Bytes that a child may ask for beyond what it has."""
+BATCH = 50
+"""Models that a child takes one after another: a fork for each costs more than the model."""
+GROWN = 0.25
+"""Share of models that grow by the check's own rules instead of being one of ours that was changed: they reach farther."""
+GROWING = Own("grown", b"", Manifest("grown", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255), {}))
+SORRY = ("refused", "onnxruntime refused", "run refused", "ran")
+"""What may become of a model; anything else is a find."""
+
+
+def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
+    """What becomes of one model in this process: outcome, why, processor milliseconds of the check, seconds, most MB more."""
+    before = memory("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")
+    begin, begin_cpu = time.perf_counter(), time.process_time()
+    outcome, why, checked_s = "refused", "", 0.0
+    try:
+        try:
+            check.check(model, own.manifest)
+        finally:
+            checked_s = time.process_time() - begin_cpu
+        outcome = "onnxruntime refused"
+        opened = session(model)
+        outcome = "run refused"
+        run(opened, rng)
+        outcome = "ran"
+    except MemoryError:
+        outcome = "no memory"
+    except Exception as e:  # onnxruntime's own classes share no base but this
+        if outcome == "refused" and not isinstance(e, BundleError):
+            raise  # the check may refuse in one way only: the child dies
+        why = str(e)
+    took = time.perf_counter() - begin
+    if any(word in why for word in ("bad_alloc", "bad allocation", "Failed to allocate")):
+        outcome = "no memory"
+    more = (memory("VmHWM") - before) / 1024
+    return {"outcome": outcome, "why": why[:200], "check_ms": 1e3 * checked_s, "mb": more, "s": took}
+
+
+def run(opened: Any, rng: Random) -> None:
+    """Three sweeps: at rest, at the end of the scale, of noise."""
+    (takes,) = opened.get_inputs()
+    kind = np.dtype({"tensor(float)": "float32"}.get(takes.type, takes.type[7:-1]))
+    top = 1e6 if kind.kind == "f" else np.iinfo(kind).max
+    noise = np.random.default_rng(rng.getrandbits(32)).uniform(0, top, takes.shape)
+    for window in (np.zeros(takes.shape), np.full(takes.shape, top), noise):
+        opened.run(None, {takes.name: window.astype(kind)})
+
+
+def memory(name: str) -> int:
+    """kB, as the kernel counts them."""
+    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith(name))
+    return int(line.split()[1])
+
+
+@dataclass
+class Fuzz:
+    """Models by number, and the children that try them."""
+
+    owns: list[Own]
+    seed: int
+
+    def model(self, number: int) -> tuple[bytes, Own, Random]:
+        """The model of this number."""
+        rng = Random(f"{self.seed}/{number}")
+        if rng.random() < GROWN:
+            return grown(rng), GROWING, rng
+        own = rng.choice(self.owns)
+        return mutated(own.model, rng, rng.choice(self.owns).model), own, rng
+
+    def results(self, first: int, count: int) -> Iterator[dict[str, Any]]:
+        """What becomes of `count` models from number `first` on, in their order."""
+        at, end = first, first + count
+        while at < end:
+            for told in self._child(range(at, min(at + BATCH, end))):
+                yield told
+                at = told["number"] + 1
+
+    def _child(self, numbers: range) -> Iterator[dict[str, Any]]:
+        """A child tries these; the last result is of the model that ended it, where one did."""
+        into, out = os.pipe()
+        pid = os.fork()
+        if not pid:
+            os.close(into)
+            self._try(numbers, out)
+        os.close(out)
+        rest, at = b"", numbers.start
+        try:
+            while at < numbers.stop:
+                there = select.select([into], [], [], DEADLINE_S)[0]
+                more = os.read(into, 65536) if there else b""
+                if not more:
+                    os.kill(pid, signal.SIGKILL)  # it hangs, or has ended
+                    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+                    pid = 0
+                    outcome = f"died ({code})" if there else "hung"
+                    yield {"number": at, "outcome": outcome, "why": "", "check_ms": 0, "mb": 0, "s": DEADLINE_S}
+                    return
+                *lines, rest = (rest + more).split(b"\n")
+                for line in lines:
+                    at += 1
+                    yield json.loads(line)
+        finally:
+            os.close(into)
+            if pid:
+                os.waitpid(pid, 0)
+
+    def _try(self, numbers: range, out: int) -> None:
+        """What the child does; it never returns."""
+        code = 1
+        try:
+            size = memory("VmSize") * 1024 + MOST_MORE
+            resource.setrlimit(resource.RLIMIT_AS, (size, size))
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # onnxruntime tells what it refuses
+            for number in numbers:
+                told = {"number": number} | tried(*self.model(number))
+                os.write(out, json.dumps(told).encode() + b"\n")
+            code = 0
+        finally:
+            os._exit(code)
+
+
+def fresh(seed: int) -> dict[str, Any]:
+    """A campaign in which nothing was done yet."""
+    return provenance() | {
+        "seed": seed, "done": 0, "outcomes": {}, "finds": [], "slowest_check_ms": 0.0, "slowest_s": 0.0, "most_mb": 0.0,
+    }  # fmt: skip
+
+
+def note(record: dict[str, Any], told: dict[str, Any]) -> None:
+    """One result more."""
+    outcome = told["outcome"]
+    record["done"] += 1
+    record["outcomes"][outcome] = record["outcomes"].get(outcome, 0) + 1
+    for key, value in (("slowest_check_ms", "check_ms"), ("slowest_s", "s"), ("most_mb", "mb")):
+        record[key] = max(record[key], round(told[value], 3))
+    if outcome not in SORRY or told["mb"] > MOST_MORE >> 20:
+        record["finds"].append(told)
+
+
+def main() -> int:
+    """1 where a model was a find."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--count", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    record = json.loads(args.out.read_text()) if args.out.exists() else fresh(args.seed)
+    if record["seed"] != args.seed:
+        parser.error(f"{args.out} is of seed {record['seed']}; name another file")
+    fuzz = Fuzz(own_models(), args.seed)
+    for told in fuzz.results(record["done"], args.count - record["done"]):
+        note(record, told)
+        if record["done"] % BATCH == 0 or record["done"] == args.count:
+            storage.put(args.out, (json.dumps(record, indent=1) + "\n").encode())
+            print(f"{record['done']} of {args.count}: {record['outcomes']}, finds {len(record['finds'])}", flush=True)
+    return 1 if record["finds"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,239 @@
+"""What is left on the disk by a kill, or a loss of power, at any moment: a small part of `python -m cuts`, and whether that
+finds what is wrong on purpose.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.cuts import __main__ as campaign
+from tests.cuts import black_box, calls, delivery, recording, scene, tree
+from tests.cuts.calls import NotFollowed
+from tests.cuts.scene import Found, Play, Point, Scene, Step
+
+pytestmark = pytest.mark.skipif(bool(calls.lacking()), reason=f"needs {calls.lacking()}")
+
+Makes = Callable[..., Play]
+
+
+@pytest.fixture
+def work() -> Iterator[Path]:
+    """A folder in memory."""
+    with scene.stage() as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
+def play(work: Path) -> Makes:
+    """Plays lines of Python, which find the folder in `f`, after others that have prepared it."""
+
+    def make(does: str, before: str = "", judge: Callable[[Found], list[str]] = lambda found: []) -> Play:
+        code = "import os, sys; from pathlib import Path; from appliance.core import storage; f = Path(sys.argv[1])\n"
+
+        def prepare(folder: Path) -> None:
+            exec(code.replace("sys.argv[1]", repr(str(folder))) + before, {})
+
+        step = Step("it", lambda folder: [sys.executable, "-S", "-c", code + does, folder])
+        return Play(Scene("lines", prepare, (step,), judge), work)
+
+    return make
+
+
+def left(play: Play, call: str | None) -> list[tree.Tree]:
+    """What a loss of power may leave before the first call of this name; None: at the end."""
+    return next(list(m.disk.left()) for m in play.moments() if (m.call.name if m.call else None) == call)
+
+
+def wrong(points: list[Point]) -> list[str]:
+    """All that was found wrong."""
+    return [f"{p.step}, {p.how} before {p.call}: {text}" for p in points for text in p.wrong]
+
+
+def test_what_is_not_synced_may_be_there_or_not(play: Makes):
+    """A new file: no name, or a name with nothing, half, zeros or all; with its content synced, no name or all."""
+    played = play("a = open(f / 'a', 'wb', 0); a.write(b'1234'); os.fsync(a.fileno())")
+    contents = [b"", b"12", b"1234", bytes(4)]
+    assert left(played, "fsync") == [{}] + [{"a": held} for held in (b"1234", b"", b"12", bytes(4))]
+    assert sorted(map(str, left(played, "fsync")[1:])) == sorted(str({"a": held}) for held in contents)
+    assert left(played, None) == [{}, {"a": b"1234"}]
+
+
+def test_a_folder_that_is_synced_holds_its_names(play: Makes):
+    """A new name stays; the content that was never synced may be lost; what was there before stays as it was."""
+    played = play("(f / 'a').write_bytes(b'1'); storage.sync(f)", "(f / 'b').write_bytes(b'2')")
+    assert left(played, None) == [{"a": held, "b": b"2"} for held in (b"1", b"", b"\0")]
+
+
+def test_what_is_overwritten_may_be_the_old_or_nothing(play: Makes):
+    """Written over in place, and not synced: what was there may still be there, and half of the new."""
+    played = play("(f / 'a').write_bytes(b'NEW.')", "(f / 'a').write_bytes(b'old')")
+    assert [found["a"] for found in left(played, None)] == [b"NEW.", b"old", b"", b"NE", bytes(4)]
+    assert [found["a"] for found in left(played, "write")] == [b"", b"old"]
+
+
+def test_a_renaming_is_never_half_done(play: Makes):
+    """From folder to folder, and of two names that are exchanged: before or after; a sync of one folder is enough."""
+    before = "[storage.put(f / name, name.encode()) for name in 'ab']; (f / 'x').mkdir()"
+    played = play(
+        "(f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x'); storage.exchange(f / 'b', f / 'x' / 'a')", before
+    )
+    assert left(played, "fsync") == [{"a": b"a", "b": b"b", "x": None}, {"b": b"b", "x": None, "x/a": b"a"}]
+    assert left(played, None) == [{"b": b"b", "x": None, "x/a": b"a"}, {"b": b"a", "x": None, "x/a": b"b"}]
+
+
+def test_names_of_two_folders_come_in_any_order(play: Makes):
+    """The later of two changes may be on the disk without the earlier one, but not of the same folder."""
+    played = play("[(f / name).mkdir() for name in ('x/1', 'x/2', 'y/3')]", "(f / 'x').mkdir(); (f / 'y').mkdir()")
+    found = [" ".join(sorted(found.keys() - {"x", "y"})) for found in left(played, None)]
+    assert found == ["", "x/1", "x/1 x/2", "y/3", "x/1 y/3", "x/1 x/2 y/3"]
+
+
+def test_a_sync_takes_with_it_what_came_before(play: Makes):
+    """A folder's new name came from another folder, where it was not synced: it is in one of the two, not in both."""
+    played = play("(f / 'a').mkdir(); (f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x')", "(f / 'x').mkdir()")
+    assert left(played, None) == [{"x": None, "x/a": None}]
+
+
+def test_a_symlink_is_swapped_in_one_step(play: Makes):
+    """disk.link: at every moment it leads to the old or the new, also where one of that name was left half done."""
+    played = play(
+        "storage.link(f / 'current', 'new')", "storage.link(f / 'current', 'old'); (f / 'current.part').symlink_to('x')"
+    )
+    found = {found["current"] for moment in played.moments() for found in moment.disk.left()}
+    assert found == {"old", "new"}
+    assert left(played, None) == [{"current": "new"}]
+
+
+def test_a_kill_comes_before_its_call(play: Makes):
+    """What is killed on entry to a renaming has not renamed; the judge gets what was said before."""
+    told = []
+    played = play("print('now'); sys.stdout.flush(); (f / 'a').rename(f / 'b'); print('then')", "(f / 'a').touch()",
+                  lambda found: told.append((tree.read(found.folder), found.heard)) or [])  # fmt: skip
+    (moment, end) = played.moments()
+    played.kill(moment)
+    assert told == [({"a": b""}, "\nnow\n")]
+    assert (moment.call.name, end.call, end.said) == ("rename", None, "\nnow\nthen\n")
+    with pytest.raises(NotFollowed, match="was not killed at its rename number 2"):
+        played.kill(replace(moment, call=replace(moment.call, nth=2)))
+
+
+@pytest.mark.parametrize(
+    "does",
+    [
+        "import mmap; a = open(f / 'a', 'r+b'); m = mmap.mmap(a.fileno(), 1); m[0] = 65",
+        "a = open(f / 'a', 'r+b'); os.posix_fallocate(a.fileno(), 0, 99)",
+        "os.system(f'echo more >>{f}/a')",
+        "os.open(f, os.O_TMPFILE | os.O_RDWR)",
+        "sys.exit(1)",
+    ],
+    ids=["mapped", "allocated", "a child's", "nameless", "failed"],
+)
+def test_what_cannot_be_followed_is_told(play: Makes, does: str):
+    """A program that changes files in a way that is not understood, or fails, is not taken for one that changes none."""
+    with pytest.raises(NotFollowed):
+        play(does, "(f / 'a').write_bytes(b'0')")
+
+
+def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
+    """The power is cut at every moment of two runs, and some kills: all that was told as stored is there."""
+    played = Play(recording.scene(), work)
+    points = [played.power(moment) for moment in played.moments()]
+    points += [played.kill(moment) for moment in list(played.moments())[8:60:10]]
+    assert wrong(points) == []
+    assert len(points) > 60
+
+
+def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
+    """Killed once it has made the folder and before it has synced that; the next run must not rely on it."""
+    played = Play(recording.scene(), work)
+    made = next(m for m in played.moments() if m.call and m.call.name == "fsync")
+    assert wrong([played.kill_then_power(made)]) == []
+
+
+@pytest.mark.parametrize("way", [way for way in recording.WAYS if way != "right"])
+def test_ways_that_are_wrong_are_found(work: Path, way: str):
+    """Files that get onto the disk in a way that loses some: the judge says so of each."""
+    played = Play(recording.scene(way), work)
+    assert any(played.power(moment).wrong for moment in played.moments())
+
+
+def test_a_kill_finds_what_is_written_under_its_own_name(work: Path):
+    """No loss of power is needed for that; and the judge sees it in what a killed program has left."""
+    played = Play(recording.scene("under its own name"), work)
+    half = next(m for m in played.moments() if m.call.name == "write" and m.call.paths[0].endswith(".npy"))
+    assert "not a recorded sweep" in str(played.kill(half).wrong)
+
+
+def test_the_black_box_loses_no_more_than_the_sweep_in_progress(work: Path):
+    """The power is cut at every moment of two runs: the last sweeps are there, and never many more."""
+    played = Play(black_box.scene(), work)
+    assert wrong([played.power(moment) for moment in played.moments()]) == []
+
+
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory: pytest.TempPathFactory) -> delivery.Shop:
+    """Signed bundles, and a file of whom the box believes."""
+    if not shutil.which("ssh-keygen"):
+        pytest.skip("needs ssh-keygen (apt-get install openssh-client)")
+    return delivery.Shop.opened(tmp_path_factory.mktemp("shop"))
+
+
+def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: delivery.Shop, work: Path):
+    """Killed before it names the bundle's folder and the ledger, and without power before the link is swapped: the box
+    starts, answers, and takes the next bundle.
+    """
+    played = Play(shop.alone("right"), work)
+    points = []
+    for moment in played.moments():
+        if moment.call and moment.call.name.startswith("rename"):
+            points.append((played.power if moment.call.paths[1].endswith("/current") else played.kill)(moment))
+    assert [point.states for point in points] == [1, 1, 4]
+    assert wrong(points) == []
+
+
+@pytest.mark.parametrize(
+    ("way", "call", "what"),
+    [
+        ("the link is gone for a moment", "symlink", r"first start: exit code 0, answers by \['\w+'\] instead"),
+        ("the ledger in place", "write", r"first start: exit code 78, .*ledger.json cannot be read"),
+    ],
+    ids=["link", "ledger"],
+)
+def test_deliveries_that_are_wrong_are_found(shop: delivery.Shop, work: Path, way: str, call: str, what: str):
+    """A store that is neither old nor new for a moment: a kill there finds it."""
+    played = Play(shop.alone(way), work)
+    (moment,) = [
+        m for m in played.moments()
+        if m.call and m.call.name == call and m.call.paths[0].endswith(("/current", "/ledger.json"))
+    ]  # fmt: skip
+    assert re.search(what, str(played.kill(moment).wrong))
+
+
+def test_a_campaign_goes_on_where_it_was_broken_off(work: Path, monkeypatch: pytest.MonkeyPatch):
+    """Points that are in the file are not cut again, half a line there is; after a change of the box all of them are."""
+    code = "import sys; from pathlib import Path; (Path(sys.argv[1]) / 'a').write_bytes(b'1')"
+    step = Step("it", lambda folder: [sys.executable, "-S", "-c", code, folder])
+    lines = Scene(
+        "lines", lambda folder: None, (step,), lambda found: ["empty"] if not any(found.folder.iterdir()) else []
+    )
+    file = work / "cuts.jsonl"
+    points = list(campaign.cut(lines, campaign.Ledger(file)))
+    assert [(p.how, p.moment, p.states, bool(p.wrong)) for p in points] == [
+        ("kill", 0, 1, True), ("kill", 1, 1, False), ("power", 0, 1, True), ("power", 1, 2, True), ("power", 2, 4, True),
+        ("kill_then_power", 0, 7, True), ("kill_then_power", 1, 6, True),
+    ]  # fmt: skip
+    assert list(campaign.cut(lines, campaign.Ledger(file))) == []
+    assert campaign.Ledger(file).points() == points
+    file.write_text(file.read_text()[:-9])
+    assert list(campaign.cut(lines, campaign.Ledger(file))) == points[-1:]
+    assert campaign.Ledger(file).points() == points
+    monkeypatch.setattr(campaign, "_head", lambda: {"source": "another"})
+    assert campaign.Ledger(file).points() == []
+    assert list(campaign.figures(points))[-1].startswith("all: kill at 2 moments, 2 folders, wrong 1; power at 3")

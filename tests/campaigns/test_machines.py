@@ -1,0 +1,149 @@
+"""The room of other processors: the same bundle gives the same labels on x86 with and without VNNI, and on arm64.
+
+Emulated by qemu, which computes what the processor would, instruction by instruction. PALPATE_MACHINES=1 gets what this
+needs (see machines.py) and insists on it; without, what is not there is skipped.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from appliance.bundle import bundle
+from appliance.inference.classifier import softmax
+from tests.factories import emulated_machines
+from tests.factories.sweep_sets import easy
+from train.data import sets
+from train.export import export
+from train.models.compact import fit
+from train.onnx_tools import layers
+from train.onnx_tools.graph_builder import TENSOR
+
+EIGHT_BITS = "eight bits"
+INSIDE = ("default", "int16")
+SHOWN_SWEEPS = 8
+
+
+@pytest.fixture(scope="session")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The default bundle with simulated sweeps, one freshly trained for each digit type, and a network that overflows."""
+    if os.environ.get("PALPATE_MACHINES") == "1":
+        emulated_machines.set_up()
+    folder = tmp_path_factory.mktemp("given")
+    shutil.copytree(bundle.DEFAULT, folder / "default")
+    np.save(folder / "default" / "sweeps.npy", sets.load("sim:T-REAL:1001:1").samples[::3])
+    for dtype in TENSOR:
+        fitted = fit.fit(easy(dtype=dtype), 1, fit.Recipe(steps=40))
+        export.export(fitted, folder / dtype, dtype, "1", "")
+        np.save(folder / dtype / "sweeps.npy", fitted.held.samples)
+    for name in INSIDE:
+        _show(folder, name)
+    overflowing(folder / EIGHT_BITS)
+    return folder
+
+
+def _show(folder: Path, name: str) -> None:
+    """A folder more: the same graph, giving its int8 tensors."""
+    model = onnx.load(folder / name / bundle.MODEL)
+    del model.graph.output[:]
+    (folder / f"{name} inside").mkdir()
+    names = [q.output[0] for q in layers.rounded(model)]
+    (folder / f"{name} inside" / "shown.onnx").write_bytes(layers.shown(model, names).SerializeToString())
+    np.save(folder / f"{name} inside" / "sweeps.npy", np.load(folder / name / "sweeps.npy")[:SHOWN_SWEEPS])
+
+
+def overflowing(folder: Path) -> None:
+    """A convolution with weights of eight bits over bytes at their highest: no 16 bits hold two of its products."""
+    folder.mkdir()
+    taps = np.full((32, 32, 5), 127, np.int8)
+    constants = {
+        "one": np.float32(1),
+        "none": np.uint8(0),
+        "none8": np.int8(0),
+        "much": np.float32(2**15),
+        "taps": taps,
+    }
+    nodes = [
+        helper.make_node("DequantizeLinear", ["sweep", "one", "none"], ["x"]),
+        helper.make_node("DequantizeLinear", ["taps", "one", "none8"], ["w"]),
+        helper.make_node("Conv", ["x", "w"], ["y"]),
+        helper.make_node("QuantizeLinear", ["y", "much", "none"], ["q"]),
+        helper.make_node("DequantizeLinear", ["q", "much", "none"], ["z"]),
+    ]
+    graph = helper.make_graph(
+        nodes, "overflowing", [helper.make_tensor_value_info("sweep", TensorProto.UINT8, [1, 32, 64])],
+        [helper.make_tensor_value_info("q", TensorProto.UINT8, None)],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
+    )  # fmt: skip
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    (folder / "shown.onnx").write_bytes(model.SerializeToString())
+    np.save(folder / "sweeps.npy", np.full((1, 32, 64), 255, np.uint8))
+
+
+@pytest.fixture(scope="session")
+def here(given: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+    """What this machine says."""
+    told = tmp_path_factory.mktemp("here") / "told.npz"
+    emulated_machines.work(given, told)
+    with np.load(told) as z:
+        return dict(z)
+
+
+@pytest.fixture(scope="session", params=emulated_machines.MACHINES)
+def there(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, dict[str, np.ndarray]]:
+    """A machine's name, and what it says."""
+    insist = os.environ.get("PALPATE_MACHINES") == "1"
+    told = tmp_path_factory.mktemp("there") / "told.npz"
+    try:
+        if insist:
+            emulated_machines.set_up()
+        emulated_machines.command(request.param)
+    except emulated_machines.Missing as e:
+        (pytest.fail if insist else pytest.skip)(str(e))
+    args, env = emulated_machines.command(request.param, request.getfixturevalue("given"), told)
+    done = subprocess.run(args, env=env, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    with np.load(told) as z:
+        return request.param, dict(z)
+
+
+def test_a_bundle_says_the_same_on_every_machine(here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]):
+    """Golden sweeps and others: the same labels, and probabilities within what the box's own test allows."""
+    name, said = there
+    assert said.keys() == here.keys()
+    for what in here:
+        if not what.endswith(("/golden", "/sweeps")):
+            continue
+        apart = np.abs(softmax(said[what]) - softmax(here[what])).max()
+        print(f"{name}: {what}: {len(here[what])} sweeps, probabilities {apart:.2g} apart, "
+              f"logits {np.abs(said[what] - here[what]).max():.2g}")  # fmt: skip
+        np.testing.assert_array_equal(said[what].argmax(1), here[what].argmax(1))
+        assert apart <= bundle.GOLDEN_TOLERANCE
+
+
+def test_what_int8_computes_is_the_same_to_the_bit(
+    here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]
+):
+    """The tensors inside: hardly one in ten thousand is another, where float rounding before it fell the other way."""
+    name, said = there
+    for what in here:
+        if what.endswith(" inside/shown"):
+            other = np.abs(said[what].astype(int) - here[what])
+            print(f"{name}: {what}: {np.count_nonzero(other)} of {other.size} differ, by up to {other.max()}")
+            assert np.mean(other > 0) < 1e-4
+
+
+def test_an_x86_without_vnni_is_one(there: tuple[str, dict[str, np.ndarray]]):
+    """Eight-bit weights overflow there, and only there: the machine is what it is called, and would show a difference."""
+    name, said = there
+    exact = round(32 * 5 * 127 * 255 / 2**15)
+    assert (said[f"{EIGHT_BITS}/shown"] == exact).all() == (name != "x86, AVX2 without VNNI")

@@ -1,0 +1,477 @@
+"""The soak: what its judge finds in records with one thing wrong, how it goes on after an interruption, what it draws."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.core import config
+from appliance.io.robot_link import StdoutPort, sentence
+from appliance.runtime import assembly
+from appliance.sim import devices, script, skin
+from appliance.sim.rig import VirtualClock
+from appliance.tools.score import Answer
+from tests.factories.paths import NO_SITE
+from tests.rig import soak, soak_judge, soak_page
+from tests.rig.soak_boxes import Gone, Reckoned, Script, ThisMachine, process
+from tests.rig.soak_judge import SAMPLE
+
+RATE = skin.FORMAT.rate_hz
+UNANSWERED, ORDER, LOST, DROPPED, WRONG, MEMORY, FILES = range(7)
+"""Targets, as soak_judge.targets lists them."""
+
+
+class FakeBox:
+    """A box without fault on a clock of its own: each call of `heard` takes its wait. change: what becomes of its lines.
+
+    dropped: frames that it has lost and never says so, a function of its time. runs: how often it was started.
+    """
+
+    name = "this machine"
+
+    def __init__(self, change: Callable[[str], list[str]] = lambda line: [line]) -> None:
+        self.now_s, self.begun_s, self.runs, self.closed = 100.0, 0.0, 0, 0
+        self.change, self.dropped = change, lambda s: 0
+        self.mute_s = float("inf")
+
+    def start(self, seed: int, sweeps: Script) -> None:
+        """Begin."""
+        self.begun_s, self.said, self.states, self.sweeps = self.now_s, 0, 0, sweeps
+        self.runs += 1
+
+    def clock(self) -> float:
+        """Its time."""
+        return self.now_s
+
+    def heard(self, wait_s: float) -> list[tuple[float, str]]:
+        """What it says in so long."""
+        self.now_s += wait_s
+        if self.now_s > self.mute_s:
+            return []
+        lines = []
+        while self.states < self.now_s - self.begun_s:
+            frames = round(self.states * RATE) - self.dropped(self.states)
+            state = sentence("STA", self.states, "streaming", 0, self.said, frames, 0, 0, 1, 0, "b", "sim")
+            lines += self.changed(self.begun_s + self.states, state)
+            self.states += 1
+        while self.edges(self.now_s)[1] > self.said:
+            self.said += 1
+            lines += self.changed(self.now_s, self.answer("ok", self.sweeps[self.said].alone))
+        return lines
+
+    def answer(self, status: str, alone: str) -> bytes:
+        """The RES of the sweep that was said last."""
+        label = alone if alone in skin.MATERIALS else ""
+        status = status if label else "unknown"
+        return sentence("RES", self.said, 1, status, label, 0.9, 0.8, 1, 0, 1.25, "b", "sim", "1.00", "")
+
+    def changed(self, at_s: float, line: bytes) -> list[tuple[float, str]]:
+        """A line with its time, after `change`."""
+        return [(at_s, new) for new in self.change(line.decode().strip())]
+
+    def edges(self, at_s: float) -> tuple[int, int]:
+        """By its time and the script."""
+        return self.sweeps.edges((at_s - self.begun_s) * RATE)
+
+    def taken(self, at_s: float) -> float:
+        """All frames of its time."""
+        return (at_s - self.begun_s) * RATE
+
+    def process(self) -> tuple[int, int, float, int, int]:
+        """Always the same."""
+        return 70_000, 60_000, self.now_s / 50, 8, 1
+
+    def about(self) -> dict[str, object]:
+        """Made up."""
+        return {"what": "a made-up box", "machine": "none", "versions": {"python": "3"}}
+
+    def stop(self) -> list[tuple[float, str]]:
+        """The open sweep is aborted."""
+        due, self.said = self.edges(self.now_s)[0], self.said + 1
+        assert due == self.said, "stopped where it is in doubt whether a sweep has begun"
+        aborted = sentence("RES", due, 1, "aborted", "", 0, 0, 0, 0, 0.1, "b", "sim", "1.00", "")
+        return self.changed(self.now_s, aborted)
+
+    def close(self) -> None:
+        """Count it."""
+        self.closed += 1
+
+
+def soaked(box: FakeBox, length_s: float = 150) -> soak_judge.Run:
+    """A run of a box."""
+    run = soak_judge.Run(seed=1)
+    soak.record(box, run, length_s, lambda: None, clock=box.clock, log=lambda line: None)
+    return run
+
+
+def sums(run: soak_judge.Run) -> dict:
+    """Its sums, through a file's form."""
+    return soak_judge.sums(json.loads(json.dumps({"runs": [soak.asdict(run)]})))
+
+
+def missed(told: dict) -> list[int]:
+    """Numbers of the targets that were not reached."""
+    return [i for i, (*_, met) in enumerate(soak_judge.targets(told)) if met is False]
+
+
+def on(number: int, new: Callable[[str], list[str]]) -> Callable[[str], list[str]]:
+    """Change the answer with this number."""
+    return lambda line: new(line) if line.startswith(f"$PPLP,RES,{number},") else [line]
+
+
+def renumbered(line: str, number: int) -> str:
+    """An answer with another number."""
+    fields = line.split("*")[0].split(",")
+    return sentence("RES", number, *fields[3:]).decode().strip()
+
+
+@pytest.fixture(scope="module")
+def clean() -> soak_judge.Run:
+    """A run in which nothing is wrong."""
+    return soaked(FakeBox())
+
+
+def test_a_box_without_fault_reaches_every_target(clean):
+    """All sweeps answered, the last one as aborted; nothing lost, nothing noted; memory of three minutes is not told."""
+    told = sums(clean)
+    assert told["due"] == told["answers"] > 40
+    assert (told["cut"], told["unanswered"], told["faults"], told["unaccounted"], told["differs"]) == (1, 0, 0, 0, 0)
+    assert told["right"]["n"] + told["refused"]["n"] + told["wrong"]["n"] == told["answers"] - 1
+    assert [met for *_, met in soak_judge.targets(told)] == [True] * 5 + [None, True]
+    assert clean.ended == "time"
+    assert clean.length_s >= 150
+
+
+def test_a_missing_answer_is_found():
+    """A sweep that gets no sentence is unanswered, and the number that was left out is noted."""
+    told = sums(soaked(FakeBox(on(17, lambda line: []))))
+    assert told["unanswered"] == 1
+    assert missed(told) == [UNANSWERED, ORDER]
+
+
+def test_a_missed_start_edge_is_found():
+    """A box that never saw a start edge numbers on without a gap, and has one answer too few in the end."""
+    box = FakeBox()
+    run = soaked(box)
+    del run.answers[-1]
+    told = sums(run)
+    assert told["unanswered"] == 1
+    assert missed(told) == [UNANSWERED]
+
+
+def test_a_double_answer_is_found():
+    """The same sentence twice is noted; the sweep is answered all the same."""
+    told = sums(soaked(FakeBox(on(17, lambda line: [line, line]))))
+    assert told["unanswered"] == 0
+    assert missed(told) == [ORDER]
+
+
+@pytest.mark.parametrize("number", [16, 18, 40])
+def test_a_wrong_number_is_found(number):
+    """An answer with the number of another sweep, before or after, is noted, and its own sweep has none."""
+    told = sums(soaked(FakeBox(on(17, lambda line: [renumbered(line, number)]))))
+    assert UNANSWERED in missed(told)
+    assert ORDER in missed(told)
+
+
+def test_a_number_too_many_makes_no_answer_wrong(clean):
+    """Where a missed edge made two answers of one sweep, the later ones are held against what was touched then."""
+
+    def ahead(line: str) -> list[str]:
+        number = int(line.split(",")[2]) if ",RES," in line else 0
+        return [renumbered(line, number + 1)] if number >= 17 else [line]
+
+    run = soaked(FakeBox(ahead))
+    assert [row[2:] for row in run.answers] == [row[2:] for row in clean.answers]
+
+
+def test_an_answer_that_nobody_asked_for_is_found():
+    """A number right in order, but before the robot has given the start edge."""
+    run = soaked(FakeBox(on(17, lambda line: [line, renumbered(line, 18), renumbered(line, 19)])))
+    assert "answer 19 came before its start edge" in run.faults[0][1]
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [
+        ("$PPLP,STA,1,streaming,0,0,9,0,0,1,0,b,sim*00", "broken"),
+        ("$PPLP,RES,1", "broken"),
+        (sentence("STA", 9, "absent", 0, 0, 9, 0, 0, 1, 0, "b", "sim").decode().strip(), "the skin is absent"),
+    ],
+)
+def test_a_broken_sentence_and_a_lost_skin_are_noted(line, what):
+    """A wrong checksum, half a sentence, a state other than streaming once frames have come."""
+    run = soaked(FakeBox(on(3, lambda answer: [answer, line])), 30)
+    assert [what in fault for _, fault in run.faults] == [True]
+
+
+def test_frames_that_nobody_counted_are_found():
+    """Fifty frames that are gone without a word; the same behind for a while and then made up for is no loss."""
+    box, late = FakeBox(), FakeBox()
+    box.dropped = lambda s: 50 * (s > 70)
+    late.dropped = lambda s: 50 * (30 < s < 80 or 115 < s < 135)
+    told = sums(soaked(box))
+    assert told["unaccounted"] == 50
+    assert missed(told) == [LOST]
+    assert missed(sums(soaked(late))) == []
+
+
+def test_frames_out_of_nowhere_are_found():
+    """A box that counts more frames than the board took has not accounted for them either."""
+    box = FakeBox()
+    box.dropped = lambda s: -50 * (s > 70)
+    assert missed(sums(soaked(box))) == [LOST]
+
+
+def test_wrong_verdicts_beyond_the_network_by_itself_are_found(clean):
+    """A box that errs where its network does not leaves the band; refusals are not wrong."""
+    told, refused = copy.deepcopy(clean), copy.deepcopy(clean)
+    for row in told.answers[:12]:
+        row[3], row[4] = "ok", next(m for m in skin.MATERIALS if m != row[2])
+    for row in refused.answers[:12]:
+        row[3], row[4] = "unknown", ""
+    assert missed(sums(told)) == [WRONG]
+    assert missed(sums(refused)) == []
+    assert sums(refused)["differs"] > 0
+
+
+@pytest.mark.parametrize(("column", "target"), [("dropped", DROPPED), ("files", FILES), ("threads", FILES)])
+def test_counters_that_grow_are_found(clean, column, target):
+    """Dropped sentences, and files or threads that become more, each miss their own target."""
+    run = copy.deepcopy(clean)
+    run.samples[-1][SAMPLE.index(column)] += 1
+    assert missed(sums(run)) == [target]
+
+
+def samples(rss_kib: np.ndarray, began_s: float = 0.0) -> dict:
+    """A run that has only memory, a sample each ten seconds."""
+    return {
+        "samples": [[began_s + 10.0 * i, float(k), 0, 0.0, 8, 1, 1, 0, 0, 1, 0, 0.0] for i, k in enumerate(rss_kib)]
+    }
+
+
+def test_growing_memory_is_found_and_steady_memory_is_not():
+    """An hour with 1 MiB an hour grows; the same noise without it is flat; the interval holds the truth."""
+    noise = np.random.default_rng(1).normal(0, 40, 360)
+    hours = np.arange(360) / 360
+    grown, flat = (soak_judge.slope([samples(70_000 + noise + kib * hours)]) for kib in (1024, 0))
+    assert grown["low"] < 1024 < grown["high"]
+    assert grown["low"] > soak_judge.GROWTH_KIB_H > flat["high"]
+    assert flat["low"] < 0 < flat["high"]
+
+
+def test_the_interval_knows_that_neighbours_are_alike():
+    """Steps that stay for minutes widen the interval against noise as large that changes with each sample."""
+    rng = np.random.default_rng(2)
+    steps, noise = np.repeat(rng.normal(0, 40, 18), 20), rng.normal(0, 40, 360)
+    wide, narrow = (soak_judge.slope([samples(70_000 + values)]) for values in (steps, noise))
+    assert wide["high"] - wide["low"] > 3 * (narrow["high"] - narrow["low"])
+
+
+def test_runs_have_a_level_each_and_one_slope():
+    """A process that was started anew on another level is no growth; two that grow are; two samples tell nothing."""
+    flat = [samples(np.full(120, 70_000.0)), samples(np.full(120, 75_000.0), 1200)]
+    grown = [samples(70_000 + np.arange(120)), samples(60_000 + np.arange(120), 1200)]
+    assert soak_judge.slope(flat) | {"kib_h": 0.0, "low": 0.0, "high": 0.0} == soak_judge.slope(flat)
+    assert soak_judge.slope(grown)["kib_h"] == pytest.approx(360)
+    assert soak_judge.slope([samples(np.full(2, 7.0))])["high"] is None
+    assert soak_judge.slope([])["high"] is None
+
+
+def test_memory_is_judged_once_the_second_half_is_long_enough(clean):
+    """An hour of growth misses the target, an hour without it reaches it."""
+    for kib, met in ((1.0, False), (0.0, True)):
+        run = copy.deepcopy(clean)
+        row = run.samples[-1]
+        run.samples = [[10.0 * i, 70_000 + kib * i, *row[2:]] for i in range(360)]
+        assert [t[3] for t in soak_judge.targets(sums(run))][MEMORY] is met
+
+
+def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
+    """After a minute without a word the run ends; what was recorded is saved, and the box closed."""
+    box, saved = FakeBox(), []
+    box.mute_s = box.now_s + 40
+    run = soak_judge.Run(seed=1)
+    soak.record(box, run, 3600, lambda: saved.append(len(run.answers)), clock=box.clock, log=lambda line: None)
+    assert run.ended == "gone"
+    assert "nothing for 60 s" in run.faults[-1][1]
+    assert saved[-1] == len(run.answers) > 5
+    assert box.closed == 1
+
+
+def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
+    """The first run is kept as it was, a second one takes what is left with the next seed, a third has nothing to do."""
+    box, lines = FakeBox(), []
+    how = {"clock": box.clock, "log": lines.append}
+    path = soak.soak(box, 7, 0.05, tmp_path, stopped=lambda: box.now_s > 170, **how)
+    first = json.loads(path.read_text())
+    assert [run["ended"] for run in first["runs"]] == ["interrupted"]
+    soak.soak(box, 7, 0.05, tmp_path, **how)
+    both = json.loads(path.read_text())
+    assert both["runs"][0] == first["runs"][0]
+    assert both["started"] == first["started"]
+    assert [run["seed"] for run in both["runs"]] == [7, 8]
+    assert both["runs"][1]["began_s"] == first["runs"][0]["length_s"]
+    assert 180 <= sum(run["length_s"] for run in both["runs"]) < 190
+    assert missed(soak_judge.sums(both)) == []
+    soak.soak(box, 7, 0.05, tmp_path, **how)
+    assert box.runs == 2
+    assert "are there already" in lines[-1]
+
+
+def test_a_soak_that_is_killed_leaves_a_whole_record():
+    """At any moment the sweeps that are due have their answers, though the run has not ended and one may be open."""
+    box, run = FakeBox(), soak_judge.Run(seed=1)
+    recorder = soak.Recorder(box, run, Script(1), box.clock)
+    recorder.start()
+    for _ in range(60):
+        recorder.listen(1.0, lambda: False)
+        assert missed(sums(run)) == []
+    assert 10 < run.due < len(run.answers) + 2
+    assert run.ended == ""
+
+
+def test_another_seed_begins_anew(tmp_path):
+    """Runs of other acts, code or machines are not put together."""
+    box = FakeBox()
+    how = {"clock": box.clock, "log": lambda line: None}
+    soak.soak(box, 7, 0.01, tmp_path, **how)
+    path = soak.soak(box, 8, 0.01, tmp_path, **how)
+    assert [run["seed"] for run in json.loads(path.read_text())["runs"]] == [8]
+
+
+def test_edges_and_frames_are_reckoned_from_the_first_sentences():
+    """The first answer fixes the script, the first counted frames the board; before, nothing has happened."""
+    sweeps = Script(1)
+    robot = Reckoned(sweeps)
+    assert robot.edges(1e9) == (0, 0)
+    begun_s = 1000.0
+    at = [begun_s + sweeps[k].stop / RATE for k in (1, 2)]
+    robot.hear(begun_s + 1, sentence("STA", 1, "streaming", 0, 0, 750, 0, 0, 1, 0, "b", "sim").decode())
+    robot.hear(at[0], sentence("RES", 1, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode())
+    assert robot.edges(at[1] - 0.1) == (2, 1)
+    assert robot.edges(at[1] + 0.1) == (2, 2)
+    assert robot.taken(begun_s + 3) == pytest.approx(2250)
+
+
+def test_the_script_tells_what_is_touched_and_what_the_network_says():
+    """Labels and edges are those of the simulator's acts; the network by itself is mostly right."""
+    sweeps, acts = Script(3), list(script.tubes(3, 12))
+    assert [sweeps[k].label for k in range(1, 13)] == [act.label for act in acts]
+    assert [sweeps[k + 1].stop - sweeps[k + 1].start for k in range(12)] == [act.stop - act.start for act in acts]
+    assert sweeps[2].start == len(acts[0].frames) + acts[1].start
+    assert sum(sweeps[k].alone == sweeps[k].label for k in range(1, 13)) >= 8
+
+
+def test_a_simulated_world_that_remembers_nothing_stays_as_large_as_it_is():
+    """Of twenty sweeps one act and no written line are held; the script has ended, and its end is known all the same."""
+    world = devices.build(skin.FORMAT, script.tubes(1, 20), VirtualClock(), "sim", remember=False)
+    with ExitStack() as stack:
+        settings = config.load(None, [], site=NO_SITE)
+        box = assembly.box(settings, bundle.load(bundle.DEFAULT), world, StdoutPort("sim"), stack)
+        while not world.finished(box.answered):
+            box.step()
+    assert (world.robot.acts, box.answered, len(world.robot.played), len(world.gpio.written)) == (20, 20, 1, 0)
+
+
+def test_a_process_is_read_from_proc():
+    """RSS and PSS in KiB, processor seconds, files and threads, also where the program's name has brackets and spaces."""
+    stat = "12 (palpate (x) y) S " + " ".join(map(str, [*range(4, 14), 250, 50, 0, 0, 20, 0, 3, 0]))
+    assert process("55 [rollup]\nRss:   70540 kB\nPss:  64586 kB\nPss_Dirty:  9 kB\n", stat, 8) == (
+        70540,
+        64586,
+        3.0,
+        8,
+        3,
+    )
+
+
+def test_this_machine_sweeps_answers_and_ends():
+    """The installed command on a pseudo-terminal: an answer, a look at its process, and an orderly end."""
+    box, sweeps, lines = ThisMachine(), Script(1), []
+    try:
+        box.start(1, sweeps)
+        end_s = time.monotonic() + 60
+        while not any(Answer.read(line) for _, line in lines) and time.monotonic() < end_s:
+            lines += box.heard(0.2)
+        rss_kib, pss_kib, cpu_s, files, threads = box.process()
+        assert 20_000 < rss_kib < 500_000
+        assert 0 < pss_kib <= rss_kib
+        assert cpu_s > 0
+        assert files > 3
+        assert threads >= 1
+        assert next(filter(None, (Answer.read(line) for _, line in lines))).sweep == 1
+        assert box.edges(time.monotonic())[1] >= 1
+        box.stop()
+        with pytest.raises(Gone, match="the box ended with 0"):
+            box.heard(0)
+    finally:
+        box.close()
+
+
+@pytest.fixture
+def told(clean) -> dict:
+    """Results of two boxes, the second interrupted and with a fault, a third left out."""
+    run, other = soak.asdict(clean), soak.asdict(copy.deepcopy(clean))
+    other["faults"] = [[3.0, "answer 7 came again"]]
+    about = {"what": "a made-up box", "machine": "none", "versions": {"python": "3"}, "commit": "abc", "seed": 1,
+             "format": "4x4", "started": "2026-01-01T00:00:00+00:00"}  # fmt: skip
+    boxes = {
+        name: about | {"box": name, "runs": runs} for name, runs in (("this machine", [run]), ("virtual box", [other]))
+    }
+    return {"left_out": {"third box": "it was not there"},
+            "boxes": {name: box | {"sums": soak_judge.sums(box)} for name, box in boxes.items()}}  # fmt: skip
+
+
+def test_the_page_needs_nothing_else_and_tells_all(told):
+    """Both boxes, every target, the fault and what was left out; no address, no script; the picture is sound XML."""
+    html, svg = soak_page.tell(told)
+    assert {e.tag.rpartition("}")[2] for e in ET.fromstring(svg).iter()} >= {"svg", "title", "path", "text"}
+    assert not re.search(r"<script|<link|<img|@import|url\((?!#)|href=\"(?!#)", html)
+    for text in ("this machine", "virtual box", "third box; it was not there", "answer 7 came again", "not reached",
+                 "growth of memory", "too short to tell", "abc"):  # fmt: skip
+        assert text in html, text
+    assert svg in html
+    assert len(svg) < 60_000
+
+
+def test_a_day_of_sweeps_stays_a_small_picture(told):
+    """Of 25,000 sweeps the slowest of each few is drawn, and the slowest of all is among them."""
+    rows = told["boxes"]["this machine"]["runs"][0]["answers"]
+    many = [[3.45 * i, i + 1, *rows[0][2:6], 1.5, 0] for i in range(25_000)]
+    many[12_345][6] = 700.0
+    told["boxes"]["this machine"]["runs"][0]["answers"] = many
+    dots = soak_page.dots(told["boxes"]["this machine"])
+    assert len(dots[0]) <= soak_page.DOTS
+    assert max(dots[1]) == 700.0
+
+
+def test_records_are_written_a_row_a_line_and_read_again(tmp_path):
+    """What is written reads back the same, and a text with brackets is left alone."""
+    content = {"runs": [{"samples": [[1.5, "a, b", None], [2, "[ c ]", 0]], "empty": [], "n": {"x": 1}}]}
+    soak.write(tmp_path / "sub" / "x.json", content)
+    text = (tmp_path / "sub" / "x.json").read_text()
+    assert json.loads(text) == content
+    assert '[1.5, "a, b", null]' in text
+
+
+def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
+    """The whole command's end: page, picture and results are there; it fails for one missed target, and names it."""
+    record = {"box": "this machine", "what": "", "machine": "", "versions": {}, "commit": "c", "seed": 1, "format": "f",
+              "started": "now", "runs": [soak.asdict(clean)]}  # fmt: skip
+    soak.write(tmp_path / "this-machine.json", record)
+    assert soak.draw(tmp_path, tmp_path / "page")
+    record["runs"][0]["due"] += 1
+    soak.write(tmp_path / "this-machine.json", record)
+    assert not soak.draw(tmp_path, tmp_path / "page")
+    assert "FAIL this machine  sweeps without an answer: 1" in capsys.readouterr().out
+    assert {p.name for p in (tmp_path / "page").iterdir()} == {"index.html", "soak.svg", "results.json"}

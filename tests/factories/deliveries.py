@@ -1,0 +1,90 @@
+"""Bundles as they are delivered, for tests. In: a folder. Out: keys, signed bundles, a store that believes one signer."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle
+from appliance.bundle.manifest import SCHEMA, Manifest
+from appliance.core.config import StoreConfig
+from appliance.deployment import signature
+from appliance.deployment.store import Store
+
+SIGNER = "anna@lab"
+NEEDED = pytest.mark.skipif(not shutil.which("ssh-keygen"), reason="ssh-keygen is missing: apt install openssh-client")
+
+
+def key(folder: Path, name: str = "key", kind: str = "ed25519") -> Path:
+    """A new private key."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / name
+    subprocess.run(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", name, "-f", path], check=True)
+    return path
+
+
+def line(key: Path, name: str = SIGNER, options: str = "") -> str:
+    """The line of a file of signers that believes this key."""
+    return f"{name} {options}{key.with_suffix('.pub').read_text()}"
+
+
+def files(counter: int, key: Path | None, **changes: object) -> dict[str, bytes]:
+    """The files of the default bundle with another counter, signed; changes: of its manifest."""
+    held = {name: data for name, data in bundle.files(bundle.DEFAULT).items() if name != bundle.SIGNATURE}
+    manifest = replace(Manifest.parse(held[bundle.MANIFEST]), counter=counter, schema=SCHEMA, **changes)  # type: ignore[arg-type]
+    held[bundle.MANIFEST] = manifest.json()
+    return signed(held, key) if key else held
+
+
+def signed(held: dict[str, bytes], key: Path) -> dict[str, bytes]:
+    """The files of a bundle with the manifest that they need, and its signature."""
+    entries = {name: bundle.file_entry(data) for name, data in held.items() if name != bundle.MANIFEST}
+    text = replace(Manifest.parse(held[bundle.MANIFEST]), files=entries).json()
+    return held | {bundle.MANIFEST: text, bundle.SIGNATURE: signature.sign(text, key)}
+
+
+def put(folder: Path, files: dict[str, bytes]) -> Path:
+    """Write the files of a bundle to a new folder."""
+    folder.mkdir(parents=True)
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+class Delivery:
+    """A box's store, and somebody who delivers bundles to it."""
+
+    def __init__(self, folder: Path, prove: Callable[[Bundle], object] = lambda bundle: None) -> None:
+        self.folder = folder
+        self.key = key(folder / "keys")
+        self.how = StoreConfig(str(folder / "store"), str(folder / "allowed_signers"), probation_sweeps=5)
+        Path(self.how.folder).mkdir()
+        Path(self.how.signers).write_text(line(self.key))
+        self.store, self.logged = Store(self.how, prove), list[str]()
+        self._made = 0
+
+    def made(self, counter: int, **changes: object) -> Path:
+        """A folder with a signed bundle, as deploy has copied it."""
+        self._made += 1
+        return put(self.folder / "incoming" / str(self._made), files(counter, self.key, **changes))
+
+    def accepted(self, counter: int) -> str:
+        """A bundle that was accepted; its sha256."""
+        return self.store.accept(self.made(counter))
+
+    def start(self) -> str:
+        """A start of the box; the sha256 of what it runs, "" for the packaged bundle."""
+        folder = self.store.choose(self.logged.append).folder
+        return "" if folder == bundle.DEFAULT else folder.name
+
+    def committed(self, counter: int) -> str:
+        """A bundle that was accepted and committed; its sha256."""
+        sha = self.accepted(counter)
+        assert self.store.commit()
+        return sha

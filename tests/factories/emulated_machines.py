@@ -1,0 +1,211 @@
+"""The room of other processors. In: folders with bundles and sweeps. Out: what the box's classifier says of them there.
+
+`python tests/machines.py` gets what an arm64 userland needs, once, into ~/.cache/palpate/machines: Debian's packages
+unpacked, the wheels of appliance/requirements.lock beside them. qemu's user mode runs it, and x86 processors older than
+this one; nothing needs root, and nothing outside that folder is changed. `python tests/machines.py FROM TO` is what
+then runs on each machine, this one too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from tests.factories.paths import ROOT
+
+LOCK = ROOT / "appliance" / "requirements.lock"
+HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palpate" / "machines"
+MACHINES = {
+    "x86, AVX2 without VNNI": ("x86_64", "Haswell"),
+    "x86, SSE4 without AVX": ("x86_64", "Nehalem"),
+    "Raspberry Pi 4": ("aarch64", "cortex-a72"),
+    "Raspberry Pi 5": ("aarch64", "cortex-a76"),
+    "Arm with all that qemu knows": ("aarch64", "max"),
+}
+"""Name: (architecture, processor as qemu calls it). The Pi 5 has dot products of eight bits, the Pi 4 has not."""
+PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
+PACKAGES = (f"{PYTHON}-minimal", f"lib{PYTHON}-stdlib", "libstdc++6")
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
+ARM_WHEELS = (
+    "--no-deps", "--only-binary", ":all:", "--implementation", "cp",
+    *(f"--platform=manylinux{tag}_aarch64" for tag in ("_2_28", "_2_27", "_2_17", "2014")),
+)  # fmt: skip
+CPUINFO = (
+    "processor\t: 0\nFeatures\t: fp asimd\nCPU implementer\t: 0x41\n"
+    "CPU architecture: 8\nCPU variant\t: 0x0\nCPU part\t: 0xd08\nCPU revision\t: 3\n"
+)
+"""onnxruntime counts cores there and crashes on an x86's; what the processor can do it asks the kernel, here qemu."""
+
+
+class Missing(Exception):
+    """What another machine needs is not to be had here."""
+
+
+def folder() -> Path:
+    """Where the arm64 userland lies, or will: another one for another lock or Python."""
+    name = hashlib.sha256(LOCK.read_bytes() + PYTHON.encode()).hexdigest()[:16]
+    return HOME / name
+
+
+def qemu(kind: str) -> str:
+    """The emulator of an architecture: this machine's, else the one that `set_up` got. Raises Missing."""
+    for name in (f"qemu-{kind}-static", f"qemu-{kind}"):
+        if found := shutil.which(name, path=f"{os.environ['PATH']}:{folder() / 'qemu' / 'usr' / 'bin'}"):
+            return found
+    raise Missing(f"no qemu-{kind} here; apt-get install qemu-user-static, or run python tests/machines.py")
+
+
+def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
+    """Arguments and environment that run this file on one of MACHINES. Raises Missing."""
+    kind, processor = MACHINES[name]
+    if platform.machine() != "x86_64":
+        raise Missing("other processors are compared with an x86")
+    run = [qemu(kind), "-cpu", processor]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    if kind == platform.machine():
+        return [*run, sys.executable, __file__, *map(str, args)], env
+    usr = folder() / "root" / "usr"
+    if not usr.exists():
+        raise Missing("no arm64 userland here; run python tests/machines.py (30 s, 300 MB in ~/.cache/palpate)")
+    env |= {"PYTHONPATH": f"{folder() / 'site'}:{ROOT}", "PYTHONHOME": str(usr)}
+    return [*run, "-L", str(usr.parent), str(usr / "bin" / PYTHON), __file__, *map(str, args)], env
+
+
+def whole(target: Path, make: Callable[[Path], None]) -> Path:
+    """The folder `target`, made whole or not at all where it is not there: `make` fills an empty one beside it.
+
+    Raises Missing with what the failed command said.
+    """
+    if target.exists():
+        return target
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=f"{target.name}.", suffix=".part", dir=target.parent))
+    part.chmod(0o755)
+    try:
+        make(part)
+        with suppress(OSError):  # somebody else was quicker
+            part.rename(target)
+    except subprocess.CalledProcessError as e:
+        raise Missing(f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout or '').strip()[-800:]}") from e
+    except FileNotFoundError as e:
+        raise Missing(f"no {e.filename} here: this needs Debian's tools") from e
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return target
+
+
+def set_up() -> Path:
+    """The folder of the arm64 userland, made where it is not there. Raises Missing where apt or pip cannot."""
+    return whole(folder(), _make)
+
+
+def _make(part: Path) -> None:
+    for made in ("root/proc", "root/sys/devices/system/cpu", "qemu"):
+        (part / made).mkdir(parents=True)
+    _unpack(part)
+    _install(part / "site")
+    (part / "root/proc/cpuinfo").write_text(CPUINFO)
+    for file in ("possible", "present"):
+        (part / "root/sys/devices/system/cpu" / file).write_text("0\n")
+    for rest in ("lists", "archives"):
+        shutil.rmtree(part / rest)
+    for other in (part / "qemu/usr/bin").glob("*"):  # 20 MB each
+        if "x86_64" not in other.name and "aarch64" not in other.name:
+            other.unlink()
+
+
+def _unpack(part: Path) -> None:
+    """Debian's Python for arm64, and qemu where this machine has none, with all they need."""
+    mine = run("dpkg", "--print-architecture").strip()
+    wanted = {"root": [f"{name}:arm64" for name in PACKAGES]}
+    try:
+        qemu("aarch64"), qemu("x86_64")
+    except Missing:
+        wanted["qemu"] = [f"qemu-user-static:{mine}"]
+    with_apt = apt(part, "arm64", *([mine] if "qemu" in wanted else []))
+    for where, names in wanted.items():
+        run(*with_apt, "apt-get", "-qq", "install", "-y", "--download-only", "--no-install-recommends", *names)
+        for package in (part / "archives").glob("*.deb"):
+            run("dpkg-deb", "-x", package, part / where)
+            package.unlink()
+
+
+def apt(part: Path, *known: str) -> tuple[str, str]:
+    """What to put before a command of apt, so that it sees these architectures, knows nothing as installed, and keeps
+    what it fetches in `part`. The lists are fetched here; apt checks their signatures with this machine's keys.
+    """
+    for made in ("lists/partial", "archives/partial"):
+        (part / made).mkdir(parents=True, exist_ok=True)
+    (part / "status").write_bytes(b"")
+    (part / "apt.conf").write_text(
+        f'APT::Architecture "{known[0]}"; APT::Architectures {{ {" ".join(f"{name};" for name in known)} }};\n'
+        f'APT::Sandbox::User ""; Acquire::Languages "none";\n'
+        f'Dir::State::Lists "{part}/lists"; Dir::State::Status "{part}/status"; Dir::Cache "{part}";\n'
+    )
+    before = ("env", f"APT_CONFIG={part / 'apt.conf'}")
+    run(*before, "apt-get", "-qq", "update")
+    return before
+
+
+def _install(site: Path) -> None:
+    """The locked wheels for arm64."""
+    run(*PIP, "install", *ARM_WHEELS, "--require-hashes", "-r", LOCK, "--target", site)
+
+
+def wheel(out: Path, source: Path) -> None:
+    """Build the box's wheel into `out`, in the empty folder `source`: setuptools would put what an older build left
+    behind into the wheel, and leaves its own behind.
+    """
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    shutil.copytree(ROOT / "appliance", source / "appliance", ignore=shutil.ignore_patterns("__pycache__"))
+    run(*PIP, "wheel", "--no-deps", "-w", out, source)
+
+
+def run(*args: str | Path) -> str:
+    """A command's output; its errors go into the exception."""
+    return subprocess.run(args, check=True, capture_output=True, text=True).stdout
+
+
+def work(given: Path, told: Path) -> None:
+    """Run what lies in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy, into one .npz.
+
+    A bundle: NAME/golden and NAME/sweeps are its logits. A shown.onnx: NAME/shown [n, ...] is all that it gives for the
+    sweeps, one after another.
+    """
+    import numpy as np
+
+    from appliance.bundle import bundle
+    from appliance.core import clock
+    from appliance.inference import classifier, session
+
+    said = {}
+    for path in sorted(given.iterdir()):
+        sweeps = np.load(path / "sweeps.npy")
+        if (path / bundle.MANIFEST).exists():
+            box = classifier.Classifier(bundle.load(path), clock.SystemClock())
+            said[f"{path.name}/golden"] = np.stack([box.logits(sweep) for sweep in box.bundle.golden])
+            said[f"{path.name}/sweeps"] = np.stack([box.logits(sweep) for sweep in sweeps])
+        if (path / "shown.onnx").exists():
+            shown = session.session((path / "shown.onnx").read_bytes())
+            each = [shown.run(None, {shown.get_inputs()[0].name: sweep[None]}) for sweep in sweeps]
+            said[f"{path.name}/shown"] = np.stack([np.concatenate([x.ravel() for x in one]) for one in each])
+    np.savez(told, **said)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 3:
+        work(Path(sys.argv[1]), Path(sys.argv[2]))
+    else:
+        try:
+            print(set_up())
+        except Missing as e:
+            sys.exit(str(e))

@@ -1,0 +1,272 @@
+"""The room of real hosts: Debians in containers, each in its own network namespace, with an sshd and a bare user.
+
+In: nothing but this machine, as root. Out: hosts that `make install` and `make deploy` are tried on, and with
+`python -m hosts figures` how long both take. Their Debian is made once, in ~/.cache/palpate/hosts: bare, with the packages
+that an install wants in apt's cache as from a mirror; and ready, with these installed. What happens on a host is gone
+with it. The skin is simulated there, by a drop-in for the unit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from itertools import count
+from pathlib import Path
+from typing import Any, Self
+
+from appliance.core.provenance import commit
+from tests.factories import deliveries, nspawn
+from tests.factories.emulated_machines import HOME, ROOT, Missing, run, wheel, whole
+
+CACHE = HOME.parent / "hosts"
+PACKAGES = ("systemd", "systemd-sysv", "openssh-server", "sudo", "dbus")
+WANTED = ("python3-venv", "libusb-1.0-0", "openssh-client")
+"""What an install gets by apt-get."""
+USER = "robot"
+NET = "10.213"
+
+
+def folder() -> Path:
+    """Where the Debians lie, or will: others for other packages or another processor."""
+    said = repr((nspawn.SUITE, PACKAGES, WANTED, platform.machine())).encode()
+    return CACHE / hashlib.sha256(said).hexdigest()[:16]
+
+
+def check() -> None:
+    """Raise Missing where such hosts cannot be run."""
+    nspawn.check()
+    if lacking := [tool for tool in ("ip", "ssh", "ssh-keygen") if not shutil.which(tool)]:
+        raise Missing(f"no {', '.join(lacking)} here; apt-get install iproute2 openssh-client")
+
+
+def set_up() -> Path:
+    """The folder with the two Debians, `bare` and `ready`, made where it is not there. Raises Missing."""
+    check()
+    return whole(folder(), _make)
+
+
+def _make(part: Path) -> None:
+    bare, ready = part / "bare", part / "ready"
+    run("mmdebstrap", "--variant=minbase", f"--include={','.join(PACKAGES)}", "--aptopt=Acquire::Languages none",
+        *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
+        "--skip=cleanup/apt", "--format=directory", nspawn.SUITE, bare)  # fmt: skip
+    _inside(bare, "useradd", "--create-home", "--shell", "/bin/sh", USER)
+    (bare / "etc/sudoers.d/user").write_text(f"{USER} ALL=(ALL) NOPASSWD: ALL\n")
+    install = ("apt-get", "install", "-y", "-qq", "--no-install-recommends")
+    _inside(bare, "apt-get", "clean")
+    _inside(bare, *install, "--download-only", *WANTED)
+    run("cp", "-a", bare, ready)
+    _inside(ready, *install, *WANTED)
+
+
+def _inside(root: Path, *command: str) -> None:
+    run("chroot", root, "env", "-i", nspawn.PATH, "DEBIAN_FRONTEND=noninteractive", *command)
+
+
+FETCH = """
+import platform, sys; from parcel import LOCK, fetch, locked
+fetch(locked(LOCK.read_text(), sys.argv[1], platform.machine()), sys.argv[1], platform.machine())
+"""
+
+
+def _fetch_wheels() -> None:
+    """Have the wheels for such a host here: a desktop inside a host's own network has no way to where they come from."""
+    python = f"{nspawn.PYTHON}.2"
+    run("env", f"PYTHONPATH={ROOT / 'systemd'}:{ROOT}", sys.executable, "-c", FETCH, python)
+
+
+class Host:
+    """A host that has booted and answers on its ssh port.
+
+    number: from 1 to 250, its own on this machine. work: an empty folder. key: whose owner may log in.
+    Raises Missing where it cannot be had.
+    """
+
+    def __init__(self, root: Path, number: int, work: Path, key: Path) -> None:
+        self.name, self.address, self._key = f"box-{number}", f"{NET}.{number}.2", key
+        (work / "parcel").mkdir(parents=True)
+        self.machine = nspawn.Machine(root, work / "parcel", work / "nspawn.log")
+        self.service = nspawn.Service(self.machine)
+        try:
+            self.pid = self.machine.first
+            link, far = f"palpate{number}", f"palpate{number}f"
+            run("ip", "link", "add", link, "type", "veth", "peer", "name", far, "netns", self.pid)
+            run("ip", "addr", "add", f"{NET}.{number}.1/30", "dev", link)
+            run("ip", "link", "set", link, "up")
+            for rest in (f"addr add {self.address}/30 dev {far}", f"link set {far} up"):
+                run("nsenter", "-t", self.pid, "-n", "ip", *rest.split())
+            home = f"/home/{USER}/.ssh"
+            self.machine.put(f"{home}/authorized_keys", key.with_suffix(".pub").read_text())
+            self.machine.get("chown", "-R", f"{USER}:{USER}", home)
+            self.machine.get("sh", "-c", "echo 127.0.0.1 localhost $(hostname) > /etc/hosts")
+            self.service.configure(nspawn.SIM)
+            self._answers()
+        except BaseException:
+            self.close()
+            raise
+
+    def _answers(self) -> None:
+        end_s = time.monotonic() + nspawn.BOOT_S
+        while time.monotonic() < end_s:
+            with suppress(OSError), socket.create_connection((self.address, 22), 1) as way:
+                if way.recv(4) == b"SSH-":
+                    return
+            time.sleep(0.1)
+        raise Missing(f"{self.address} has no sshd after {nspawn.BOOT_S} s")
+
+    def close(self) -> None:
+        """Shut it down."""
+        self.machine.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Hosts:
+    """Several hosts side by side, and a desktop that may log in on them. kind: "bare" or "ready"."""
+
+    def __init__(self, count: int, work: Path, kind: str = "ready") -> None:
+        self._stack = ExitStack()
+        self.work = work
+        ssh = work / ".ssh"
+        ssh.mkdir(parents=True)
+        (ssh / "known_hosts").touch()
+        run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", ssh / "id_ed25519")
+        root, first = set_up() / kind, 1 + os.getpid() * 8 % 240
+        _fetch_wheels()
+        with self._stack:
+            self.hosts = [
+                self._stack.enter_context(Host(root, number, work / f"host-{number}", ssh / "id_ed25519"))
+                for number in range(first, first + count)
+            ]
+            self._stack = self._stack.pop_all()
+
+    def inventory(self) -> Path:
+        """An inventory of all."""
+        shared = {"ssh_user": USER, "ssh_key": str(self.work / ".ssh/id_ed25519"),
+                  "ssh_known_hosts_file": str(self.work / ".ssh/known_hosts")}  # fmt: skip
+        file = self.work / "inventory.py"
+        file.write_text(f"hosts = ({[(h.name, {'ssh_hostname': h.address}) for h in self.hosts]!r}, {shared!r})\n")
+        return file
+
+    def desktop(
+        self, command: str, *args: str | Path, inside: Host | None = None, limit_s: float = 600
+    ) -> subprocess.CompletedProcess[str]:
+        """Run systemd/COMMAND.py as a user of the desktop who has the key; `inside` a host's own network, or here."""
+        where = ("nsenter", "-t", inside.pid, "-n") if inside else ()
+        return subprocess.run(
+            [*where, sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
+            env=os.environ | {"HOME": str(self.work)}, capture_output=True, text=True, timeout=limit_s, check=False,
+        )  # fmt: skip
+
+    def cut(self, command: str, *args: str | Path, said: str, after_s: float) -> None:
+        """The same, killed so long after it has said something."""
+        with subprocess.Popen(
+            [sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
+            env=os.environ | {"HOME": str(self.work)}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        ) as process:  # fmt: skip
+            while said not in (line := process.stderr.readline()):
+                if not line:
+                    raise AssertionError(f"ended without {said!r}")
+            time.sleep(after_s)
+            process.kill()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+
+def figures(repeats: int = 5, many: int = 8) -> dict[str, Any]:
+    """Install and deliver, over loopback to one host, then to `many` at once."""
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        for name in ("source", "dist"):
+            (work / name).mkdir()
+        wheel(work / "dist", work / "source")
+        key = deliveries.key(work / "keys")
+        (work / "signers").write_text(deliveries.line(key))
+        install = ("--signers", work / "signers", "--board", "rpi5", "--wheel", next((work / "dist").glob("*.whl")))
+        bundles = (deliveries.put(work / f"bundle-{n}", deliveries.files(n, key)) for n in count(1))
+        told: dict[str, Any] = {"commit": commit(), "machine": _machine()}
+        with Hosts(1, work / "one") as one:
+            at = ("--host", f"{USER}@127.0.0.1")
+            told["loopback"] = _measured(one, at, install, [next(bundles) for _ in range(repeats)], one.hosts[0])
+        with Hosts(many, work / "many") as several:
+            at = ("--hosts", several.inventory())
+            told["many"] = _measured(several, at, install, [next(bundles) for _ in range(repeats)])
+        told["load_after"] = os.getloadavg()[0]
+    return told
+
+
+def _measured(
+    place: Hosts, at: Sequence[str | Path], install: Sequence[str | Path], bundles: Sequence[Path],
+    inside: Host | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Seconds of an install, and of each bundle's delivery, as the commands say and as a clock beside them."""
+
+    def timed(command: str, *args: str | Path) -> dict[str, Any]:
+        begin_s = time.monotonic()
+        done = place.desktop(command, *at, *args, "--json", place.work / "told.json", inside=inside)
+        took_s = time.monotonic() - begin_s
+        if done.returncode:
+            raise RuntimeError(done.stdout + done.stderr)
+        told = json.loads((place.work / "told.json").read_text())
+        late_s = told["began_s"] - begin_s  # one clock for all processes of a machine
+        boxes = [box | {"ready_s": round(box["ready_s"] + late_s, 2)} for box in told["boxes"].values()]
+        return {"command_s": round(took_s, 2), "boxes": boxes}
+
+    installed = timed("install", *install)
+    rounds = [timed("deploy", bundle) for bundle in bundles]
+    boxes = [box for one in rounds for box in one["boxes"]]
+    return {
+        "hosts": len(place.hosts), "rounds": len(rounds), "install": installed,
+        "command_s": _spread([one["command_s"] for one in rounds]),
+        **{name: _spread([box[name] for box in boxes]) for name in ("ready_s", "lost_s")}, "deploys": rounds,
+    }  # fmt: skip
+
+
+def _spread(values: Sequence[float]) -> dict[str, float]:
+    return {"median": round(statistics.median(values), 2), "min": min(values), "max": max(values)}
+
+
+def _machine() -> dict[str, Any]:
+    models = (line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
+    name = next(models, "unknown").partition(": ")[2]
+    return {
+        "processor": name, "arch": platform.machine(), "cores": os.cpu_count(), "load_before": os.getloadavg()[0],
+        "python": platform.python_version(),
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser("python -m hosts")
+    commands = parser.add_subparsers(required=True, dest="command")
+    commands.add_parser("set-up", help="make the Debians")
+    measure = commands.add_parser("figures", help="how long an install and a deploy take")
+    measure.add_argument("--out", type=Path, default=ROOT / "build" / "deploy.json", help="(default build/deploy.json)")
+    args = parser.parse_args()
+    try:
+        if args.command == "set-up":
+            print(set_up())
+        else:
+            args.out.parent.mkdir(exist_ok=True)
+            args.out.write_text(json.dumps(figures(), indent=1) + "\n")
+    except Missing as e:
+        sys.exit(str(e))

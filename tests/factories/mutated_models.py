@@ -1,0 +1,242 @@
+"""Models of our own, and what becomes of them at random. In: nothing, or bytes and a generator. Out: bytes.
+
+Two kinds of change: of bytes, which mostly break the file, and of fields, which leave a file that can be read and reach
+the rules of the operators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from random import Random
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import helper, numpy_helper
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Manifest, Thresholds
+from appliance.bundle.onnx_check.operators import OPERATORS
+
+NUMBERS = (0, 1, -1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 64, 255, 256, 1500, 10_000, 65_535, 65_536, 10**6, 2**31 - 1, -(2**31),
+           2**31, 2**32, 2**40, 2**62, 2**63 - 1, -(2**63))  # fmt: skip
+FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-39, 1e-45, 1e38, -1e38, float("inf"), float("-inf"), float("nan"))
+CHANGES = (1, 1, 1, 2, 3)
+"""How many, each as likely as it stands here."""
+QUICK = ("L-knn", "L-svm", "st-hmp", "compact-4k")
+"""Methods that train in a second, and have all operators but GRU and MaxPool between them."""
+
+
+@dataclass(frozen=True)
+class Own:
+    """A model that `palpate-train` writes, and the manifest that goes with it."""
+
+    name: str
+    model: bytes
+    manifest: Manifest
+
+
+def own_models(names: tuple[str, ...] = ()) -> list[Own]:
+    """The default bundle's model and those of these methods, or of all, hardly trained on a small skin."""
+    from tests.factories.sweep_sets import tones
+    from train.models import methods
+
+    default, sweeps = bundle.load(bundle.DEFAULT), tones()
+    found = [Own("default", default.model, default.manifest)]
+    for name, method in methods.every(methods.Effort(0.02, 2)).items():
+        if name in (names or methods.every()):
+            given = methods.given(method.input, sweeps)
+            model = method.train(sweeps, given, 1).graph().SerializeToString()
+            manifest = Manifest(name, "1", sweeps.format, method.input, sweeps.materials, Thresholds(1, 255), {})
+            found.append(Own(name, model, manifest))
+    return found
+
+
+def mutated(model: bytes, rng: Random, other: bytes) -> bytes:
+    """`model` with one to three changes; `other`: where pieces may come from."""
+    if rng.random() < 0.4:
+        for _ in range(rng.choice(CHANGES)):
+            model = rng.choice(BYTES)(model, rng, other)
+        return model
+    made, piece = onnx.load_from_string(model), onnx.load_from_string(other)
+    for _ in range(rng.choice(CHANGES)):
+        try:
+            rng.choice(FIELDS)(made.graph, rng, piece.graph)
+        except (ValueError, TypeError, IndexError):  # no such field there, or it does not take the number
+            continue
+    if rng.random() < 0.05:
+        made.opset_import[0].version = rng.choice((1, 7, 12, 13, 16, 18, 19, 21, 99))
+    return bytes(made.SerializeToString())
+
+
+def flip(data: bytes, rng: Random, other: bytes) -> bytes:
+    """Up to eight bits turned over."""
+    changed = bytearray(data)
+    for _ in range(rng.randint(1, 8)):
+        changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
+def splice(data: bytes, rng: Random, other: bytes) -> bytes:
+    """A piece of another model, or of this one, instead of a piece."""
+    source = rng.choice((data, other))
+    at, to = rng.randrange(len(data)), rng.randrange(len(source))
+    return data[:at] + source[to : to + rng.randint(1, 64)] + data[at + rng.randint(0, 64) :]
+
+
+def numbered(data: bytes, rng: Random, other: bytes) -> bytes:
+    """A byte becomes a number of several."""
+    at, value = rng.randrange(len(data)), rng.choice(NUMBERS) % 2**64
+    varint = bytearray()
+    while value > 127:
+        varint.append(value & 127 | 128)
+        value >>= 7
+    return data[:at] + bytes([*varint, value]) + data[at + 1 :]
+
+
+def short(data: bytes, rng: Random, other: bytes) -> bytes:
+    """The end is cut off."""
+    return data[: max(rng.randrange(len(data)), 1)]
+
+
+Graph = onnx.GraphProto
+BYTES: tuple[Callable[[bytes, Random, bytes], bytes], ...] = (flip, flip, flip, splice, numbered, short)
+
+
+def setting(graph: Graph, rng: Random, other: Graph) -> None:
+    """A number of a node's setting."""
+    attribute = rng.choice([a for node in graph.node for a in node.attribute])
+    if attribute.type == onnx.AttributeProto.INT:
+        attribute.i = rng.choice(NUMBERS)
+    elif attribute.type == onnx.AttributeProto.FLOAT:
+        attribute.f = rng.choice(FLOATS)
+    elif attribute.type == onnx.AttributeProto.STRING:
+        attribute.s = rng.choice((b"", b"NONE", b"SOFTMAX", b"mul", b"POLY", b"RBF", b"sqeuclidean"))
+    else:
+        values = attribute.ints if attribute.type == onnx.AttributeProto.INTS else attribute.floats
+        number = rng.choice(NUMBERS) if values is attribute.ints else rng.choice(FLOATS)
+        _listed(values, number, rng)
+
+
+def _listed(values: Any, number: Any, rng: Random) -> None:
+    """A list of numbers with one other, one more or one less."""
+    how = rng.random()
+    if how < 0.7:
+        values[rng.randrange(len(values))] = number
+    elif how < 0.85:
+        values.append(number)
+    else:
+        del values[rng.randrange(len(values))]
+
+
+def settings(graph: Graph, rng: Random, other: Graph) -> None:
+    """A node loses a setting, or gets one of another node."""
+    node = rng.choice(graph.node)
+    if node.attribute and rng.random() < 0.5:
+        del node.attribute[rng.randrange(len(node.attribute))]
+    else:
+        node.attribute.append(rng.choice([a for node in other.node for a in node.attribute]))
+
+
+def operator(graph: Graph, rng: Random, other: Graph) -> None:
+    """A node becomes another operator."""
+    node = rng.choice(graph.node)
+    node.domain, node.op_type = rng.choice(list(OPERATORS))
+
+
+def names(graph: Graph) -> list[str]:
+    """All that a node may take."""
+    return [v.name for v in (*graph.input, *graph.initializer)] + [name for node in graph.node for name in node.output]
+
+
+def wiring(graph: Graph, rng: Random, other: Graph) -> None:
+    """A node takes something else, more or less."""
+    _listed(rng.choice(graph.node).input, rng.choice(names(graph)), rng)
+
+
+def nodes(graph: Graph, rng: Random, other: Graph) -> None:
+    """A node goes, comes twice, moves, or comes from another model."""
+    at = rng.randrange(len(graph.node))
+    held = onnx.NodeProto()
+    held.CopyFrom(rng.choice((graph.node[at], rng.choice(other.node))))
+    if rng.random() < 0.3:
+        del graph.node[at]
+    if rng.random() < 0.7:
+        graph.node.insert(rng.randrange(len(graph.node) + 1), held)
+
+
+def between(graph: Graph, rng: Random, other: Graph) -> None:
+    """A new node between two others, of any operator, with the settings of such a one elsewhere."""
+    at = rng.randrange(len(graph.node))
+    target = graph.node[at]
+    slot = rng.randrange(len(target.input))
+    domain, op = rng.choice(list(OPERATORS))
+    like = [node for node in (*graph.node, *other.node) if node.op_type == op]
+    held = onnx.NodeProto()
+    if like:
+        held.CopyFrom(rng.choice(like))
+    del held.input[:], held.output[:]
+    extra = OPERATORS[domain, op].least - 1
+    held.input.extend([target.input[slot], *(rng.choice(names(graph)) for _ in range(extra))])
+    held.op_type, held.domain, held.name = op, domain, "between"
+    held.output.extend(["between", "beside"] if op in ("TopK", "SVMClassifier") else ["between"])
+    target.input[slot] = "between"
+    graph.node.insert(at, held)
+
+
+def constant(graph: Graph, rng: Random, other: Graph) -> None:
+    """A number of a constant; half of the time of one that may decide a size."""
+    sizes = [c for c in graph.initializer if c.data_type == onnx.TensorProto.INT64]
+    held = rng.choice(sizes if sizes and rng.random() < 0.5 else graph.initializer)
+    values = numpy_helper.to_array(held).copy()
+    if values.dtype.kind == "f":
+        values.flat[rng.randrange(values.size)] = rng.choice(FLOATS)
+    else:
+        ends = np.iinfo(values.dtype)
+        fits = [n for n in NUMBERS if ends.min <= n <= ends.max]
+        values.flat[rng.randrange(values.size)] = rng.choice(fits)
+    held.CopyFrom(numpy_helper.from_array(values, held.name))
+
+
+def form(graph: Graph, rng: Random, other: Graph) -> None:
+    """A constant's shape or type; half of the time with the numbers that fit it."""
+    held = rng.choice(graph.initializer)
+    values, name = numpy_helper.to_array(held), held.name
+    shape, kind = list(values.shape), values.dtype
+    if rng.random() < 0.6:
+        _listed(shape, rng.choice([n for n in NUMBERS if n >= 0] if rng.random() < 0.5 else (1, 2, 3, 4, 6)), rng)
+    else:
+        kind = np.dtype(rng.choice(("f4", "i1", "u1", "i2", "i4", "i8", "f8", "?")))
+    if rng.random() < 0.7 and np.prod(shape, dtype=object) < 10**6:
+        held.CopyFrom(numpy_helper.from_array(np.resize(values, shape).astype(kind), name))
+    else:
+        del held.dims[:]
+        held.dims.extend(shape)
+        held.data_type = helper.np_dtype_to_tensor_dtype(kind)
+
+
+def exchanged(graph: Graph, rng: Random, other: Graph) -> None:
+    """A constant gets the content of another."""
+    held, source = rng.choice(graph.initializer), rng.choice((graph, other))
+    name = held.name
+    held.CopyFrom(rng.choice(source.initializer))
+    held.name = name
+
+
+def ends(graph: Graph, rng: Random, other: Graph) -> None:
+    """What the model says that it takes or gives."""
+    value = rng.choice((*graph.input, *graph.output))
+    held = value.type.tensor_type
+    if rng.random() < 0.2:
+        held.elem_type = rng.randint(0, 17)
+    elif rng.random() < 0.2:
+        value.name = rng.choice(names(graph))
+    else:
+        rng.choice(held.shape.dim).dim_value = rng.choice(NUMBERS)
+
+
+FIELDS: tuple[Callable[[Graph, Random, Graph], None], ...] = (
+    setting, setting, settings, operator, wiring, nodes, between, between, between, constant, constant, constant, form, form,
+    exchanged, exchanged, ends,
+)  # fmt: skip

@@ -1,0 +1,263 @@
+"""The room of the real systemd: a Debian in a container, with systemd as PID 1 and the box installed as on a board.
+
+`python tests/nspawn.py` makes the Debian, once, in ~/.cache/palpate/nspawn: packages from Debian, a virtual environment
+with the wheels of appliance/requirements.lock. `Machine` boots it in half a second; what is changed in it lies in
+memory and is gone at the end. It has no devices, and its limits of memory and processor are not enforced. Needs root.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Self
+
+from tests.factories.emulated_machines import HOME, LOCK, PIP, ROOT, Missing, run, wheel, whole
+
+CACHE = HOME.parent / "nspawn"
+SUITE, PYTHON = "bookworm", "3.11"
+"""Debian 12, what the boards run, and its Python."""
+PACKAGES = ("systemd", "systemd-sysv", "python3-venv", "libstdc++6", "libusb-1.0-0", "openssh-client", "udev")
+TOOLS = {
+    "mmdebstrap": "mmdebstrap", "systemd-nspawn": "systemd-container", "nsenter": "util-linux", "setpriv": "util-linux",
+}  # fmt: skip
+PLACES = {
+    "palpate.service": "/etc/systemd/system/palpate.service",
+    "palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
+    "palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
+}
+"""Where the files of systemd/ go."""
+CABLE = """
+import os, sys, time
+from appliance.__main__ import main
+from appliance.sim import usb
+class Cable(usb.RigBackend):
+    # plugged in while /run/skin is there; its bus hangs while /run/hang is
+    def _touch(self, what=""):
+        while os.path.exists("/run/hang"):
+            time.sleep(0.01)
+        self.plug() if os.path.exists("/run/skin") else self.unplug()
+        super()._touch(what)
+usb.RigBackend = Cable
+sys.exit(main())
+"""
+SIM = "ExecStart=\nExecStart=/opt/palpate/bin/palpate run --sim skin\n"
+CABLED = "ExecStart=\nExecStart=/opt/palpate/bin/python /opt/palpate/cable.py run --sim skin\n"
+PALPATE = "/opt/palpate/bin/palpate"
+SITE = "/etc/palpate/palpate.toml"
+STREAMS = r"skin streaming\. Sweeps answered: \d+"
+WAIT_S = 30
+"""Longest wait for what should take a second or two: other work may be going on here."""
+PATH = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
+BOOT_S = 60
+
+
+def folder() -> Path:
+    """Where the Debian lies, or will: another one for another lock, suite or processor."""
+    said = repr((SUITE, PYTHON, PACKAGES, platform.machine())).encode()
+    return CACHE / hashlib.sha256(LOCK.read_bytes() + said).hexdigest()[:16]
+
+
+def check() -> None:
+    """Raise Missing where a container cannot be run at all."""
+    if os.geteuid():
+        raise Missing("systemd in a container needs root; use sudo")
+    if lacking := [name for name in TOOLS if not shutil.which(name)]:
+        wanted = sorted({TOOLS[name] for name in lacking})
+        raise Missing(f"no {', '.join(lacking)} here; apt-get install {' '.join(wanted)}")
+
+
+def set_up() -> Path:
+    """The folder of the Debian, made where it is not there. Raises Missing where mmdebstrap or pip cannot."""
+    check()
+    return whole(folder(), _make)
+
+
+def _make(root: Path) -> None:
+    run("mmdebstrap", "--variant=minbase", f"--include={','.join(PACKAGES)}", "--aptopt=Acquire::Languages none",
+        *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
+        "--format=directory", SUITE, root)  # fmt: skip
+    wheels = root / "wheels"
+    run(*PIP, "download", "--no-deps", "--only-binary", ":all:", "--python-version", PYTHON,
+        "--require-hashes", "-r", LOCK, "-d", wheels)  # fmt: skip
+    shutil.copy(LOCK, wheels)
+    inside = ("chroot", root, "env", "-i", PATH)
+    run(*inside, "python3", "-m", "venv", "/opt/palpate")
+    run(*inside, *_pip("--find-links", "/wheels", "--require-hashes", "-r", f"/wheels/{LOCK.name}"))
+    shutil.rmtree(wheels)
+
+
+def _pip(*args: str) -> tuple[str, ...]:
+    return ("/opt/palpate/bin/pip", "--disable-pip-version-check", "-q", "install", "--no-index", *args)
+
+
+def _group() -> Path | None:
+    """A new control group, None where there are none: in one that they share, a container's systemd ends the programs of
+    another's.
+    """
+    mounts = (line.split() for line in Path("/proc/mounts").read_text().splitlines())
+    mounted = next((Path(where) for _, where, kind, *_ in mounts if kind == "cgroup2"), None)
+    return Path(tempfile.mkdtemp(prefix="palpate-", dir=mounted)) if mounted else None
+
+
+class Machine:
+    """A container that has booted; `run` runs a command in it, as root. first: the number of its first process.
+
+    root: what `set_up` gave. parcel: a folder that it sees, read-only, as /parcel. log: where nspawn's own words go.
+    Raises Missing where a container cannot be booted on this machine.
+    """
+
+    def __init__(self, root: Path, parcel: Path, log: Path) -> None:
+        self._log, self._group = log, _group()
+        with tempfile.TemporaryDirectory() as place, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ear:
+            ear.bind(f"{place}/notify")
+            command = (
+                *(("sh", "-c", 'echo $$ >"$0/cgroup.procs"; exec "$@"', self._group) if self._group else ()),
+                "setpriv", "--pdeathsig", "TERM",  # a test run that is killed leaves no container behind
+                "systemd-nspawn", "--quiet", f"--directory={root}", f"--machine=palpate-{os.getpid()}", "--register=no",
+                "--keep-unit", "--console=pipe", "--private-network", "--volatile=overlay", "--notify-ready=yes",
+                f"--bind-ro={parcel}:/parcel", "--boot",
+            )  # fmt: skip
+            env = os.environ | {"NOTIFY_SOCKET": f"{place}/notify", "SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
+            with log.open("wb") as out:
+                self._process = subprocess.Popen(
+                    command, env=env, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
+                )
+            try:
+                self.first = self._booted(ear)
+            except BaseException:
+                self.close()
+                raise
+
+    def _booted(self, ear: socket.socket) -> str:
+        """Wait until its systemd has booted; the number of its first process."""
+        ear.settimeout(0.2)
+        first, end = "", time.monotonic() + BOOT_S
+        while time.monotonic() < end and self._process.poll() is None:
+            with suppress(TimeoutError):
+                said = dict(line.partition("=")[::2] for line in ear.recv(4096).decode().splitlines())
+                first = said.get("X_NSPAWN_LEADER_PID", first)
+                if said.get("READY") == "1":
+                    return first
+        raise Missing(f"systemd does not boot in a container here: {self._log.read_text(errors='replace').strip()}")
+
+    def run(self, *command: str, say: str = "", limit_s: float = 60) -> subprocess.CompletedProcess[str]:
+        """Run a command in it to its end, with `say` as its input."""
+        enter = ("nsenter", "-t", self.first, "-m", "-u", "-i", "-n", "-p", "-C", "-r", "-w", "env", "-i", PATH)
+        return subprocess.run(
+            [*enter, *command], input=say, capture_output=True, text=True, timeout=limit_s, check=False
+        )
+
+    def get(self, *command: str, say: str = "") -> str:
+        """What a command prints; it must succeed."""
+        done = self.run(*command, say=say)
+        assert done.returncode == 0, f"{command} gave {done.returncode}: {done.stdout}{done.stderr}"
+        return done.stdout.strip()
+
+    def put(self, path: str, text: str) -> None:
+        """Write a file, with its folder."""
+        self.get("mkdir", "-p", str(Path(path).parent))
+        self.get("tee", path, say=text)
+
+    def install(self) -> None:
+        """Put the box on it as on a board: `parcel` holds its wheel and the files of systemd/."""
+        self.get("sh", "-c", f"{' '.join(_pip('--no-deps'))} /parcel/*.whl")
+        for name, place in PLACES.items():
+            self.get("install", "-D", "-m", "644", f"/parcel/{name}", place)
+        self.get("systemd-sysusers", PLACES["palpate.sysusers"])
+        self.get("systemd-tmpfiles", "--create", PLACES["palpate.tmpfiles"])
+        self.get("systemctl", "daemon-reload")
+
+    def close(self) -> None:
+        """Shut it down."""
+        self._process.terminate()
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._group:
+            for place in (*sorted(self._group.rglob("*/"), reverse=True), self._group):
+                with suppress(OSError):  # what still ends in it
+                    place.rmdir()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Service:
+    """palpate.service on a machine."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.machine = machine
+        self._begin = time.time()
+
+    def configure(self, text: str) -> None:
+        """Add lines to [Service] by a drop-in."""
+        self.machine.put("/run/systemd/system/palpate.service.d/test.conf", f"[Service]\n{text}\n")
+        self.machine.get("systemctl", "daemon-reload")
+
+    def start(self, text: str = SIM) -> int:
+        """Start it with a drop-in, wait until it is active; the number of its process."""
+        self.configure(text)
+        self.machine.get("systemctl", "start", "palpate")
+        return int(self["MainPID"])
+
+    def __getitem__(self, name: str) -> str:
+        return self.machine.get("systemctl", "show", "palpate", "--value", "-p", name)
+
+    def until(self, name: str, wanted: str) -> None:
+        """Wait for a property to be `wanted`, a regular expression."""
+        end = time.monotonic() + WAIT_S
+        while not re.fullmatch(wanted, value := self[name]):
+            assert time.monotonic() < end, f"{name} stays {value!r}: {self.journal()}"
+            time.sleep(0.2)
+
+    def kill(self, signal: str) -> None:
+        """Send a signal to the process itself, as nobody who stops a service would."""
+        self.machine.get("systemctl", "kill", "--kill-whom=main", f"--signal={signal}", "palpate")
+
+    def journal(self, *more: str) -> list[str]:
+        """What the service and systemd about it have written to the journal since the test began."""
+        about = ("-u", "palpate", "-o", "cat", f"--since=@{self._begin:.6f}", *more)
+        return self.machine.get("journalctl", "-q", *about).splitlines()
+
+    def told(self, *more: str) -> list[str]:
+        """The journal without systemd's words: what the program tells a person."""
+        return self.journal("_SYSTEMD_UNIT=palpate.service", *more)
+
+    def answers(self) -> list[str]:
+        """The verdicts in the journal."""
+        return [line for line in self.told() if line.startswith("sweep ")]
+
+    def status(self) -> dict[str, Any]:
+        """What `palpate status --json` tells a user who is nobody in particular."""
+        told = self.machine.run("setpriv", "--reuid=nobody", "--clear-groups", PALPATE, "status", "--json").stdout
+        return dict(json.loads(told))
+
+
+def pack(parcel: Path, source: Path) -> None:
+    """Fill a parcel with the wheel of this checkout and systemd/. source: an empty folder to build in."""
+    wheel(parcel, source)
+    for name in PLACES:
+        shutil.copy(ROOT / "systemd" / name, parcel)
+
+
+if __name__ == "__main__":
+    try:
+        print(set_up())
+    except Missing as e:
+        sys.exit(str(e))

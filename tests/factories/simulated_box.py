@@ -1,0 +1,84 @@
+"""A box on simulated devices, for tests: numbered frames, devices with an idle robot, the robot's end of the port."""
+
+from __future__ import annotations
+
+import os
+import select
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from appliance.core.types import Sweep, SweepFormat, Verdict
+from appliance.io.robot_link import SerialSink
+from appliance.runtime.loop import Box
+from appliance.sim import devices, rig, skin
+
+SECOND = 1_000_000_000
+SETTLE_S = 0.02
+
+
+def numbered(n: int, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
+    """Frames [n, R, C] whose digits name the frame and the taxel."""
+    grid = np.arange(fmt.rows * fmt.cols).reshape(fmt.rows, fmt.cols)
+    return ((np.arange(first, first + n) % 97)[:, None, None] + grid).astype(fmt.digits)
+
+
+def idle_world(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -> devices.SimWorld:
+    """A world whose skin sends numbered frames and whose robot does nothing."""
+    n = min(round(seconds * fmt.rate_hz), 60_000)
+    acts = [rig.Act(numbered(n, fmt), 10**9, 10**9 + 1, "")]
+    world = devices.build(fmt, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
+    world.backend.board = rig.Board(fmt, world.robot, world.clock, **{"packet_frames": 4} | board)
+    return world
+
+
+@dataclass
+class Rigged:
+    """A box on the rig, and the robot's end of its serial line."""
+
+    box: Box
+    world: devices.SimWorld
+    far_end: int
+    port: SerialSink
+    heard: list[str] = field(default_factory=list)
+    kept: list[Sweep] = field(default_factory=list)
+    rest: bytes = b""
+
+    def until(self, done: Callable[[], bool], *, limit_s: float = 60) -> list[Verdict]:
+        """Step until `done()`; fails after `limit_s` of the world's time."""
+        verdicts = []
+        end_ns = self.world.clock.now_ns() + limit_s * SECOND
+        while not done():
+            assert self.world.clock.now_ns() < end_ns, "nothing happened"
+            verdicts += self.box.step()
+            self.listen()
+        self.listen(SETTLE_S)
+        return verdicts
+
+    def seconds(self, s: float) -> list[Verdict]:
+        """Step for `s` seconds of the world's time."""
+        end_ns = self.world.clock.now_ns() + round(s * SECOND)
+        return self.until(lambda: self.world.clock.now_ns() >= end_ns)
+
+    def listen(self, wait_s: float = 0) -> None:
+        """Read the robot's end; the kernel passes on what the near end wrote in its own time."""
+        while select.select([self.far_end], [], [], wait_s)[0]:
+            *lines, self.rest = (self.rest + os.read(self.far_end, 65536)).split(b"\r\n")
+            self.heard += [line.decode("ascii") for line in lines]
+
+    def ask(self, line: str) -> str:
+        """Send a command; the answer's sentence."""
+        before = len(self.heard)
+        os.write(self.far_end, line.encode() + b"\r\n")
+        self.until(lambda: any(",ANS," in h for h in self.heard[before:]), limit_s=5)
+        return next(h for h in self.heard[before:] if ",ANS," in h)
+
+    def edge(self, name: str, after_s: float, level: bool = True) -> None:
+        """Drive an input line `after_s` from now."""
+        self.world.gpio.drive(name, level, self.world.clock.now_ns() + round(after_s * SECOND))
+
+    def pulse(self, name: str, after_s: float) -> None:
+        """A pulse of 20 ms."""
+        self.edge(name, after_s)
+        self.edge(name, after_s + 0.02, False)

@@ -1,0 +1,56 @@
+"""The fixtures of the tests under a real systemd: the machine, the box installed on it, its service. In: nothing. Out: these.
+
+A test file has them with pytest_plugins = ["tests.factories.systemd_fixtures"]. The skin is simulated, in real time. PALPATE_SYSTEMD=1 makes what
+this needs (see nspawn.py) and insists on it; without, what is not there is skipped.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from tests.factories import nspawn
+from tests.factories.emulated_machines import Missing
+
+
+@pytest.fixture(scope="session")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[nspawn.Machine]:
+    """A machine that has booted, nothing of the box on it but its locked dependencies."""
+    insist = os.environ.get("PALPATE_SYSTEMD") == "1"
+    parcel, folder = tmp_path_factory.mktemp("parcel"), tmp_path_factory.mktemp("machine")
+    try:
+        nspawn.check()
+        if not insist and not nspawn.folder().exists():
+            raise Missing(
+                "no Debian for a container here; run python tests/nspawn.py (90 s, 370 MB in ~/.cache/palpate)"
+            )
+        nspawn.pack(parcel, tmp_path_factory.mktemp("source"))
+        booted = nspawn.Machine(nspawn.set_up(), parcel, folder / "nspawn.log")
+    except Missing as e:
+        if insist:
+            raise
+        pytest.skip(str(e))
+    with booted:
+        yield booted
+
+
+@pytest.fixture(scope="session")
+def before(machine: nspawn.Machine) -> list[bool]:
+    """Whether user and folders were there; then the box is installed."""
+    tests = (("id", "palpate"), ("test", "-e", "/etc/palpate"), ("test", "-e", "/var/lib/palpate"))
+    there = [machine.run(*one).returncode == 0 for one in tests]
+    machine.install()
+    machine.put("/opt/palpate/cable.py", nspawn.CABLE)
+    return there
+
+
+@pytest.fixture
+def service(machine: nspawn.Machine, before: list[bool]) -> Iterator[nspawn.Service]:
+    """The installed service, stopped; stopped again and as it was delivered after the test."""
+    yield nspawn.Service(machine)
+    machine.run("rm", "-rf", "/run/systemd/system/palpate.service.d", nspawn.SITE, "/run/skin", "/run/hang")
+    machine.get("systemctl", "daemon-reload")
+    machine.get("systemctl", "stop", "palpate")
+    machine.run("systemctl", "reset-failed", "palpate")

@@ -1,0 +1,129 @@
+"""A bundle whose answers are known by arithmetic, for tests. In: what it shall hold. Out: a Bundle, and windows for it.
+
+Its embedding is two of four taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its materials "a", "b" and
+"c" lie at (0, 0), (6, 0) and (0, 6) there.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle, Early, Known, Manifest, Thresholds
+from appliance.core.types import Frames, Status, Sweep, SweepFormat
+
+FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
+MEANS = np.array([[0, 0], [6, 0], [0, 6]], np.float32)
+KNOWN = Known(limit=9.0, temperature=2.0)
+LIMITS = Thresholds(contact=10, full_scale=32767, unsure=0.5)
+OUTPUTS = ("logits", "embedding")
+
+
+def window(z1: float, z2: float, fmt: SweepFormat = FORMAT) -> np.ndarray:
+    """Digits [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves."""
+    level = np.array([[100 + 10 * z1, 100 + 10 * z2], [100, 100]])
+    ripple = np.where(np.arange(fmt.window) % 2, 1, -1)[:, None, None]
+    return np.rint(level + ripple).astype(fmt.digits)
+
+
+def sweep(z1: float, z2: float, number: int = 1, object: int = 0, fmt: SweepFormat = FORMAT) -> Sweep:
+    """A good sweep with this embedding."""
+    n = np.arange(fmt.window)
+    return Sweep(number, 0, 0, Status.OK, Frames(n, n, window(z1, z2, fmt)), object=object)
+
+
+def model(
+    outputs: Sequence[str] = OUTPUTS, steps: int = 3, fmt: SweepFormat = FORMAT, scale: float = 0.1, labels: int = 3
+) -> bytes:
+    """The graph; each early row d is (d + 1) times the logits; an output of another name is a copy of the logits."""
+    onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
+    node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
+    pick = np.zeros((4, 2), np.float32)
+    pick[0, 0] = pick[1, 1] = scale
+    bias = -(MEANS[:labels] ** 2).sum(1) / 2
+    constants = {
+        "axes": np.array([1]), "flat": np.array([1, 4]), "pick": pick, "shift": np.float32([-10, -10]),
+        "weights": MEANS[:labels].T / KNOWN.temperature, "bias": bias / np.float32(KNOWN.temperature),
+        "one": np.array([1, 1, labels]), "steps": np.arange(1, steps + 1, dtype=np.float32)[None, :, None],
+    }  # fmt: skip
+    nodes = [
+        node("Cast", ["sweep"], ["float"], to=1),
+        node("ReduceMean", ["float", "axes"], ["mean"], keepdims=0),
+        node("Reshape", ["mean", "flat"], ["taxels"]),
+        node("Gemm", ["taxels", "pick", "shift"], ["embedding"]),
+        node("Gemm", ["embedding", "weights", "bias"], ["logits"]),
+        node("Reshape", ["logits", "one"], ["row"]),
+        node("Mul", ["row", "steps"], ["early"]),
+    ]
+    shapes = {"logits": [1, labels], "embedding": [1, 2], "early": [1, steps, labels]}
+    for name in set(outputs) - shapes.keys():
+        nodes.append(node("Identity", ["logits"], [name]))
+    value = onnx.helper.make_tensor_value_info
+    kind = onnx.helper.np_dtype_to_tensor_dtype(fmt.digits)
+    graph = onnx.helper.make_graph(
+        nodes, "toy",
+        [value("sweep", kind, [1, fmt.window, fmt.rows, fmt.cols])],
+        [value(name, 1, shapes.get(name, [1, labels])) for name in outputs],
+        [array(values, name) for name, values in constants.items()],
+    )  # fmt: skip
+    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+    return bytes(made.SerializeToString())
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    """An .npz."""
+    packed = io.BytesIO()
+    np.savez(packed, **arrays)
+    return packed.getvalue()
+
+
+def npy(array: np.ndarray) -> bytes:
+    """An .npy."""
+    packed = io.BytesIO()
+    np.save(packed, array)
+    return packed.getvalue()
+
+
+def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of means.npz."""
+    bias = -(MEANS**2).sum(1) / 2
+    return {"means": MEANS, "bias": bias, "sweeps": np.zeros(3, np.int64), "spread": np.ones(3, np.float32)} | changes
+
+
+def files(
+    *, known: Known | None = KNOWN, early: Early | None = None, outputs: Sequence[str] = OUTPUTS,
+    fmt: SweepFormat = FORMAT, arrays: dict[str, np.ndarray] | None = None, **graph: float,
+) -> dict[str, bytes]:  # fmt: skip
+    """The files of a toy bundle by name."""
+    arrays = means() if arrays is None else arrays
+    at = np.stack([window(2.5, 0.5, fmt), window(0.5, 3.5, fmt)])
+    z = np.zeros((2, arrays["means"].shape[1]), np.float32)
+    z[:, :2] = [[2.5, 0.5], [0.5, 3.5]]
+    logits = (z @ arrays["means"].T + arrays["bias"]) / KNOWN.temperature
+    content = {bundle.MODEL: model(outputs, fmt=fmt, **graph), bundle.GOLDEN: npz(samples=at, logits=logits)}
+    if known:
+        content[bundle.MEANS] = npz(**arrays)
+    manifest = Manifest(
+        "toy", "1", fmt, "raw", tuple("abcdef"[: logits.shape[1]]), LIMITS,
+        {k: bundle.file_entry(v) for k, v in content.items()}, figures={"LOPO": {"accuracy": 1.0}}, made={"seed": 1},
+        early=early, known=known,
+    )  # fmt: skip
+    return content | {bundle.MANIFEST: manifest.json()}
+
+
+def put(folder: Path, content: dict[str, bytes]) -> Path:
+    """Write the files of a bundle."""
+    folder.mkdir(exist_ok=True)
+    for name, data in content.items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+def load(folder: Path, **more) -> Bundle:
+    """A toy bundle, written to `folder` and read."""
+    return bundle.load(put(folder, files(**more)))

@@ -1,0 +1,267 @@
+"""The unit under a real systemd, in a container: start, notify, watchdog, restart, exit codes, stop, rights, journal."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+
+import pytest
+
+from tests.factories import nspawn
+from tests.factories.emulated_machines import ROOT
+from tests.factories.nspawn import CABLED, PALPATE, SIM, SITE, STREAMS, WAIT_S, Machine, Service
+
+pytest_plugins = ["tests.factories.systemd_fixtures"]
+
+
+def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, before: list[bool]):
+    """User, groups and folders, with owners and modes; none of it was there before, and twice is as good as once."""
+    assert before == [False, False, False]
+    for _ in range(2):
+        assert set(machine.get("id", "-nG", "palpate").split()) == {"palpate", "dialout", "gpio", "plugdev"}
+        assert machine.get("getent", "passwd", "palpate").endswith(":/var/lib/palpate:/usr/sbin/nologin")
+        assert len(machine.get("getent", "group", "gpio", "dialout", "plugdev").splitlines()) == 3
+        own = [f"/var/lib/palpate{folder}" for folder in ("", "/incoming", "/bundles")]
+        folders = machine.get("stat", "-c", "%n %U:%G %a", "/etc/palpate", *own).splitlines()
+        assert folders == ["/etc/palpate root:root 755", *(f"{folder} palpate:palpate 750" for folder in own)]
+        machine.get("systemd-sysusers")
+        machine.get("systemd-tmpfiles", "--create", nspawn.PLACES["palpate.tmpfiles"])
+
+
+def test_the_unit_is_sound_and_hardened(machine: Machine, before: list[bool]):
+    """systemd finds nothing to complain about and knows its times; the exposure is 1.5 of 10 at most."""
+    done = machine.run("systemd-analyze", "verify", nspawn.PLACES["palpate.service"])
+    assert (done.returncode, done.stderr) == (0, "")
+    shown = dict(line.split("=", 1) for line in machine.get("systemctl", "show", "palpate").splitlines())
+    wanted = {"Type": "notify", "NotifyAccess": "main", "Restart": "always", "RestartUSec": "2s"}
+    wanted |= {"TimeoutStartUSec": "1min", "TimeoutStopUSec": "10s", "StartLimitIntervalUSec": "0"}
+    assert {name: shown[name] for name in wanted} == wanted
+    done = machine.run(
+        "systemd-analyze", "security", "--offline=true", "--threshold=15", nspawn.PLACES["palpate.service"]
+    )
+    print(done.stdout.splitlines()[-1])
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_udev_rules_are_sound(machine: Machine, before: list[bool]):
+    """udev reads them and finds nothing to complain about: each key, operator and group is known to it."""
+    rules = "70-palpate.rules"
+    machine.put(f"/etc/udev/rules.d/{rules}", (ROOT / "firmware_config" / rules).read_text())
+    said = machine.run("udevadm", "test", "/sys/class/mem/null").stderr
+    assert f"Reading rules file: /etc/udev/rules.d/{rules}" in said
+    assert f"{rules}:" not in said
+
+
+def test_the_boot_does_not_wait_for_a_skin(machine: Machine, service: Service):
+    """multi-user.target wants the service, and is reached without it."""
+    machine.get("systemctl", "enable", "palpate")
+    try:
+        assert "palpate.service" in machine.get("systemctl", "show", "multi-user.target", "-p", "Wants")
+        machine.get("systemctl", "stop", "multi-user.target")
+        service.configure(CABLED)
+        machine.get("systemctl", "start", "multi-user.target")
+        assert service["ActiveState"] == "activating"
+    finally:
+        machine.get("systemctl", "disable", "palpate")
+
+
+def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, service: Service):
+    """Without a skin it is starting for as long as that takes, and says why; with one active, and stays so without it."""
+    service.configure(CABLED + "TimeoutStartSec=2\nWatchdogSec=2")
+    machine.get("systemctl", "start", "--no-block", "palpate")
+    absent = r"skin absent: no skin 1209:7ac7 on USB .* check cable, power and udev rule\. Sweeps answered: \d"
+    service.until("StatusText", absent)
+    time.sleep(4.5)  # more than twice its time to start
+    assert (service["ActiveState"], service["NRestarts"]) == ("activating", "0")
+    machine.put("/run/skin", "")
+    service.until("ActiveState", "active")
+    service.until("StatusText", STREAMS)
+    machine.get("rm", "/run/skin")
+    service.until("StatusText", "skin absent.*")
+    assert (service["ActiveState"], service["NRestarts"]) == ("active", "0")
+    machine.put("/run/skin", "")
+    service.until("StatusText", STREAMS)
+    skin = [line for line in service.told() if line.startswith("skin: ")]
+    assert [line.split(" (")[0].split(";")[0] for line in skin] == [
+        "skin: no skin 1209:7ac7 on USB",
+        "skin: streaming",
+        "skin: the skin was unplugged",
+        "skin: no skin 1209:7ac7 on USB",
+        "skin: streaming",
+    ]
+
+
+def test_a_start_that_hangs_is_begun_again(machine: Machine, service: Service):
+    """Before READY no watchdog looks; but a start that takes no turns any more runs out of time."""
+    service.configure(CABLED + "TimeoutStartSec=2\nWatchdogSec=2\nRestartSec=100ms")
+    machine.get("systemctl", "start", "--no-block", "palpate")
+    service.until("StatusText", "skin absent.*")
+    service.kill("SIGSTOP")
+    service.until("NRestarts", "1")
+    assert any("start operation timed out" in line for line in service.journal())
+
+
+def test_a_process_that_stands_still_is_killed_and_started_again(service: Service):
+    """SIGSTOP: the watchdog finds it within its time; the service comes back by itself and answers on."""
+    first = service.start(SIM + "WatchdogSec=3")
+    begin = time.monotonic()
+    service.kill("SIGSTOP")
+    service.until("NRestarts", "1")
+    print(f"stopped to started again {time.monotonic() - begin:.1f} s: watchdog 3, RestartSec 2")
+    service.until("ActiveState", "active")
+    assert int(service["MainPID"]) not in (0, first)
+    assert sum("Watchdog timeout (limit 3s)" in line for line in service.journal()) == 1
+    service.until("StatusText", STREAMS)
+
+
+def test_a_turn_that_hangs_is_found_and_named(machine: Machine, service: Service):
+    """A bus that never comes back: killed by the watchdog, and the journal says where it hung."""
+    machine.put("/run/skin", "")
+    service.start(CABLED + "WatchdogSec=3\nRestartSec=100ms")
+    machine.put("/run/hang", "")
+    service.until("NRestarts", "1")
+    machine.get("rm", "/run/hang")
+    service.until("ActiveState", "active")
+    said = service.journal()
+    assert "Fatal Python error: Aborted" in said
+    assert any("sensor.py" in line and line.endswith(" in read") for line in said)
+
+
+@pytest.mark.parametrize("signal", ["SIGKILL", "SIGSEGV"])
+def test_a_killed_process_is_started_again(machine: Machine, service: Service, signal: str):
+    """However it dies, two seconds later it is there again; in between its lines, of the same settings, are lowered."""
+    machine.put(SITE, "[output]\nready = 'GPIO23'\n")  # the simulated skin has lines of its own and ignores it
+    first = service.start()
+    service.kill(signal)
+    service.until("NRestarts", "1")
+    service.until("ActiveState", "active")
+    assert int(service["MainPID"]) not in (0, first)
+    assert sum("Main process exited, code=killed, status=" in line for line in service.journal()) == 1
+    lowered = [line for line in service.told() if line.startswith("palpate: outputs may not be low:")]
+    assert [line.split(": ")[2].split(";")[0] for line in lowered] == ["this machine has no /dev/gpiochip*"]
+
+
+def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service):
+    """Exit 78: named once, and no start after it; mended, it starts."""
+    service.start()
+    machine.put(SITE, "[sweep]\nlongest_s = 'for ever'\n")
+    service.kill("SIGKILL")
+    service.until("ActiveState", "failed")
+    time.sleep(2.5)  # longer than RestartSec
+    assert (service["NRestarts"], service["ExecMainStatus"], service["SubState"]) == ("1", "78", "failed")
+    named = f"palpate: {SITE}: sweep.longest_s = 'for ever'"
+    assert sum(line.startswith(named) for line in service.told()) == 1
+    machine.get("rm", SITE)
+    machine.get("systemctl", "start", "palpate")
+    service.until("StatusText", STREAMS)
+
+
+def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, service: Service):
+    """Exit 69: no GPIO chip; a start each two seconds for as long as that takes, each with its one line."""
+    machine.put(SITE, "[trigger]\nstart = 'GPIO17'\nstop = 'GPIO27'\n")
+    service.configure("")
+    machine.get("systemctl", "start", "--no-block", "palpate")
+    begin = time.monotonic()
+    service.until("NRestarts", "3")
+    took_s = time.monotonic() - begin
+    print(f"three starts in {took_s:.1f} s")
+    assert took_s > 4
+    assert service["ExecMainStatus"] in ("0", "69")
+    named = [line for line in service.told() if line.startswith("palpate: this machine has no /dev/gpiochip*")]
+    assert len(named) in (3, 4)
+
+
+def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
+    """The sweep that is open is answered `aborted`, and the program ends by itself and well in time."""
+    service.start()
+    end = time.monotonic() + WAIT_S
+    while not (told := service.status()).get("sweeping") or not told["answered"]:
+        assert time.monotonic() < end, told
+    begin = time.monotonic()
+    machine.get("systemctl", "stop", "palpate")
+    assert time.monotonic() - begin < 10
+    assert "palpate.service: Deactivated successfully." in service.journal()
+    answers = service.answers()
+    assert [line.split(":")[0] for line in answers] == [f"sweep {i + 1}" for i in range(len(answers))]
+    assert answers[-1] == f"sweep {len(answers)}: no answer, aborted: by command, or because the box was stopping"
+
+
+def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
+    """The skin, and each sweep in words; no sentence, nothing once a second; the lost skin is a warning."""
+    machine.put("/run/skin", "")
+    service.start(CABLED)
+    end = time.monotonic() + WAIT_S
+    while len(service.answers()) < 2:
+        assert time.monotonic() < end, service.told()
+        time.sleep(0.2)
+    machine.get("rm", "/run/skin")
+    service.until("StatusText", "skin absent.*")
+    told = service.told()
+    assert [line for line in told if not line.startswith(("sweep ", "skin: "))] == []
+    assert told[0] == "skin: streaming"
+    assert re.fullmatch(r"sweep 1: [a-z ]+, [0-9.]+ % \([0-9.]+ ms\)", service.answers()[0])
+    warned = service.told("-p", "warning")
+    assert warned[-1].startswith("skin: no skin 1209:7ac7 on USB")
+    assert not [line for line in warned if " % (" in line]
+
+
+def test_every_user_may_ask_how_it_is(machine: Machine, service: Service):
+    """`palpate status` of a user without rights: running, skin away (exit 69), stopped (exit 1)."""
+    ask = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", PALPATE, "status")
+    machine.put("/run/skin", "")
+    pid = service.start(CABLED)
+    service.until("StatusText", STREAMS)
+    done = machine.run(*ask)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.match(rf"running for \d+ s \(process {pid}, palpate [0-9.]+, source sim\)\nskin +streaming", done.stdout)
+    assert service.status()["pid"] == pid
+    machine.get("rm", "/run/skin")
+    service.until("StatusText", "skin absent.*")
+    time.sleep(0.2)
+    done = machine.run(*ask)
+    assert done.returncode == 69
+    assert "check cable, power and udev rule" in done.stdout
+    machine.get("systemctl", "stop", "palpate")
+    done = machine.run(*ask, "--json")
+    assert (done.returncode, json.loads(done.stdout)["running"]) == (1, False)
+
+
+def test_systemctl_says_how_it_is(machine: Machine, service: Service):
+    """A person who asks `systemctl status` reads it in words; the watchdog looks, ten seconds long."""
+    service.start()
+    assert service["WatchdogUSec"] == "10s"
+    service.until("StatusText", STREAMS)
+    shown = machine.run("systemctl", "status", "--no-pager", "palpate").stdout
+    assert 'Status: "skin streaming. Sweeps answered: ' in shown
+    assert "active (running)" in shown
+
+
+def test_it_is_nobody_in_particular(machine: Machine, service: Service):
+    """Not root, no capability, no new privileges, system calls filtered; /etc/palpate can be read and not written."""
+    pid = service.start()
+    status = dict(re.findall(r"^(\w+):\t(.*)$", machine.get("cat", f"/proc/{pid}/status"), re.MULTILINE))
+    uid = machine.get("id", "-u", "palpate")
+    assert set(status["Uid"].split()) == {uid} != {"0"}
+    assert {int(status[name], 16) for name in ("CapPrm", "CapEff", "CapBnd", "CapAmb")} == {0}
+    assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
+    machine.put(SITE, "")
+    as_it = ("nsenter", "-t", str(pid), "-m", "setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups")
+    assert machine.run(*as_it, "cat", SITE).returncode == 0
+    for path in (SITE, "/etc/palpate/new", "/opt/palpate/new", "/root/new"):
+        assert machine.run(*as_it, "touch", path).returncode != 0
+        assert "Read-only" in machine.run("nsenter", "-t", str(pid), "-m", "touch", path).stderr  # not even root could
+    machine.get(*as_it, "touch", "/var/lib/palpate/new")
+
+
+def test_what_it_can_write_it_cannot_execute(machine: Machine, service: Service):
+    """In its own view of the files; Python and ssh-keygen it can, and libusb is found."""
+    pid = service.start()
+    as_it = ("nsenter", "-t", str(pid), "-m", "--")
+    for place in ("/var/lib/palpate", "/run/palpate", "/tmp", "/var/tmp", "/dev/shm"):
+        machine.get(*as_it, "cp", "/bin/true", f"{place}/own")
+        assert machine.run(*as_it, f"{place}/own").stderr.endswith("Permission denied\n"), place
+        machine.get(*as_it, "rm", f"{place}/own")
+    assert "ssh-keygen" in machine.run(*as_it, "ssh-keygen", "-Y", "help").stderr
+    look = "import usb.backend.libusb1 as b; print(b.get_backend().lib)"
+    assert "libusb" in machine.get(*as_it, "/opt/palpate/bin/python", "-c", look)

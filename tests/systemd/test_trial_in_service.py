@@ -1,0 +1,263 @@
+"""A new bundle under a real systemd: its trial, what ends it, what does not, and the shadow of a candidate.
+
+Bundle A is deployed and committed; each test deploys another, B, signed and with a higher counter.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import itertools
+import json
+import subprocess
+import tarfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.bundle import bundle
+from tests.factories.nspawn import CABLED, PALPATE, SITE, STREAMS, Machine, Service
+from train.export.sign import sign
+
+pytest_plugins = ["tests.factories.systemd_fixtures"]
+
+CURSED = """
+import os, signal, sys, time
+from appliance.__main__ import main
+from appliance.sim import usb
+class Cursed(usb.RigBackend):
+    # a second and a half after it has begun, while the current bundle is the one in /run/cursed: do what stands there
+    begin = time.monotonic()
+    def _touch(self, what=""):
+        super()._touch(what)
+        if time.monotonic() > self.begin + 1.5 and os.path.exists("/run/cursed"):
+            sha, does = open("/run/cursed").read().split()
+            if os.readlink("/var/lib/palpate/current").endswith(sha):
+                os.kill(os.getpid(), signal.SIGSEGV) if does == "die" else time.sleep(60)
+usb.RigBackend = Cursed
+sys.exit(main())
+"""
+RUN = "ExecStart=\nExecStart=/opt/palpate/bin/python /opt/palpate/cursed.py run --sim skin --shadow\nRestartSec=100ms\n"
+REAL = "ExecStart=\nExecStart=/opt/palpate/bin/palpate run\nRestartSec=100ms\n"
+AS_PALPATE = ("setpriv", "--reuid=palpate", "--regid=palpate", "--init-groups", PALPATE)
+LEFT = "has failed its trial, and "
+
+
+class Store:
+    """The store on the machine, as whoever deploys sees it. a: the sha256 of bundle A's manifest."""
+
+    def __init__(self, machine: Machine, folder: Path) -> None:
+        self.machine, self._folder, self._counters = machine, folder, itertools.count(1)
+        self._key = folder / "key"
+        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "me", "-f", self._key], check=True)
+        kind, key, _ = self._key.with_suffix(".pub").read_text().split()
+        machine.put("/etc/palpate/allowed_signers", f"me {kind} {key}\n")
+        machine.put("/opt/palpate/cursed.py", CURSED)
+        self.a = self.deploy()
+        self.do("commit")
+
+    def do(self, *command: str) -> str:
+        """A command of the box, as its user."""
+        return self.machine.get(*AS_PALPATE, *command)
+
+    def deploy(self, *how: str, **changes: Any) -> str:
+        """Copy a new bundle, A with changes to its manifest, to the box and have it accepted; its sha256."""
+        counter = next(self._counters)
+        made = self._folder / f"b{counter}"
+        made.mkdir()
+        for name, data in bundle.files(bundle.DEFAULT).items():
+            (made / name).write_bytes(data)
+        manifest = replace(bundle.load(bundle.DEFAULT).manifest, **changes)
+        (made / "manifest.json").write_bytes(manifest.json())
+        sign(made, self._key, counter)
+        packed = io.BytesIO()
+        with tarfile.open(fileobj=packed, mode="w") as tar:
+            tar.add(made, arcname=made.name)
+        unpack = "base64 -d | tar -x -C /var/lib/palpate/incoming"
+        self.machine.get("sh", "-c", unpack, say=base64.b64encode(packed.getvalue()).decode())
+        self.do("accept", *how, f"/var/lib/palpate/incoming/{made.name}")
+        return hashlib.sha256((made / "manifest.json").read_bytes()).hexdigest()
+
+    @property
+    def current(self) -> str:
+        """The bundle that runs from the next start on."""
+        return Path(self.machine.get("readlink", "/var/lib/palpate/current")).name
+
+    @property
+    def ledger(self) -> dict[str, Any]:
+        """What the box knows of its bundles."""
+        return dict(json.loads(self.machine.get("cat", "/var/lib/palpate/ledger.json")))
+
+    def starts(self, sha: str) -> int:
+        """How many starts count against a bundle."""
+        return int(self.ledger["standings"][sha]["starts"])
+
+
+@pytest.fixture(scope="module")
+def stored(machine: Machine, before: list[bool], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """The store with bundle A committed."""
+    return Store(machine, tmp_path_factory.mktemp("bundles"))
+
+
+@pytest.fixture
+def store(stored: Store, service: Service) -> Iterator[Store]:
+    """The same, back to A after the test."""
+    yield stored
+    stored.machine.get("systemctl", "stop", "palpate")
+    stored.machine.run("rm", "-f", "/run/cursed")
+    if stored.current != stored.a:
+        stored.do("rollback")
+    assert stored.current == stored.a
+
+
+def serves(service: Service, sha: str) -> None:
+    """Wait until the skin streams and this bundle answers."""
+    service.until("ActiveState", "active")
+    service.until("StatusText", STREAMS)
+    end = time.monotonic() + 10
+    while service.status().get("bundle") != sha[:8]:
+        assert time.monotonic() < end, service.journal()
+        time.sleep(0.2)
+
+
+def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Service, store: Store):
+    """On trial at its first start, which `palpate status` tells; after its sweeps committed, with a line in the journal."""
+    new = store.deploy()
+    machine.put(SITE, "[store]\nprobation_sweeps = 1\n")
+    service.start(RUN)
+    serves(service, new)
+    end = time.monotonic() + 30
+    while store.starts(new) or not store.ledger["standings"][new]["committed"]:
+        assert time.monotonic() < end, service.journal()
+        time.sleep(0.2)
+    told = [line for line in service.told() if line.startswith("bundle ")]
+    assert told == [
+        f"bundle {new[:8]} is on trial, start 1 of 3",
+        f"bundle {new[:8]} has stood its trial and is committed",
+    ]
+    machine.get("systemctl", "restart", "palpate")
+    serves(service, new)
+    store.do("rollback")
+
+
+@pytest.mark.parametrize(("does", "more"), [("die", ""), ("hang", "WatchdogSec=1\n")])
+def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
+    machine: Machine, service: Service, store: Store, does: str, more: str
+):
+    """Each start READY and then a fault, or the watchdog: after three nobody's help is needed, A serves again."""
+    new = store.deploy()
+    machine.put("/run/cursed", f"{new} {does}")
+    begin = time.monotonic()
+    service.configure(RUN + more)
+    machine.run("systemctl", "start", "palpate")
+    service.until("NRestarts", "3")
+    serves(service, store.a)
+    print(f"{does}: A serves again after {time.monotonic() - begin:.1f} s")
+    assert store.current == store.a
+    *starts, left = [line for line in service.told() if line.startswith(f"bundle {new[:8]} ")]
+    assert starts == [f"bundle {new[:8]} is on trial, start {i} of 3" for i in (1, 2, 3)]
+    assert LEFT in left
+    assert left.endswith("it was started 3 times without being committed")
+    assert "it was started 3 times without being committed" in store.do("bundles")
+
+
+def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
+    machine: Machine, service: Service, store: Store
+):
+    """Altered on the card after it was accepted: A serves with this very start, no restart."""
+    new = store.deploy()
+    model = f"/var/lib/palpate/bundles/{new}/model.onnx"
+    machine.get("sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc")
+    service.start(RUN)
+    serves(service, store.a)
+    assert (service["NRestarts"], store.current) == ("0", store.a)
+    told = [line for line in service.told() if LEFT in line]
+    assert len(told) == 1
+    assert "model.onnx was altered" in told[0]
+
+
+def test_a_bundle_that_does_not_fit_the_settings_is_left(machine: Machine, service: Service, store: Store):
+    """Settings that the new bundle cannot serve and A can: left in that start."""
+    new = store.deploy(early=None)
+    machine.put(SITE, "[classifier]\nearly = true\n")
+    service.start(RUN)
+    serves(service, store.a)
+    assert (service["NRestarts"], store.current) == ("0", store.a)
+    assert any(f"bundle {new[:8]} {LEFT}" in line and "classifier.early" in line for line in service.told())
+
+
+def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
+    machine: Machine, service: Service, store: Store
+):
+    """Exit 78, no loop, and the journal says what to do; `palpate rollback` and a start, and A serves."""
+    new = store.deploy()
+    store.do("commit")
+    model = f"/var/lib/palpate/bundles/{new}/model.onnx"
+    machine.get("sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc")
+    service.configure(RUN)
+    machine.run("systemctl", "start", "palpate")
+    service.until("ActiveState", "failed")
+    assert (service["ExecMainStatus"], service["NRestarts"]) == ("78", "0")
+    assert any("model.onnx was altered" in line and "palpate rollback" in line for line in service.told())
+    store.do("rollback")
+    service.start(RUN)
+    serves(service, store.a)
+
+
+@pytest.mark.parametrize("end", ["stopped in order", "killed without a skin", "without a GPIO chip"])
+def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(machine: Machine, service: Service, store: Store, end: str):
+    """Four restarts, four kills while the skin is away, or four ends with exit 69: still on trial, at its first start."""
+    new = store.deploy()
+    if end == "without a GPIO chip":
+        machine.put(SITE, "[trigger]\nstart = 'GPIO17'\nstop = 'GPIO27'\n")
+        service.configure(REAL)
+        machine.get("systemctl", "start", "--no-block", "palpate")
+        service.until("NRestarts", "[4-9]")
+        assert any("no /dev/gpiochip" in line for line in service.told())
+        machine.get("systemctl", "stop", "palpate")
+    elif end == "stopped in order":
+        for _ in range(4):
+            service.start(RUN)
+            serves(service, new)
+            machine.get("systemctl", "stop", "palpate")
+    else:
+        service.configure(CABLED + "RestartSec=100ms")
+        machine.get("systemctl", "start", "--no-block", "palpate")
+        for i in range(4):
+            wait_for(lambda: store.starts(new) == 0 and service["StatusText"].startswith("skin absent"), service)
+            service.kill("SIGKILL")
+            service.until("NRestarts", str(i + 1))
+        wait_for(lambda: store.starts(new) == 0, service)
+    assert (store.current, store.starts(new)) == (new, 0)
+    assert not [line for line in service.told() if LEFT in line]
+
+
+def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) -> None:
+    """Wait for something that should come in a second or two."""
+    end = time.monotonic() + limit_s
+    while not done():
+        assert time.monotonic() < end, service.journal()
+        time.sleep(0.1)
+
+
+def test_a_candidate_classifies_beside_and_becomes_the_one(machine: Machine, service: Service, store: Store):
+    """Deployed as a candidate, it shadows from the next start on; `palpate status` and `palpate bundles` say how it does;
+    promoted, it is on trial, and its shadow is over."""
+    new = store.deploy("--shadow")
+    assert store.current == store.a
+    service.start(RUN)
+    serves(service, store.a)
+    wait_for(lambda: "on 1 of 1 sweeps" in service.status().get("shadow", ""), service)
+    machine.get("systemctl", "restart", "palpate")  # the counts go on
+    wait_for(lambda: "on 2 of 2 sweeps" in service.status().get("shadow", ""), service)
+    machine.get("systemctl", "stop", "palpate")
+    assert f"candidate {new[:8]} agrees with {store.a[:8]} on " in store.do("bundles")
+    store.do("promote")
+    service.start(RUN)
+    serves(service, new)
+    assert service.status()["shadow"] == ""

@@ -1,0 +1,153 @@
+"""The house rules that a machine can hold: who imports whom, what a wheel holds, how the rooms look."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.factories import emulated_machines
+from tests.factories.paths import ROOT
+
+ROOMS = sorted([*ROOT.glob("appliance/**/*.py"), *ROOT.glob("train/**/*.py")])
+GROUNDS = [p for room in ("rig", "undersides", "fuzz", "cuts") for p in sorted(ROOT.glob(f"tests/{room}/**/*.py"))]
+BOX = [p for p in ROOMS if p.is_relative_to(ROOT / "appliance") and "sim" not in p.parts]
+ALLOWED = {"numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2"}  # the last is Python's own from 3.12 on
+
+
+def run(*args: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
+    """Run a command; its output, or a failure that shows it."""
+    done = subprocess.run(args, cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def imports(path: Path) -> set[str]:
+    """Names of all modules that a file imports, relative ones with their dots."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            found |= {base} | {f"{base}.{alias.name}" for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("path", BOX, ids=lambda p: p.name)
+def test_the_box_imports_five_libraries_and_no_simulator(path: Path):
+    """Only the five libraries of the design; the simulator only from __main__."""
+    for name in imports(path):
+        if not name.startswith("."):
+            top = name.split(".")[0]
+            assert top in ALLOWED | set(sys.stdlib_module_names), f"{path.name} imports {name}"
+        elif path.name != "__main__.py":
+            assert not name.startswith(".sim"), f"{path.name} imports {name}"
+
+
+def test_a_fresh_process_loads_nothing_of_the_desktop():
+    """After a whole virtual run, PyTorch, scikit-learn, scipy and train are not in the process."""
+    code = (
+        "import sys; from appliance.__main__ import main; main(['run', '--sim', 'skin', '--virtual', '--sweeps', '1']);"
+        "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'sklearn', 'scipy', 'train', 'onnx', 'pandas'}))"
+    )
+    assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
+
+
+def test_the_simulator_is_not_loaded_unless_named():
+    """`palpate config` and everything it imports leave appliance.sim alone."""
+    code = "import sys; from appliance.__main__ import main; main(['config']); print([m for m in sys.modules if '.sim' in m])"
+    assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
+
+
+def test_onnxruntime_starts_no_thread_of_its_own():
+    """Telemetry off: no uploader, no pool; a session that has run leaves the process with its one thread."""
+    code = (
+        "import os; from appliance.bundle import bundle; from appliance.core import clock; from appliance.inference import classifier; import onnxruntime;"
+        "box = classifier.Classifier(bundle.load(bundle.DEFAULT), clock.SystemClock()); box.self_test();"
+        "print(len(os.listdir('/proc/self/task')))"
+    )
+    env = {k: v for k, v in os.environ.items() if not k.startswith("ORT_")} | {"OPENBLAS_NUM_THREADS": "1"}
+    assert run(sys.executable, "-c", code, cwd=ROOT, env=env).splitlines()[-1] == "1"
+
+
+@pytest.mark.parametrize("path", [*ROOMS, *GROUNDS], ids=lambda p: str(p.relative_to(ROOT)))
+def test_rooms_are_small_and_introduced(path: Path):
+    """Under 300 lines, functions under 40 lines of code, a docstring that opens the file."""
+    text = path.read_text()
+    tree = ast.parse(text)
+    assert ast.get_docstring(tree), "no opening paragraph"
+    assert len(text.splitlines()) < 300
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            body = node.body[1:] if ast.get_docstring(node) else node.body
+            lines = node.end_lineno - body[0].lineno + 1 if body else 0
+            assert lines < 40, f"{node.name} has {lines} lines"
+
+
+@pytest.mark.parametrize("path", BOX, ids=lambda p: p.name)
+def test_no_wall_clock_no_pickle_no_bare_except(path: Path):
+    """Monotonic time only, nothing unpickled, no error swallowed whole."""
+    text = path.read_text()
+    assert not re.search(r"\btime\.time\(|datetime|import pickle|allow_pickle=True", text)
+    assert not re.search(r"except\s*:", text)
+    if path.name != "clock.py":
+        assert "time.sleep" not in text
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: p.name)
+def test_every_test_says_what_it_holds(path: Path):
+    """Each test has a docstring."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+            assert ast.get_docstring(node), node.name
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of the box, built from the project."""
+    out = tmp_path_factory.mktemp("wheel")
+    emulated_machines.wheel(out, tmp_path_factory.mktemp("source"))
+    (built,) = out.glob("palpate-*.whl")
+    return built
+
+
+def test_the_wheel_holds_the_appliance_alone(wheel: Path):
+    """appliance with its bundle and licence; no train, no tests."""
+    names = zipfile.ZipFile(wheel).namelist()
+    assert {n.split("/")[0] for n in names if ".dist-info/" not in n} == {"appliance"}
+    assert {
+        "appliance/default_bundle/model.onnx",
+        "appliance/default_bundle/manifest.json",
+        "appliance/alignment/page.html",
+    } <= set(names)
+    assert any(n.endswith("licenses/LICENSE") for n in names)
+
+
+def test_the_wheel_works_in_a_clean_environment(wheel: Path, tmp_path: Path):
+    """Locked dependencies with hashes, the wheel, nothing else: `palpate check` on the rig says ok, away from the checkout."""
+    run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
+    python = tmp_path / "venv" / "bin" / "python"
+    pip = (python, "-m", "pip", "install", "-q", "--disable-pip-version-check")
+    run(*pip, "--require-hashes", "-r", ROOT / "appliance" / "requirements.lock", cwd=tmp_path)
+    run(*pip, "--no-deps", wheel, cwd=tmp_path)
+    out = run(tmp_path / "venv" / "bin" / "palpate", "check", "--sim", "skin", "--virtual", cwd=tmp_path)
+    assert out.count("ok  ") == 4
+
+
+def test_the_lock_covers_both_processors():
+    """Every requirement is pinned with hashes; the binary ones have wheels for x86_64 and aarch64 among them."""
+    text = (ROOT / "appliance" / "requirements.lock").read_text()
+    entries = re.split(r"\n(?=[a-z])", text)
+    assert len(entries) >= 5
+    for entry in entries:
+        assert "==" in entry.split("\n")[0]
+        assert "--hash=sha256:" in entry
+    for name in ("numpy", "onnxruntime", "gpiod"):
+        assert sum(e.count("--hash") for e in entries if e.startswith(name)) >= 8, name

@@ -1,0 +1,190 @@
+"""Deciding early, desktop side: the rule on constructed tenths, heads, and the graph against what the box computes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Classes, Early, Manifest, Thresholds
+from appliance.core.clock import SystemClock
+from appliance.inference import classifier, enrolment
+from appliance.inference import early_exit as box_early
+from appliance.inference.novelty import Means
+from tests.factories.trunk import FORM, trunk
+from train.calibration import early_exit, posthoc
+from train.evaluation import uncertainty
+from train.onnx_tools.graph_builder import run
+
+
+def tenths(n: int, places: int = 8, seed: int = 0, strength=None):
+    """Features [N, 10, 5] of n sweeps of three materials at each place, told apart better with each tenth."""
+    rng = np.random.default_rng(seed)
+    labels = np.tile(np.repeat(np.arange(3), n), places)
+    means = 4 * np.eye(5)[:3]
+    grown = np.linspace(0.3, 1.5, 10) if strength is None else np.asarray(strength)
+    x = means[labels][:, None] * grown[:, None] + rng.standard_normal((len(labels), 10, 5))
+    return x, labels, np.repeat(np.arange(places), 3 * n)
+
+
+def certain(labels, when, wrong=()):
+    """Probabilities [n, 10, 3]: .4 of another material before the step `when` [n] and .9996 from then on; `wrong` sweeps name another
+    until the last."""
+    p = np.full((len(labels), 10, 3), 0.3)
+    for i, (k, w) in enumerate(zip(labels, when, strict=True)):
+        p[i, :w, (k + 2) % 3] = 0.4
+        p[i, w:] = 2e-4
+        p[i, w:, (k + (i in wrong)) % 3] = 0.9996
+        p[i, 9] = 2e-4
+        p[i, 9, k] = 0.9996
+    return p
+
+
+def test_the_rule_decides_when_the_steps_are_sure():
+    """All sweeps are clear from the third tenth on: decided there with one step, and nothing is lost."""
+    labels = np.arange(300) % 3
+    found = early_exit.rule(certain(labels, np.full(300, 2)), labels)
+    assert found.early
+    assert found.early.agree == 1
+    assert (found.share, found.lost, found.why) == (pytest.approx(0.3), 0.0, "")
+
+
+def test_a_rule_asks_for_agreement_where_one_step_deceives():
+    """A tenth that is sure and wrong for 2 % of the sweeps, once: two steps in agreement do not fall for it."""
+    labels = np.arange(300) % 3
+    p = certain(labels, np.full(300, 2))
+    p[:6, 2] = np.roll(p[:6, 2], 1, axis=1)
+    found = early_exit.rule(p, labels)
+    assert found.early
+    assert found.early.agree == 2
+    assert found.share == pytest.approx(0.4, abs=0.01)
+    assert found.lost == 0
+
+
+@pytest.mark.parametrize(("wrong", "off"), [(1, False), (2, True)])
+def test_half_a_point_and_no_more(wrong: int, off: bool):
+    """Of 300 sweeps one may turn wrong, a third of a point; two, which stay wrong until the end, may not."""
+    labels = np.arange(300) % 3
+    found = early_exit.rule(certain(labels, np.full(300, 2), range(wrong)), labels)
+    assert (found.early is None) is off
+    assert bool(found.why) is off
+
+
+def test_no_rule_without_data_or_gain():
+    """Few sweeps, or sweeps that are clear only at the end: off, and why."""
+    labels = np.arange(30) % 3
+    assert "30 sweeps" in early_exit.rule(certain(labels, np.full(30, 2)), labels).why
+    labels = np.arange(300) % 3
+    assert "95%" in early_exit.rule(certain(labels, np.full(300, 9)), labels).why
+
+
+def test_no_looser_level_after_one_that_lost():
+    """Levels are tried from the strictest: luck further down does not count."""
+    labels = np.arange(200) % 3
+    p = certain(labels, np.full(200, 9))
+    p[:, 4] = 0.05
+    p[np.arange(200), 4, labels] = 0.9  # right at .9
+    p[:10, 2] = 0.02
+    p[np.arange(10), 2, (labels[:10] + 1) % 3] = 0.96  # ten are wrong at .96
+    assert early_exit.rule(p, labels).early is None or early_exit.rule(p, labels).early.least[0] > 0.96
+
+
+@pytest.mark.parametrize("agree", [1, 2, 3])
+def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
+    """early.decide against appliance.early.decides on random probabilities, some levels above 1."""
+    rng = np.random.default_rng(agree)
+    p = classifier.softmax(2 * rng.standard_normal((200, 10, 3)))
+    rule = Early(tuple(rng.choice([0.5, 0.7, 0.9, 1.5], 9).tolist()), agree)
+    named, share = early_exit.decide(p, rule)
+    for i in range(200):
+        step = next((d for d in range(9) if box_early.decides(p[i, : d + 1], rule)), 9)
+        assert (share[i], named[i]) == ((step + 1) / 10, p[i, step].argmax())
+
+
+def test_temperatures_make_each_step_honest():
+    """Crossed over places, the mean of the highest probability is what is right, at every step."""
+    x, y, at = tenths(40)
+    done = posthoc.finish(x, y, at, np.ones(len(y), bool))
+    new, labels, _ = tenths(60, seed=9)
+    p = done.probabilities(new)
+    right = (p.argmax(2) == labels[:, None]).mean(0)
+    assert right[0] < 0.75 < 0.99 < right[9]
+    assert np.abs(p.max(2).mean(0) - right).max() < 0.04
+
+
+def test_each_step_has_its_own_temperature():
+    """The last temperature is the whole sweep's, each other one its own step's."""
+    x, y, at = tenths(10, seed=3)
+    done, every = posthoc.finish(x, y, at, np.ones(len(y), bool)), np.ones(len(y), bool)
+    logits, numbers = early_exit.crossed(x, y, at, every)
+    cooler = early_exit.temperatures(logits, y[numbers])
+    assert len(set(cooler)) > 2
+    assert done.temperature == cooler[-1]
+    raw = early_exit.heads(done.embedding(x), y, 3)
+    assert np.allclose(done.steps.weight * cooler[:-1, None, None], raw.weight, rtol=1e-5)
+
+
+def test_a_material_of_one_place_and_two_materials():
+    """A material that only one place has is still learned; of two materials, too: nothing is NaN."""
+    x, y, at = tenths(20)
+    keep = (y != 2) | (at == 0)
+    done = posthoc.finish(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool))
+    assert np.isfinite(done.probabilities(x)).all()
+    assert (done.logits(x[:, -1]).argmax(1) == y).mean() > 0.9
+    two = posthoc.finish(x[y < 2], y[y < 2], at[y < 2], at[y < 2] < 4)
+    assert np.isfinite(two.probabilities(x[y < 2])).all()
+
+
+@pytest.fixture(scope="module")
+def made():
+    """A bundle's parts on the toy trunk, one of whose features nobody trained: Finish, model, digits, labels, whole Bundle."""
+    rng = np.random.default_rng(0)
+    labels = np.tile(np.repeat(np.arange(3), 4), 6)
+    level = np.array([[[20, 60], [40, 40]], [[60, 20], [40, 40]], [[40, 40], [60, 20]]])
+    digits = level[labels][:, None] + rng.normal(0, [4, 9, 6], (FORM.window, 2, 2, 3))[None, ..., 0].repeat(72, 0)
+    digits = np.rint(digits + rng.normal(0, 5, digits.shape)).astype(np.int16)
+    trunks = trunk(FORM, True)
+    x, size = run(trunks, digits), 1
+    done = posthoc.finish(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
+    done = replace(done, rule=early_exit.Rule(Early((0.9,) * 9, 2)))
+    model = done.graph(trunks)
+    files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: done.means()}
+    manifest = Manifest("toy", "1", FORM, "raw", ("a", "b", "c"), Thresholds(1.0, 32767.0),
+                        {k: bundle.file_entry(v) for k, v in files.items()}, early=done.rule.early, known=done.known())  # fmt: skip
+    means = done.embedding.means
+    classes = Classes(means, -(means**2).sum(1) / 2, np.zeros(3, np.int64), np.ones(3, np.float32))
+    whole = bundle.Bundle(manifest, "0", files[bundle.MODEL], digits[:2], run(model, digits[:2]), classes)
+    return done, x, digits, labels, whole
+
+
+def test_the_graph_gives_what_training_computed(made):
+    """Logits, embedding and the heads of all tenths in the box's classifier are those of Finish."""
+    done, x, digits, _, whole = made
+    box = classifier.Classifier(whole, SystemClock())
+    box.self_test()
+    for i in (0, 17, 40):
+        assert np.allclose(box.embedding(digits[i]), done.embedding(x[i, -1]), atol=1e-3)
+        have = classifier.softmax(np.vstack([box.early(digits[i]), box.logits(digits[i])]))
+        assert np.allclose(have, done.probabilities(x[i : i + 1])[0], atol=1e-3)
+
+
+def test_a_graph_without_tenths_has_no_early_heads(made):
+    """From a trunk of the whole window: logits and embedding alone; without a rule none either."""
+    done, x, digits, _, _ = made
+    for model in (done.graph(trunk(FORM)), replace(done, rule=early_exit.Rule(None, "why")).graph(trunk(FORM, True))):
+        assert [o.name for o in model.graph.output] == ["logits", "embedding"]
+        assert np.allclose(
+            classifier.softmax(run(model, digits[:2])), classifier.softmax(done.logits(x[:2, -1])), atol=1e-3
+        )
+
+
+def test_enrolment_is_judged_as_the_box_enrols(made):
+    """doubt.enrolled_logits against appliance.enrol on the same sweeps, up to a term that all labels share."""
+    done, x, digits, labels, whole = made
+    drawn = np.flatnonzero(labels == 1)[:3]
+    new = enrolment.enrol(whole, "new", digits[drawn]).bundle
+    z = done.embedding(x[:, -1])
+    means = Means(new.classes, new.manifest.known, new.manifest.labels)
+    want = means.logits(means.distances(z)) * done.warmth
+    have = uncertainty.enrolled_logits(done.embedding, z, z[drawn])
+    assert np.allclose(have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=0.02)

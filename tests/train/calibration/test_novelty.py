@@ -1,0 +1,118 @@
+"""Knowing what is known, on Gaussians whose truth is known: the embedding is LDA, the limit keeps what it promises."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+from appliance.core.errors import FormatError
+from train.calibration import novelty
+
+
+def gaussians(n: int, means, seed: int = 0, mix=None):
+    """n sweeps of each of `means` [K, F] with covariance mix mix' -> features, labels."""
+    rng, means = np.random.default_rng(seed), np.asarray(means, float)
+    labels = np.repeat(np.arange(len(means)), n)
+    noise = rng.standard_normal((len(labels), means.shape[1]))
+    return means[labels] + (noise if mix is None else noise @ mix), labels
+
+
+@pytest.mark.parametrize("whole", [0, 3])
+def test_the_embedding_is_lda(whole: int):
+    """Logits from distances are those of shrinkage LDA with equal priors but for a common term; the covariance is 1."""
+    mix = np.random.default_rng(1).standard_normal((7, 7))
+    x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 7)) @ mix, mix=mix)
+    one = novelty.embed(x, y, whole)
+    assert one.means.shape == (4, 3 + whole)
+    lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", store_covariance=True).fit(x, y)
+    want = x @ lda.coef_.T + lda.intercept_
+    have = one.logits(x)
+    assert np.allclose(have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=1e-3)
+    half = -one.distances(one(x)) / 2
+    assert np.allclose(half - half.mean(1, keepdims=True), have - have.mean(1, keepdims=True), atol=1e-3)
+    assert np.allclose(one.projection.T @ lda.covariance_ @ one.projection, np.eye(3 + whole), atol=1e-4)
+
+
+def test_features_that_nobody_trained_are_kept_whole():
+    """With `whole` all of the last features' directions are seen: the distance is the whole Mahalanobis distance there."""
+    x, y = gaussians(300, [[0, 0, 0], [6, 0, 0]])
+    stranger = np.array([[0.0, 0.0, 20.0]])
+    assert novelty.embed(x, y, 0).strangeness(stranger)[0] < 10
+    assert novelty.embed(x, y, 1).strangeness(stranger)[0] > 300
+
+
+def test_two_sweeps_of_a_material_and_silent_channels_are_finite():
+    """K = 2, one class of two sweeps, a feature that never changes: no NaN."""
+    x, y = gaussians(2, [[0, 0, 0], [5, 0, 0]])
+    x[:, 2] = 1.0
+    more, labels = gaussians(30, [[5, 0, 1]], seed=3)
+    more[:, 2] = 1.0
+    one = novelty.embed(np.vstack([x, more]), np.concatenate([y, labels + 1]), 2)
+    assert np.isfinite(one.strangeness(x)).all()
+    silent = novelty.embed(np.zeros((8, 3)), np.repeat([0, 1], 4), 3)
+    assert np.isfinite(silent.strangeness(np.ones((1, 3)))).all()
+
+
+@pytest.mark.parametrize(
+    ("labels", "why"),
+    [([0, 0, 0], "one material"), ([0, 2, 2, 0], "label 1"), ([0, 1], "record more")],
+)
+def test_what_cannot_be_embedded_is_refused(labels, why: str):
+    """One material, a label without sweeps, one sweep each."""
+    with pytest.raises(FormatError, match=why):
+        novelty.embed(np.random.default_rng(0).standard_normal((len(labels), 2)), np.array(labels))
+
+
+def test_the_limit_keeps_what_it_promises():
+    """Over many draws a limit of 99 sweeps keeps what is asked for of new ones; with few sweeps it is the largest."""
+    rng = np.random.default_rng(0)
+    for asked in (0.95, novelty.KEPT):
+        kept = [np.mean(rng.chisquare(5, 500) <= novelty.limit(rng.chisquare(5, 99), asked)) for _ in range(200)]
+        assert abs(np.mean(kept) - asked) < 0.006
+    assert novelty.limit(np.array([1.0, 7.0, 3.0])) == 7.0
+    with pytest.raises(FormatError, match="several positions"):
+        novelty.limit(np.empty(0))
+
+
+def test_the_limit_knows_positions_that_were_not_seen():
+    """Places that shift all sweeps: judged across groups the limit keeps 95 % at new places, within them it does not."""
+
+    def world(places, seed):
+        x, y = gaussians(5 * places, [[0, 0], [30, 0]], seed)
+        at = np.tile(np.repeat(np.arange(places), 5), 2)
+        return x + 3 * np.random.default_rng(seed + 1).standard_normal((places, 2))[at], y, at
+
+    (x, y, at), (new, _, _) = world(300, 0), world(400, 5)
+    one, every = novelty.embed(x, y, 2), np.ones(len(y), bool)
+    across = novelty.limit(novelty.crossed(x, y, at, every, 2), 0.95)
+    assert 0.93 < np.mean(one.strangeness(new) <= across) < 0.97
+    seven = at < 7  # with few places the covariance is too small, and what fits itself is far too narrow
+    narrow, mine, them = novelty.embed(x[seven], y[seven], 2), (x[seven], y[seven], at[seven]), every[seven]
+    itself, others = (novelty.limit(s, 0.95) for s in (narrow.strangeness(x[seven]), novelty.crossed(*mine, them, 2)))
+    kept = [np.mean(narrow.strangeness(new) <= at_most) for at_most in (itself, others)]
+    assert kept[0] < 0.9 < kept[1]
+    few = np.isin(at, (0, 1))
+    assert len(novelty.crossed(x, y, at, few)) == few.sum()
+    with pytest.raises(FormatError, match="one group"):
+        novelty.crossed(x, y, 0 * at, every)
+
+
+def test_each_judge_judges_once_and_never_its_own_group():
+    """parts: every judged sweep is in one part, and no group is on both sides."""
+    groups = np.random.default_rng(0).integers(0, 25, 200)
+    judged = groups % 3 > 0
+    seen = []
+    for fit, numbers in novelty.parts(groups, judged):
+        assert not set(groups[fit]) & set(groups[numbers])
+        seen += numbers.tolist()
+    assert sorted(seen) == np.flatnonzero(judged).tolist()
+
+
+def test_auroc_of_a_known_separation():
+    """Two normals two deviations apart: Phi(2 / sqrt 2); ties count half."""
+    rng = np.random.default_rng(0)
+    have = novelty.auroc(rng.standard_normal(20000), 2 + rng.standard_normal(20000))
+    assert abs(have - norm.cdf(2 / np.sqrt(2))) < 0.003
+    assert novelty.auroc(np.zeros(3), np.zeros(5)) == 0.5
+    with pytest.raises(FormatError, match="both kinds"):
+        novelty.auroc(np.zeros(3), np.empty(0))

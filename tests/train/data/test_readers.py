@@ -1,0 +1,352 @@
+"""The room of files: HDF5, TactMat and the box's recordings become sets; what is broken is refused by name."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from appliance.core.types import Status, SweepFormat, load, save
+from tests.factories.recordings import FORMAT, record
+from tests.factories.sweep_sets import held
+from train.data import readers, sets
+
+
+def hdf5(path: Path, **changes: object) -> str:
+    """A good HDF5 set with some arrays changed, or left out where the change is None."""
+    with h5py.File(path, "w") as file:
+        for name, values in (held() | {"materials": ["a", "b", "ç"]} | changes).items():
+            if values is not None:
+                file[name] = values
+    return str(path)
+
+
+def tactmat(path: Path, dtype: str = "uint8", **more: object) -> np.ndarray:
+    """A small file as the TactMat page describes it; its samples [3, 4, 50, 4, 4]."""
+    samples = np.arange(3 * 4 * 50 * 16).reshape(3, 4, 50, 4, 4) % 155
+    with h5py.File(path, "w") as file:
+        file.create_dataset("samples", data=samples.astype(dtype), compression="gzip")
+        for name, values in ({"materials": [b"cork", b"felt", b"tile"]} | more).items():
+            file[name] = values
+    return samples
+
+
+def before_crc(path: Path) -> None:
+    """Make a sidecar what it was in schema 1: the sweep and its format, no check of its bytes."""
+    held = json.loads(path.read_text()) | {"schema": 1}
+    del held["crc32"]
+    path.write_text(json.dumps(held))
+
+
+def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
+    """Names as text or bytes, the rate as a data set or an attribute, another name, another byte order."""
+    a = sets.load(hdf5(tmp_path / "a.h5"))
+    assert (str(a.format), a.materials) == ("2x3 int16 at 50 Hz, window 8", ("a", "b", "ç"))
+    np.testing.assert_array_equal(a.samples, held()["samples"])
+    np.testing.assert_array_equal(a.groups["speed"], held()["group_speed"])
+    b = hdf5(tmp_path / "b.data", rate_hz=None, materials=np.array([b"a", b"b", "ç".encode()]), samples=None)
+    with h5py.File(b, "a") as file:
+        file["samples"] = held()["samples"].astype(">i2")
+        file["notes"] = h5py.ExternalLink("/nowhere.h5", "/x")  # nobody asks for it
+        file.attrs["rate_hz"] = 50
+    b = sets.load(b)
+    assert b.samples.dtype.isnative
+    assert sets.digest(b) == sets.digest(a)
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.hdf5"])
+def test_every_form_is_read_back(tmp_path: Path, name: str):
+    """What save writes is what load reads, and the ending says in which form."""
+    whole = sets.load(hdf5(tmp_path / "whole.h5"))
+    whole.save(tmp_path / name)
+    assert sets.digest(sets.load(str(tmp_path / name))) == sets.digest(whole)
+    assert h5py.is_hdf5(tmp_path / name) == (name != "a.npz")
+
+
+NAN = np.zeros((6, 8, 2, 3), np.float32)
+NAN[4, 7, 1, 2] = np.nan
+PAIR = np.zeros(6, [("a", "i4"), ("b", "f4")])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"samples": None}, "lacks samples"),
+        ({"labels": None}, "lacks labels"),
+        ({"materials": None}, "lacks materials"),
+        ({"rate_hz": None}, "lacks rate_hz"),
+        ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
+        ({"samples": np.zeros((6, 8, 2, 3))}, "samples are float64; .*astype\\('float32'\\)"),
+        ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
+        ({"samples": PAIR.reshape(6, 1, 1, 1)}, "samples are .*; use one of"),
+        ({"samples": ["a"] * 6}, "samples have the shape \\[6\\]"),
+        ({"samples": h5py.Empty("u1")}, "samples is no array but .*shape None"),
+        ({"labels": PAIR}, "labels holds .*; give one whole number for each of 6"),
+        ({"labels": np.array([0, 1, 2, 0, 3, 1])}, "label 3 of sweep 4 is out of range; there are 3"),
+        ({"labels": np.full(6, 1)}, "only one class, 'b'"),
+        ({"labels": ["a", "b", "ç"] * 2}, "labels holds <U1"),
+        ({"materials": np.arange(3)}, "materials hold int64"),
+        ({"materials": np.array([b"a", b"b", b"\xff"])}, "not a sweep set .*: .*utf-8"),
+        ({"rate_hz": "fast"}, "rate_hz holds .*fast.*; give one number"),
+        ({"rate_hz": [50.0, 60.0]}, "give one number"),
+        ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
+        ({"group_speed": h5py.SoftLink("/gone")}, "group_speed is a link to '/gone'; put the data itself"),
+        ({"samples": h5py.ExternalLink("gone.h5", "/samples")}, "samples is a link to '/samples'"),
+        ({"samples": h5py.SoftLink("/samples")}, "samples is a link to '/samples'"),
+        ({"labels": np.dtype("i8")}, "labels is no array but .*named type"),
+    ],
+)
+def test_a_broken_hdf5_is_refused_by_name(tmp_path: Path, changes: dict, message: str):
+    """Each fault has its message, which begins with the file."""
+    with pytest.raises(FormatError, match=f"^broken.h5: .*{message}"):
+        sets.load(hdf5(tmp_path / "broken.h5", **changes))
+
+
+def _group(file: h5py.File) -> None:
+    file.create_group("samples")
+
+
+def _unwritten(file: h5py.File) -> None:
+    file.create_dataset("samples", (6, 8, 2, 3), "u1")
+
+
+def _huge(file: h5py.File) -> None:
+    file.create_dataset("samples", (1 << 40, 8, 2, 3), "u1", chunks=(1, 8, 2, 3))[0] = 1
+
+
+def _virtual(file: h5py.File) -> None:
+    layout = h5py.VirtualLayout((6, 8, 2, 3), "u1")
+    layout[:] = h5py.VirtualSource("gone.h5", "samples", (6, 8, 2, 3))
+    file.create_virtual_dataset("samples", layout)
+
+
+def _external(file: h5py.File) -> None:
+    file.create_dataset("samples", (6, 8, 2, 3), "u1", external="/etc/hostname")
+
+
+def _ragged(file: h5py.File) -> None:
+    file.create_dataset("samples", (6, 8, 2, 3), h5py.vlen_dtype("i2"))[0, 0, 0, 0] = [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (_group, "samples is no array but .*HDF5 group"),
+        (_unwritten, "samples \\[6, 8, 2, 3\\] was not written to its end"),
+        (_huge, "samples \\[1099511627776, 8, 2, 3\\] was not written to its end"),
+        (_virtual, "samples lies in other files"),
+        (_external, "samples lies in other files"),
+        (_ragged, "samples are object; use one of"),
+    ],
+)
+def test_samples_that_are_not_in_the_file_are_refused(tmp_path: Path, make: Callable, message: str):
+    """HDF5 would show zeros, another file, or nothing that ends."""
+    path = hdf5(tmp_path / "odd.h5", samples=None)
+    with h5py.File(path, "a") as file:
+        make(file)
+    with pytest.raises(FormatError, match=f"^odd.h5: .*{message}"):
+        sets.load(path)
+
+
+def test_what_is_no_hdf5_is_refused(tmp_path: Path):
+    """Cut anywhere, text, nothing, or not there."""
+    whole = Path(hdf5(tmp_path / "whole.h5")).read_bytes()
+    for name, data in {
+        "half.h5": whole[: len(whole) // 2],
+        "head.h5": whole[:8],
+        "text.h5": b"x",
+        "empty.h5": b"",
+    }.items():
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "cut").write_bytes(whole[:-1])
+    for name in ("half.h5", "head.h5", "text.h5", "empty.h5", "gone.h5", "cut"):
+        with pytest.raises(FormatError, match=f"^{name}: not a sweep set.*HDF5"):
+            sets.load(str(tmp_path / name))
+
+
+@pytest.mark.parametrize("signature", [b"SNOD", b"HEAP", b"TREE", b"GCOL", b"labels"])
+def test_a_damaged_hdf5_is_refused(tmp_path: Path, signature: bytes):
+    """Whatever table of the file is overwritten, the header of an array (at its address) among them."""
+    path = tmp_path / "a.h5"
+    hdf5(path)
+    data = bytearray(path.read_bytes())
+    at = data.index(signature)
+    if signature == b"labels":
+        with h5py.File(path) as file:
+            at = h5py.h5o.get_info(file["labels"].id).addr
+    data[at] = 0xEE
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match=r"^a\.h5: not a sweep set"):
+        sets.load(str(path))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int64", "float32", "float64"])
+def test_tactmat_is_read(tmp_path: Path, dtype: str):
+    """Labels from the first axis, repetitions from the second, digits of a byte in whatever type they are kept."""
+    samples = tactmat(tmp_path / "t.h5", dtype)
+    s = sets.load(str(tmp_path / "t.h5"))
+    assert str(s.format) == "4x4 uint8 at 750 Hz, window 50"
+    assert s.materials == ("cork", "felt", "tile")
+    assert s.source == "t.h5 (names no rate, taken for 750 Hz)"
+    np.testing.assert_array_equal(s.labels, np.repeat([0, 1, 2], 4))
+    np.testing.assert_array_equal(s.groups["repetition"], [0, 1, 2, 3] * 3)
+    np.testing.assert_array_equal(s.samples[7], samples[1, 3])
+
+
+def test_tactmat_s_own_rate_goes_first(tmp_path: Path):
+    """A rate in the file is used, and nothing is said to be assumed."""
+    tactmat(tmp_path / "t.h5", rate_hz=1000.0)
+    s = sets.load(str(tmp_path / "t.h5"))
+    assert (s.rate_hz, s.source) == (1000.0, "t.h5")
+
+
+def test_a_broken_tactmat_is_refused(tmp_path: Path):
+    """Names that do not fit, none, digits beyond a byte, labels of which nobody knows what they are."""
+    for more, message in (
+        ({"materials": ["cork", "felt"]}, "are of 3 materials, 2 are named"),
+        ({"labels": np.arange(12) % 3}, "lacks rate_hz"),
+        ({"labels": np.arange(12) % 3, "rate_hz": 1.0}, "samples have the shape \\[3, 4, 50, 4, 4\\]"),
+    ):
+        tactmat(tmp_path / "t.h5", **more)
+        with pytest.raises(FormatError, match=f"^t.h5.*: .*{message}"):
+            sets.load(str(tmp_path / "t.h5"))
+    for bad, message in (
+        (256.0, "samples are float64"),
+        (np.nan, "samples are float64"),
+        (-1.0, "samples are float64"),
+    ):
+        tactmat(tmp_path / "t.h5", "float64")
+        with h5py.File(tmp_path / "t.h5", "a") as file:
+            file["samples"][1, 1, 1, 1, 1] = bad
+        with pytest.raises(FormatError, match=message):
+            sets.load(str(tmp_path / "t.h5"))
+
+
+def test_recordings_are_a_set(tmp_path: Path):
+    """One recording a file, materials and places by name, objects apart in each folder; what is not ok is counted."""
+    for i, (material, position, obj) in enumerate(
+        [("b", "tip", 0), ("a", "side", 1), ("b", "side", 1), ("a", "tip", 2)]
+    ):
+        record(tmp_path / f"run{i // 2}" / f"sweep-{i:06d}.npy", material, id=i, position=position, object=obj)
+    record(tmp_path / "run0" / "sweep-000009.npy", status=Status.SATURATED, id=9)
+    record(tmp_path / "run1" / "sweep-000010.npy", "", Status.GAP, frames=0)
+    (tmp_path / "sweep-000011.npy.part").write_bytes(b"half")
+    s = sets.load(str(tmp_path))
+    assert (s.format, s.materials) == (FORMAT, ("a", "b"))
+    assert s.source == f"{tmp_path} (left out: 1 gap, 1 saturated)"
+    np.testing.assert_array_equal(s.labels, [1, 0, 1, 0])
+    assert {k: list(v) for k, v in s.groups.items()} == {
+        "recording": [0, 1, 2, 3],
+        "position": [1, 0, 0, 1],
+        "object": [0, 1, 2, 3],
+    }
+    np.testing.assert_array_equal(s.samples[2], 2 + np.arange(48).reshape(8, 2, 3))
+
+
+def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
+    """Where all names are whole numbers a group has these, so that --only position=12 means what it says."""
+    for i, (position, session) in enumerate([("12", "7"), ("3", "07"), ("3", "8"), ("0", "7")]):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], position=position, session=session)
+    groups = sets.load(str(tmp_path)).groups
+    assert list(groups["position"]) == [12, 3, 3, 0]
+    assert list(groups["session"]) == [1, 0, 2, 1]
+
+
+def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):
+    """Recordings of the box, with device, clock, tare and verdict, beside those of before."""
+    for i in range(4):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, position="tip")
+    before = sets.digest(sets.load(str(tmp_path)))
+    for i in range(2):
+        about = {"device": {"serial": "x"}, "tare": [[0] * 3] * 2, "verdict": {"status": ("unknown", "unsure")[i]}}
+        save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), about)
+    before_crc(tmp_path / "3.json")
+    assert sets.digest(sets.load(str(tmp_path))) == before
+
+
+def test_what_the_box_refused_is_left_out(tmp_path: Path):
+    """A skin that did not touch, or was broken, whatever its label; an early answer's part of a window."""
+    for i in range(8):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
+    for i, status in enumerate(readers.REFUSED):
+        save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), {"verdict": {"status": str(status)}})
+    record(tmp_path / "9.npy", "a", frames=3, share=0.4)
+    s = sets.load(str(tmp_path))
+    assert s.source.endswith("(left out: 1 dead-taxel, 1 early, 1 no-contact, 1 saturated, 1 stuck-taxel)")
+    assert list(s.samples[:, 0, 0, 0]) == [4, 5, 6, 7]
+
+
+def test_objects_of_several_runs_in_one_folder_stay_apart(tmp_path: Path):
+    """Each run of the box counts its objects anew and says in the sidecar which run it was."""
+    for i, (run, obj) in enumerate([(0, 1), (0, 1), (2, 1), (2, 2)]):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, object=obj)
+        save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), {"run": run})
+    assert list(sets.load(str(tmp_path)).groups["object"]) == [0, 0, 1, 2]
+
+
+def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
+    """Nothing is known, nothing is grouped but the recording."""
+    for i in range(4):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2])
+    assert list(sets.load(str(tmp_path)).groups) == ["recording"]
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"material": ""}, "2.npy: has no material; write it into 2.json"),
+        ({"position": "tip"}, "0.npy: has no position though others have"),
+        ({"session": 3}, "2.npy: .*session = 3 is not of type str"),
+        ({"material": None}, "2.npy: .*material = None is not of type str"),
+        ({"object": "cup"}, "2.npy: .*object = 'cup' is not of type int"),
+        ({"frames": 7}, "2.npy: 7 frames of 2x3 int16 at 50 Hz, window 8; others have"),
+        (
+            {"fmt": SweepFormat(2, 3, 100.0, 8, "int16")},
+            "2.npy: 8 frames of 2x3 int16 at 100 Hz, window 8; others have 2x3",
+        ),
+    ],
+)
+def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, message: str):
+    """The file that lacks something or is of another form."""
+    record(tmp_path / "0.npy", "a")
+    record(tmp_path / "1.npy", "b")
+    record(tmp_path / "2.npy", **more)
+    with pytest.raises(FormatError, match=f"^{tmp_path}/{message}"):
+        sets.load(str(tmp_path))
+
+
+def test_broken_recordings_are_named(tmp_path: Path):
+    """A table cut in two, a sidecar that is gone or says nothing, nothing that is ok, nothing at all, one material."""
+    with pytest.raises(FormatError, match="no recorded sweep is ok; record some"):
+        sets.load(str(tmp_path))
+    record(tmp_path / "0.npy", status=Status.SHORT)
+    with pytest.raises(FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"):
+        sets.load(str(tmp_path))
+    record(tmp_path / "1.npy", "a")
+    with pytest.raises(FormatError, match="only one class, 'a'"):
+        sets.load(str(tmp_path))
+    whole, about = (tmp_path / "1.npy").read_bytes(), json.loads((tmp_path / "1.json").read_text())
+    (tmp_path / "1.npy").write_bytes(whole[:-9])
+    with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep"):
+        sets.load(str(tmp_path))
+    (tmp_path / "1.npy").write_bytes(whole)
+    (tmp_path / "1.json").write_text(json.dumps(about | {"status": "fine"}))
+    with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep"):
+        sets.load(str(tmp_path))
+    (tmp_path / "1.json").unlink()
+    with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep"):
+        sets.load(str(tmp_path))
+
+
+def test_a_recording_is_never_unpickled(tmp_path: Path):
+    """Objects in an .npy are refused where they stand."""
+    record(tmp_path / "1.npy", "a")
+    np.save(tmp_path / "1.npy", np.array([{}], object), allow_pickle=True)
+    before_crc(tmp_path / "1.json")
+    with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep .*allow_pickle"):
+        readers.read(tmp_path, sets.SweepSet)

@@ -1,0 +1,266 @@
+"""The room of sweep sets: what is refused and how it is named, what belongs together and stays so."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from appliance.core.errors import FormatError
+from appliance.sim import skin
+from tests.factories.sweep_sets import easy, held, write
+from train.data import sets
+
+
+def test_a_file_is_read_as_it_is_described(tmp_path: Path):
+    """Format, materials, groups and digits come out as they were put in; save writes the same form."""
+    s = sets.load(write(tmp_path / "good.npz"))
+    assert str(s.format) == "2x3 int16 at 50 Hz, window 8"
+    assert s.materials == ("a", "b", "c")
+    s.save(tmp_path / "again.npz")
+    again = sets.load(str(tmp_path / "again.npz"))
+    np.testing.assert_array_equal(again.samples, held()["samples"])
+    np.testing.assert_array_equal(again.groups["speed"], held()["group_speed"])
+    assert (again.materials, again.rate_hz) == (s.materials, s.rate_hz)
+
+
+NAN = np.zeros((6, 8, 2, 3), np.float32)
+NAN[4, 7, 1, 2] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"samples": None}, "lacks samples"),
+        ({"materials": None, "rate_hz": None}, "lacks materials, rate_hz"),
+        ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
+        ({"samples": np.zeros((6, 0, 2, 3), np.uint8)}, "none empty"),
+        ({"samples": np.zeros((6, 8, 2, 3))}, "samples are float64; use one of uint8.*samples.astype\\('float32'\\)"),
+        ({"samples": np.full((6, 8, 2, 3), -1)}, "samples are int64; .*samples.astype\\('int16'\\)"),
+        ({"samples": np.ones((6, 8, 2, 3), bool)}, "samples are bool; .*samples.astype\\('uint8'\\)"),
+        ({"samples": np.full((6, 8, 2, 3), 1 << 40)}, "samples are int64; .*samples.astype\\('float32'\\)"),
+        ({"samples": np.full((6, 8, 2, 3), 1j)}, "samples are complex128; use one of uint8, int16, uint16, float32$"),
+        ({"samples": np.zeros((6, 8, 256, 1), np.uint8)}, "a grid of 256 x 1 taxels is out of range"),
+        ({"rate_hz": np.array(np.nan)}, "rate_hz is nan"),
+        ({"rate_hz": np.array(2e6)}, "a rate of 2000000.0 Hz is out of range"),
+        ({"group_speed": np.ones(6)}, "group_speed holds float64"),
+        ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
+        ({"labels": np.arange(5)}, "labels holds int64 \\[5\\]; give one whole number for each of 6"),
+        ({"labels": np.zeros(6)}, "labels holds float64"),
+        ({"labels": np.array([0, 1, 2, 0, 3, 1])}, "label 3 of sweep 4 is out of range; there are 3"),
+        ({"labels": np.array([0, 1, -1, 0, 2, 1])}, "label -1 of sweep 2 is out of range"),
+        ({"labels": np.full(6, 2)}, "only one class, 'c'"),
+        ({"materials": np.array(["a", "b", "a"])}, "name one twice"),
+        ({"materials": np.arange(3)}, "materials hold int64"),
+        ({"rate_hz": np.array([50.0, 60.0])}, "give one number"),
+        ({"rate_hz": np.array(-1.0)}, "rate_hz is -1.0"),
+        ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
+        ({"materials": np.array(["a", {}, "c"], object)}, "not a sweep set"),
+    ],
+)
+def test_a_broken_file_is_refused_by_name(tmp_path: Path, changes: dict, message: str):
+    """Each fault has its message, which begins with the file."""
+    with pytest.raises(FormatError, match=f"^broken.npz: .*{message}"):
+        sets.load(write(tmp_path / "broken.npz", **changes))
+
+
+def test_what_is_no_set_at_all_is_refused(tmp_path: Path):
+    """Text, a single array, a cut archive and nothing."""
+    (tmp_path / "text.npz").write_text("samples")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    whole = Path(write(tmp_path / "whole.npz")).read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    for name in ("text.npz", "empty.npz", "array.npy", "cut.npz", "missing.npz"):
+        with pytest.raises(FormatError, match=f"^{name}: not a sweep set"):
+            sets.load(str(tmp_path / name))
+
+
+def test_simulated_sets_have_their_worlds():
+    """Sizes of the paper's sets, the seed's place, and positions of joined worlds that stay apart."""
+    real = sets.load("sim:T-REAL:5-6:1")
+    assert (len(real), real.format, real.materials) == (2 * 9 * 6, skin.FORMAT, skin.MATERIALS)
+    assert len(np.unique(real.groups["position"])) == 18
+    hard = sets.load("sim:T-HARD", seed=6)
+    assert len(hard) == 60
+    np.testing.assert_array_equal(hard.samples, sets.load("sim:T-HARD:6").samples)
+    np.testing.assert_array_equal(real.samples[:54], skin.sweep_set("T-REAL", 5, 1)[0])
+
+
+@pytest.mark.parametrize("spec", ["sim:T-SOFT", "sim:T-REAL:x", "sim:T-REAL:1:0", "sim:", "sim:T-REAL:2-1"])
+def test_an_unknown_simulated_set_is_refused(spec: str):
+    """The message repeats what was asked for."""
+    with pytest.raises(FormatError, match=f"^set '{spec}' is "):
+        sets.load(spec)
+
+
+def test_select_keeps_what_fulfils_every_condition():
+    """All of = <= >=, and materials that are left over go, with the labels numbered anew."""
+    s = easy(8)
+    part = s.select(["speed>=1", "speed<=2"])
+    assert set(part.groups["speed"]) == {1, 2}
+    assert len(part) == len(s) // 2
+    assert len(s.select([])) == len(s)
+    upper = s.select(["recording>=8"])
+    assert upper.materials == ("middle", "high")
+    np.testing.assert_array_equal(np.bincount(upper.labels), [8, 8])
+    np.testing.assert_array_equal(upper.samples, s.samples[8:])
+
+
+def test_select_takes_any_of_several_values():
+    """Values of a group, and materials by name, spaces around either."""
+    s = easy(8)
+    assert set(s.select(["speed=0, 3"]).groups["speed"]) == {0, 3}
+    part = s.select(["material=high, low"])
+    assert part.materials == ("low", "high")
+    np.testing.assert_array_equal(part.samples, s.samples[np.r_[:8, 16:24]])
+    assert s.select(["material=high,low", "speed=1"]).format == s.format
+
+
+@pytest.mark.parametrize(
+    ("condition", "message"),
+    [
+        ("speed<2", "cannot be read"),
+        ("speed", "cannot be read"),
+        ("force=1", "no group 'force'; it has recording, speed"),
+        ("speed=", "'' is no whole number"),
+        ("speed=1,fast", "'1,fast' is no whole number"),
+        ("speed<=1,2", "<= takes a group and one whole number"),
+        ("material>=low", ">= takes a group and one whole number"),
+        ("speed=9", "no sweep fulfils speed=9; it has 0, 1, 2, 3$"),
+        ("speed=1,9", "no sweep fulfils speed=9; it has 0"),
+        ("material=low,hihg", "no sweep fulfils material=hihg; it has high, low, middle"),
+        ("recording>=99999999999999999999", "no sweep fulfils recording>=9+;"),
+        ("recording<=7", "only one class, 'low'"),
+    ],
+)
+def test_select_names_what_is_wrong(condition: str, message: str):
+    """A typing error never passes for an empty filter."""
+    with pytest.raises(FormatError, match=message):
+        easy(8).select([condition])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 7), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1))
+def test_split_never_separates_a_recording(pieces: int, share: float, seed: int):
+    """No recording is on both sides, nothing is lost or doubled, and both sides have each material near the share."""
+    s = easy(21, pieces=pieces) if 21 % pieces == 0 else easy(6 * pieces, pieces=pieces)
+    first, second = s.split("recording", share, seed)
+    assert not set(first.groups["recording"]) & set(second.groups["recording"])
+    assert len(first) + len(second) == len(s)
+    for part, ideal in ((first, share), (second, 1 - share)):
+        per_material = np.bincount(part.labels, minlength=3) / (len(s) / 3)
+        recordings = len(np.unique(s.groups["recording"])) / 3
+        assert np.all(np.abs(per_material - ideal) <= 1 / recordings + 1e-9)
+
+
+def test_split_is_the_seed_s_alone():
+    """The same seed gives the same parts, another seed others."""
+    s = easy(20)
+    parts = [s.split("recording", 0.5, seed)[0].groups["recording"] for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(parts[0], parts[1])
+    assert set(parts[0]) != set(parts[2])
+
+
+def test_split_refuses_what_would_flatter():
+    """Groups that cut recordings, a part without a material, a share that is none."""
+    s = easy(8, pieces=2)
+    s.groups["half"] = np.arange(len(s)) % 2
+    with pytest.raises(FormatError, match="'half' cut recordings in two"):
+        s.split("half", 0.5, 0)
+    s.groups["material"] = s.labels
+    del s.groups["recording"]
+    s.groups["one"] = np.zeros(len(s), int)
+    with pytest.raises(FormatError, match="the first part is everything; it has 1 groups"):
+        s.split("one", 0.5, 0)
+    for share in (0.0, 1.0, 1.5):
+        with pytest.raises(FormatError, match="splits nothing"):
+            s.split("material", share, 0)
+
+
+def test_split_never_trains_without_a_material():
+    """Where one group alone has a material it is in the first part, or the split is refused."""
+    s = easy(8).take(np.arange(19))  # 8 low, 8 middle, 3 high
+    s.groups["box"] = np.array([0] * 8 + [1] * 4 + [2] * 7)
+    told = set()
+    for seed in range(20):
+        try:
+            told.add(s.split("box", 0.5, seed)[0].labels.max())
+        except FormatError as e:
+            told.add(str(e))
+    assert told == {2, "easy: split by 'box': the first part lacks 'high'; it has 3 groups, use a finer one"}
+
+
+def test_join_keeps_recordings_apart_and_forces_together():
+    """Number 0 of two sets is two recordings, also where one set counts none; a speed of 2 is the same speed."""
+    a, b = easy(4, pieces=2), easy(4, seed=1)
+    both = sets.join([a, b])
+    assert not set(both.groups["recording"][:12]) & set(both.groups["recording"][12:])
+    np.testing.assert_array_equal(both.groups["speed"], np.append(a.groups["speed"], b.groups["speed"]))
+    del b.groups["recording"]
+    assert len(np.unique(sets.join([a, b]).groups["recording"])) == 6 + 12
+    with pytest.raises(FormatError, match="differ; join sets of one kind"):
+        sets.join([a, easy(4, dtype="int16")])
+
+
+def test_joined_sets_are_told_apart():
+    """`set` counts in the order given, so that one can be trained on and the other be tested on; one alone has none."""
+    real, hard = sets.load("sim:T-REAL:1001:1"), sets.load("sim:T-HARD:1001-1002:2")
+    both = sets.join([real, hard])
+    np.testing.assert_array_equal(both.groups["set"], [0] * 54 + [1] * 24)
+    np.testing.assert_array_equal(both.groups["world"], [1001] * 66 + [1002] * 12)
+    assert not set(both.groups["position"][:54]) & set(both.groups["position"][54:])
+    assert sets.join([hard]) is hard
+    assert "set" not in hard.groups
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
+def test_without_means_leaves_the_texture(dtype: str):
+    """Float32, mean zero, a constant taxel exactly zero, differences in time, labels and groups as they were."""
+    s = easy(4, dtype=dtype)
+    s.samples[2, :, 1, 0] = 3.3 if dtype == "float32" else 3
+    s = replace(s, samples=s.samples[:, :49])  # in float32 the mean of so many 3.3 is not 3.3
+    bare = s.without_means()
+    assert bare.samples.dtype == np.float32
+    assert np.abs(bare.samples.mean(axis=1, dtype=np.float64)).max() < 1e-6
+    assert not bare.samples[2, :, 1, 0].any()
+    np.testing.assert_allclose(np.diff(bare.samples, axis=1), np.diff(s.samples.astype(float), axis=1), atol=1e-4)
+    assert (bare.labels is s.labels, bare.groups, bare.materials) == (True, s.groups, s.materials)
+
+
+def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
+    """The same for a file read back, whatever its form; another for each thing that could change a result."""
+    s = easy(4)
+    for name in ("a.npz", "b.h5"):
+        s.save(tmp_path / name)
+        assert sets.digest(sets.load(str(tmp_path / name))) == sets.digest(s)
+    assert re.fullmatch("[0-9a-f]{16}", sets.digest(s))
+    other = s.samples.copy()
+    other[-1, -1, -1, -1] ^= 1
+    changed = [
+        replace(s, samples=other),
+        replace(s, samples=s.samples.astype(np.int16)),
+        replace(s, samples=s.samples.astype(np.uint16)),
+        replace(s, samples=s.samples.reshape(12, 64, 4, 1)),
+        replace(s, labels=s.labels[::-1]),
+        replace(s, materials=("low", "middle", "top")),
+        replace(s, rate_hz=101.0),
+        replace(s, groups={"recording": s.groups["recording"]}),
+        replace(s, groups=s.groups | {"speed": s.groups["recording"]}),
+    ]
+    assert len({sets.digest(x) for x in (s, *changed)}) == 10
+    assert sets.digest(replace(s, source="elsewhere", labels=s.labels.astype(np.uint8))) == sets.digest(s)
+
+
+def test_a_set_goes_to_another_process():
+    """Pickled and back, as a cluster does; this is no way to load a file."""
+    s = easy(4)
+    again = pickle.loads(pickle.dumps(s))
+    assert sets.digest(again) == sets.digest(s)
+    assert again.source == s.source

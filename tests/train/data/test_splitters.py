@@ -1,0 +1,131 @@
+"""Protocols: who is trained on and who is tested on, and never a recording on both sides."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.model_selection import LeaveOneGroupOut as Theirs
+from sklearn.model_selection import cross_val_score
+from sklearn.naive_bayes import GaussianNB
+
+from appliance.core.errors import FormatError
+from train.data.sets import SweepSet
+from train.data.splitters import Protocol
+
+
+def a_set(labels: list[int], **groups: list[int]) -> SweepSet:
+    """Sweeps of one frame whose digit is their number."""
+    n = len(labels)
+    samples = np.arange(n, dtype=np.int16).reshape(n, 1, 1, 1)
+    names = tuple("abcdef"[: max(labels) + 1])
+    return SweepSet(samples, np.array(labels), names, 100.0, {k: np.array(v) for k, v in groups.items()}, "made up")
+
+
+GRID = a_set([k for _ in range(3) for k in (0, 0, 1, 1)], position=[p for p in range(3) for _ in range(4)],
+             recording=[r for r in range(6) for _ in range(2)])  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["leave:position", "random:3", "split:position=0,1->2"])
+def test_a_protocol_tests_what_it_did_not_train_on(text: str):
+    """No sweep and no recording on both sides; every fold has both."""
+    for train, test in Protocol(text).folds(GRID, 1):
+        assert len(train)
+        assert len(test)
+        assert not set(GRID.groups["recording"][train]) & set(GRID.groups["recording"][test])
+
+
+def test_leave_is_scikit_learns_leave_one_group_out():
+    """The same folds in the same order."""
+    theirs = Theirs().split(GRID.samples, GRID.labels, GRID.groups["position"])
+    for (train, test), (their_train, their_test) in zip(Protocol("leave:position").folds(GRID, 1), theirs, strict=True):
+        assert train.tolist() == their_train.tolist()
+        assert test.tolist() == their_test.tolist()
+
+
+def test_split_trains_on_a_and_tests_on_b():
+    """Values before the arrow on one side, after it on the other, the rest on none."""
+    ((train, test),) = Protocol("split:position=2->0").folds(GRID, 1)
+    assert set(GRID.groups["position"][train]) == {2}
+    assert set(GRID.groups["position"][test]) == {0}
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(2, 4), st.integers(0, 99), st.integers(1, 4))
+def test_random_folds_are_whole_recordings_and_everything_once(folds: int, seed: int, pieces: int):
+    """Each sweep is tested once; no recording is cut; every fold holds every material."""
+    recording = np.repeat(np.arange(12), pieces)
+    sweeps = a_set((recording % 3).tolist(), recording=recording.tolist())
+    tested = []
+    for train, test in Protocol(f"random:{folds}").folds(sweeps, seed):
+        assert not set(recording[train]) & set(recording[test])
+        assert set(sweeps.labels[test]) == {0, 1, 2}
+        tested += test.tolist()
+    assert sorted(tested) == list(range(len(sweeps)))
+
+
+def test_random_folds_follow_their_seed():
+    """The same seed, the same folds; another seed, others."""
+    sweeps = a_set([0, 1] * 20)
+    one, same, other = ([t.tolist() for _, t in Protocol("random:4").folds(sweeps, s)] for s in (1, 1, 2))
+    assert one == same
+    assert one != other
+
+
+@pytest.mark.parametrize("text", ["leave:position", "random:3", "split:position=0,1->2"])
+def test_scikit_learn_takes_them_as_splitters(text: str):
+    """cross_val_score runs on each."""
+    splitter = Protocol(text).splitter(GRID, 1)
+    x = GRID.samples.reshape(len(GRID), -1)
+    scores = cross_val_score(GaussianNB(), x, GRID.labels, groups=GRID.groups["recording"], cv=splitter)
+    assert len(scores) == splitter.get_n_splits(x, GRID.labels, GRID.groups["recording"])
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("loo", "cannot be read; use random:FOLDS"),
+        ("random:1", "too few folds"),
+        ("random:4", "needs 4 recordings of each material; material 0 has 3"),
+        ("leave:speed", "no group 'speed'; it has one, position, recording"),
+        ("leave:one", "all sweeps have 7"),
+        ("split:position=0->9", "has no 9; it has 0, 1, 2"),
+        ("split:position=0,1->1,2", "position=1 is on both sides"),
+        ("split:position=0", "cannot be read"),
+    ],
+)
+def test_what_cannot_be_split_is_named(text: str, why: str):
+    """Unknown forms, groups and values, and folds that cannot be filled."""
+    sweeps = a_set(GRID.labels.tolist(), **GRID.groups, one=[7] * 12)
+    with pytest.raises(FormatError, match=why):
+        Protocol(text).folds(sweeps, 1)
+
+
+@pytest.mark.parametrize("text", ["leave:half", "split:half=0->1"])
+def test_a_group_that_cuts_recordings_is_refused(text: str):
+    """Pieces of one recording are never on both sides."""
+    sweeps = a_set([0, 0, 1, 1], recording=[0, 0, 1, 1], half=[0, 1, 0, 1])
+    with pytest.raises(FormatError, match="2 recordings, 0 among them, would be trained on and tested on"):
+        Protocol(text).folds(sweeps, 1)
+
+
+def test_a_recording_of_several_materials_is_refused():
+    """Numbers that start anew for each material would fuse sweeps of all of them."""
+    sweeps = a_set([0, 0, 1, 1], recording=[5, 6, 5, 6], day=[0, 1, 0, 1])
+    with pytest.raises(FormatError, match="recording 5 holds sweeps of several materials, as 2 do"):
+        Protocol("leave:day").folds(sweeps, 1)
+
+
+def test_nothing_left_to_train_on_is_refused():
+    """Where a group is the material, leaving one of two out leaves one."""
+    sweeps = a_set([0, 0, 1, 1], session=[0, 0, 1, 1])
+    with pytest.raises(FormatError, match="2 sweeps of less than two materials are left"):
+        Protocol("leave:session").folds(sweeps, 1)
+
+
+def test_clusters_are_what_was_left_out_or_recordings():
+    """Left-out groups for leave, recordings of several windows else, nothing where each sweep stands alone."""
+    assert Protocol("leave:position").clusters(GRID).tolist() == GRID.groups["position"].tolist()
+    assert Protocol("random:3").clusters(GRID).tolist() == GRID.groups["recording"].tolist()
+    assert Protocol("random:3").clusters(a_set([0, 1])) is None

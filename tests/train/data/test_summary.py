@@ -1,0 +1,161 @@
+"""What is in a set, in lines: counts by position and session, what was lost, what keeps it from being trained on."""
+
+from __future__ import annotations
+
+import re
+from argparse import ArgumentParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from appliance.core.types import Status
+from tests.factories.recordings import record
+from tests.factories.sweep_sets import easy, write
+from train.data import sets, summary
+
+
+def lines(s: sets.SweepSet) -> list[str]:
+    """What is told of a set."""
+    return summary.described(s, {})
+
+
+def command(*words: str) -> None:
+    """The command `sets`."""
+    parser = ArgumentParser()
+
+    def add(name: str, run: object, text: str) -> ArgumentParser:
+        parser.set_defaults(run=run)
+        return parser
+
+    summary.register(add)
+    args = parser.parse_args(words)
+    args.run(args)
+
+
+def test_a_set_is_described():
+    """Sweeps, form, materials with their counts, recordings, groups with their values, long lists shortened."""
+    s = easy(20, pieces=2)
+    s.groups["force"] = np.arange(60) % 12 * 10
+    first, *more = lines(s)
+    assert first == f"easy: 60 sweeps of 0.64 s; 2x2 uint8 at 100 Hz, window 64; digest {sets.digest(s)}"
+    assert more == [
+        "  recordings: 30, of 2 each",
+        "  materials: 3: low 20, middle 20, high 20",
+        "  force: 12: 0, 10, 20, 30, 40, 50, 60, 70, …, 110",
+        "  speed: 4: 0, 1, 2, 3",
+    ]
+    assert "  recordings: 29, of 1 to 2 each" in lines(s.take(np.arange(1, 58)))
+
+
+def test_what_is_confounded_is_told():
+    """Values that hold one material, a material that one value takes with it, recordings of several; not one value."""
+    s = easy(4, pieces=8)
+    s.groups.update(object=s.labels // 2, one=np.zeros(12, int))
+    told = [
+        "    confounded: one material only at 1",
+        "    confounded: 'low' only at 0; leaving that out leaves none to train on",
+        "    confounded: 'middle' only at 0; leaving that out leaves none to train on",
+        "    confounded: 'high' only at 1; leaving that out leaves none to train on",
+    ]
+    assert lines(s)[1:] == [
+        "  recordings: 2, of 4 to 8 each",
+        "    1 of them hold sweeps of several materials: number recordings within one material",
+        "  materials: 3: low 4, middle 4, high 4",
+        "  object: 2: 0, 1",
+        *told,
+        "  one: 1: 0",
+        "  speed: 2: 0, 1",
+        *told,
+    ]
+
+
+def test_positions_and_sessions_are_counted_in_tables():
+    """Materials down, positions across, totals at both ends, a dot for a hole; one of many positions has no table."""
+    s = easy(4)
+    s.groups.update(position=np.array([0, 0, 0, 10] + [10] * 8), speed=np.zeros(12, int))
+    assert lines(s)[3:] == [
+        "  position: 2: 0, 10",
+        "    confounded: one material only at 0",
+        "    confounded: 'middle' only at 10; leaving that out leaves none to train on",
+        "    confounded: 'high' only at 10; leaving that out leaves none to train on",
+        "            0  10  all",
+        "    low     3   1    4",
+        "    middle  ·   4    4",
+        "    high    ·   4    4",
+        "    all     3   9   12",
+        "  speed: 1: 0",
+    ]
+    s.groups.update(session=s.labels, position=np.arange(12))
+    assert "    all     4  4  4   12" in lines(s)
+    assert "    low     1  1  1  1  ·  ·  ·  ·  ·  ·   ·   ·    4" in lines(s)
+    many = easy(13)
+    many.groups["position"] = np.arange(39) % 13
+    assert [line.split()[0] for line in lines(many)] == ["easy:", "recordings:", "materials:", "position:", "speed:"]
+
+
+def test_recordings_are_described_by_name(tmp_path: Path):
+    """Places by the names they were given and the numbers that select them; frames lost, what was left out, verdicts."""
+    for i in range(6):
+        path = tmp_path / f"run{i // 3}" / f"{i}.npy"
+        record(path, "ab"[i % 2], id=i, position=("tip", "side", "tip")[i % 3], session="7", lost=i // 4)
+    record(tmp_path / "run0" / "9.npy", "", Status.GAP, frames=0, lost=100)
+    s = sets.load(str(tmp_path))
+    assert summary.describe(str(tmp_path)).splitlines() == [
+        f"{tmp_path} (left out: 1 gap): 6 sweeps of 0.16 s; 2x3 int16 at 50 Hz, window 8; digest {sets.digest(s)}",
+        "  recordings: 6, of 1 each",
+        "  materials: 2: a 3, b 3",
+        "  position: 2: 0 side, 1 tip",
+        "         side  tip  all",
+        "    a       1    2    3",
+        "    b       1    2    3",
+        "    all     2    4    6",
+        "  session: 1: 7",
+        "         7  all",
+        "    a    3    3",
+        "    b    3    3",
+        "    all  6    6",
+        "  frames lost: 2 of 48, in 2 sweeps, filled in from their neighbours",
+    ]
+
+
+def test_recordings_are_described_while_they_grow(tmp_path: Path):
+    """One material alone, names that are still lacking: counted, and what keeps it from being trained on is said."""
+    record(tmp_path / "0.npy", "a", position="2")
+    told = summary.describe(str(tmp_path)).splitlines()
+    assert "  materials: 1: a 1" in told
+    assert told[-1] == f"  cannot be trained on yet: {tmp_path}: only one class, 'a'; a classifier needs two"
+    record(tmp_path / "1.npy", "")
+    told = summary.describe(str(tmp_path)).splitlines()
+    assert "  materials: 2: (none) 1, a 1" in told
+    assert "  position: 2: 0 (none), 1 2" in told
+    assert not any("session" in line for line in told)
+    assert told[-1].startswith(f"  cannot be trained on yet: {tmp_path / '1.npy'}: has no ")
+    record(tmp_path / "2.npy", status=Status.SHORT)
+    (tmp_path / "0.npy").unlink()
+    (tmp_path / "1.npy").unlink()
+    with pytest.raises(FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"):
+        summary.describe(str(tmp_path))
+
+
+def test_what_is_known_can_be_loaded():
+    """Every simulated set in the list has as many sweeps as it says (the large one: sixty for each of its worlds)."""
+    said = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
+    assert said == {"sim:T-LAB": "240", "sim:T-REAL": "540", "sim:T-HARD": "60", "sim:T-HARD:1-20": "1200"}
+    assert len(sets.load("sim:T-LAB", 1001)) == 240
+    assert len(sets.load("sim:T-HARD:1001-1002")) == 120
+
+
+def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Alone it lists, `describe` tells of several, `view` writes a picture and names it."""
+    command()
+    assert capsys.readouterr().out == summary.known() + "\n"
+    one = write(tmp_path / "a.npz")
+    command("describe", one, "sim:T-HARD:1001:1")
+    first, second = capsys.readouterr().out.split("\n\n")
+    assert first.startswith("a.npz: 6 sweeps")
+    assert second.startswith("sim:T-HARD:1001:1: 6 sweeps")
+    command("view", one, "--number", "2", "--out", str(tmp_path / "new" / "a.svg"))
+    assert capsys.readouterr().out == f"{tmp_path}/new/a.svg\n"
+    assert (tmp_path / "new" / "a.svg").read_text().startswith("<svg")

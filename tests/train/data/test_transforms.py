@@ -1,0 +1,112 @@
+"""Less of everything: what is left of the sweeps is what a sensor so set would give, and the telling taxels stay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from train.data import transforms
+from train.data.sets import SweepSet
+from train.data.transforms import WHOLE, Change
+
+
+def counting(shape: tuple[int, ...] = (2, 12, 2, 3), kind: str = "int16") -> SweepSet:
+    """Digits that name sweep, frame and taxel: 1000 i + 10 t + m."""
+    n, frames, rows, cols = shape
+    taxel = np.arange(rows * cols).reshape(rows, cols)
+    x = 1000 * np.arange(n)[:, None, None, None] + 10 * np.arange(frames)[:, None, None] + taxel
+    return SweepSet(x.astype(kind), np.arange(n) % 2, ("a", "b"), 60.0, {"day": np.arange(n)}, "counting")
+
+
+def test_nothing_left_out_is_the_set_itself():
+    """Not even copied."""
+    sweeps = counting()
+    assert WHOLE.of(sweeps) is sweeps
+    assert str(WHOLE) == "all"
+
+
+def test_the_window_is_the_middle():
+    """Of twelve frames the inner six; rate and all else stay."""
+    part = Change(window=0.5).of(counting())
+    assert part.samples[0, :, 0, 0].tolist() == [30, 40, 50, 60, 70, 80]
+    assert (part.rate_hz, part.format.rows, part.format.cols, part.samples.dtype) == (60, 2, 3, np.int16)
+    assert part.groups["day"].tolist() == [0, 1]
+    assert Change(window=0.01).of(counting()).format.window == 1
+
+
+@pytest.mark.parametrize(("kind", "mean"), [("int16", [20, 70]), ("float32", [20, 70])])
+def test_frames_are_averaged(kind: str, mean: list[int]):
+    """Five into one, what does not make a whole one is left out; digits stay digits, the rate is a fifth."""
+    part = Change(rate=5).of(counting(kind=kind))
+    assert part.samples[0, :, 0, 0].tolist() == mean
+    assert (part.rate_hz, part.samples.dtype.name) == (12, kind)
+    assert Change(rate=2).of(counting((1, 2, 1, 1), "uint8")).samples.ravel().tolist() == [5]
+    with pytest.raises(FormatError, match="none empty"):
+        Change(rate=13).of(counting())
+
+
+def test_low_bits_are_cut_off():
+    """Of whole digits, negative ones too; a float set counts as eight bits of its range."""
+    x = np.array([-5, -1, 0, 3, 4, 127], np.int16).reshape(1, 6, 1, 1).repeat(2, 0)
+    cut = Change(bits=2).of(SweepSet(x, np.array([0, 1]), ("a", "b"), 1.0))
+    assert cut.samples[0].ravel().tolist() == [-8, -4, 0, 0, 4, 124]
+    ramp = np.linspace(-1, 1, 4096, dtype=np.float32).reshape(1, -1, 1, 1).repeat(2, 0)
+    coarse = Change(bits=4).of(SweepSet(ramp, np.array([0, 1]), ("a", "b"), 1.0)).samples
+    assert len(np.unique(coarse)) == 17  # sixteen steps and the very top
+    assert np.abs(coarse - ramp).max() <= 2 / 16
+
+
+def test_rows_and_columns_stay_a_grid():
+    """Whole ones left: a smaller grid; else one column, in the order of their numbers."""
+    grid = Change(taxels=(5, 3, 0, 2)).of(counting()).samples
+    assert grid.shape == (2, 12, 2, 2)
+    assert grid[0, 0].tolist() == [[0, 2], [3, 5]]
+    line = Change(taxels=(4, 0, 2)).of(counting()).samples
+    assert line.shape == (2, 12, 3, 1)
+    assert line[0, 0, :, 0].tolist() == [0, 2, 4]
+
+
+def test_changes_add_up():
+    """Each takes something else away."""
+    both = Change(window=0.5).and_then(Change(rate=2)).and_then(Change(taxels=(1,)))
+    assert both == Change(0.5, 2, (1,))
+    assert both.of(counting()).samples[0].ravel().tolist() == [26, 46, 66]
+    assert str(both) == "window 0.5, rate 2, taxels 1"
+
+
+def textured(tells: dict[int, list[float]], taxels: int = 9, each: int = 12) -> SweepSet:
+    """White noise of strength 3 on every taxel; `tells`: by taxel, how much stronger it is with each material."""
+    kinds = len(next(iter(tells.values())))
+    labels = np.tile(np.arange(kinds), each)
+    rng = np.random.default_rng(5)
+    strength = 3 * np.exp(0.2 * rng.standard_normal((len(labels), taxels)))
+    for taxel, factors in tells.items():
+        strength[:, taxel] *= np.array(factors)[labels]
+    x = 100 + strength[:, None] * rng.standard_normal((len(labels), 80, taxels))
+    names = tuple("abcdef"[:kinds])
+    return SweepSet(np.rint(x).astype(np.int16)[..., None], labels, names, 100.0, {}, "textured")
+
+
+def test_the_telling_taxels_come_first():
+    """Two taxels that each tell half of it, anywhere on the skin."""
+    assert set(transforms.order(textured({7: [1, 3, 1, 3], 2: [1, 1, 3, 3]}))[:2]) == {2, 7}
+
+
+def test_one_of_two_that_tell_the_same_stays():
+    """Neither is missed when it alone is left out; that must not cost both of them, nor put a weaker one before both."""
+    sweeps = textured({4: [1, 4], 2: [1, 1.6]}, each=30)
+    x = sweeps.samples.copy()
+    x[:, :, 6] = x[:, :, 4]
+    first = transforms.order(SweepSet(x, sweeps.labels, sweeps.materials, 100.0))
+    assert first[0] in (4, 6)
+    assert first[1] == 2
+
+
+@pytest.mark.parametrize("kind", ["silent", "one taxel", "one frame"])
+def test_any_sweeps_have_an_order(kind: str):
+    """Silent ones, one taxel, one frame: every taxel once."""
+    shape = {"silent": (4, 20, 2, 2), "one taxel": (4, 20, 1, 1), "one frame": (4, 1, 2, 2)}[kind]
+    x = np.zeros(shape, np.uint8) if kind == "silent" else np.random.default_rng(1).integers(0, 255, shape, np.uint8)
+    found = transforms.order(SweepSet(x, np.array([0, 0, 1, 1]), ("a", "b"), 10.0))
+    assert sorted(found) == list(range(shape[2] * shape[3]))

@@ -1,0 +1,252 @@
+"""The grid of methods, protocols, folds and seeds: what it counts, keeps, resumes, and the form that scripts rely on."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from appliance.inference.classifier import softmax
+from tests.factories.sweep_sets import tones
+from train.cli.main import main
+from train.data.sets import SweepSet
+from train.evaluation import evaluate, fold
+from train.evaluation.evaluate import Plan, Where
+from train.models import methods
+
+KEYS = {"method", "protocol", "means_removed", "seed", "window", "recording", "interval", "fit_s", "ms_p50"}
+
+
+def every(sweeps: SweepSet, where: Where, *names: str, **plan) -> list[evaluate.Result]:
+    """All results of these methods."""
+    given = {"protocols": ("leave:session",), **plan}
+    return list(evaluate.evaluate(sweeps, Plan(names, **given), where))
+
+
+HERE = Where(jobs=1, cache=None)
+
+
+def test_it_finds_what_is_there_to_find():
+    """Hums of three pitches are told apart under every protocol, by window and by recording."""
+    for result in every(
+        tones(), HERE, "L-gauss", "H-svm", protocols=("leave:session", "random:3", "split:session=0,1->2")
+    ):
+        told = result.json()
+        assert told["window"]["right"] >= 0.9 * told["window"]["total"], told
+        assert told["recording"]["right"] == told["recording"]["total"]
+        assert told["agreement"] == 1
+
+
+def test_it_finds_nothing_where_there_is_nothing():
+    """Labels drawn at random are guessed at about one in three: nothing leaks from the test."""
+    sweeps = tones(recordings=20, windows=1)
+    labels = np.random.default_rng(2).permutation(sweeps.labels)
+    shuffled = SweepSet(sweeps.samples, labels, sweeps.materials, 100.0, sweeps.groups, "shuffled")
+    (result,) = every(shuffled, HERE, "L-svm")
+    assert 8 <= result.json()["window"]["right"] <= 32
+
+
+def test_removed_means_are_gone():
+    """A material known by its offset alone is not known any more."""
+    hidden = tones(offset=40.0, noise=60.0)
+    hidden = SweepSet((hidden.samples - hidden.samples % 40).astype(np.int16), hidden.labels, hidden.materials, 100.0,
+                      hidden.groups, "offsets")  # fmt: skip
+    (with_means,), (without,) = (every(hidden, HERE, "static-svm", means_removed=gone) for gone in (False, True))
+    assert with_means.json()["window"]["right"] > without.json()["window"]["right"] + 5
+    assert without.json()["means_removed"] is True
+    assert np.abs(without.sweeps.samples.mean(axis=1)).max() < 1e-3
+
+
+def test_the_counts_are_those_of_the_logits():
+    """Windows by the largest logit, recordings by the product of their probabilities, the confusion matrix of both."""
+    sweeps = tones(noise=150.0)
+    (result,) = every(sweeps, HERE, "L-knn")
+    told, labels = result.json(), sweeps.labels[result.test]
+    assert sorted(result.test) == list(range(len(sweeps)))
+    assert told["window"] == {"right": int((result.logits.argmax(1) == labels).sum()), "total": 36}
+    right = 0
+    for number in range(18):
+        mine = sweeps.groups["recording"][result.test] == number
+        right += np.log(softmax(result.logits[mine])).sum(0).argmax() == labels[mine][0]
+    assert told["recording"] == {"right": right, "total": 18}
+    confusion = np.array(told["confusion"])
+    assert confusion.sum(1).tolist() == [12, 12, 12]
+    assert np.trace(confusion) == told["window"]["right"]
+    low, high = told["interval"]
+    assert low <= told["window"]["right"] / 36 <= high
+
+
+def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
+    """Where it runs does not change what comes out."""
+    one, two = (every(tones(), Where(jobs, cache=None), "L-svm", protocols=("random:3",)) for jobs in (1, 2))
+    assert np.array_equal(one[0].logits, two[0].logits)
+
+
+def test_what_was_interrupted_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Folds that are done are not trained again; the result is the same."""
+    where = Where(jobs=1, cache=tmp_path)
+    calls: list[int] = []
+    train = fold.run
+
+    def counted(*args):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return train(*args)
+
+    monkeypatch.setattr(evaluate, "run", counted)
+    with pytest.raises(KeyboardInterrupt):
+        every(tones(), where, "L-gauss")
+    assert len(list(tmp_path.glob("*.npz"))) == 2
+    assert not every(tones(), replace(where, kept=True), "L-gauss")  # and nothing is trained, nothing half told
+    (result,) = every(tones(), where, "L-gauss")
+    assert len(calls) == 4
+    (again,) = every(tones(), where, "L-gauss")
+    assert len(calls) == 4
+    assert np.array_equal(result.logits, again.logits)
+    assert np.array_equal(result.logits, every(tones(), replace(where, kept=True), "L-gauss")[0].logits)
+    assert again.json()["window"] == every(tones(), HERE, "L-gauss")[0].json()["window"]
+
+
+def test_a_broken_cache_file_is_done_again(tmp_path: Path):
+    """Half a file is as none."""
+    where = Where(jobs=1, cache=tmp_path)
+    (first,) = every(tones(), where, "L-gauss")
+    path = min(tmp_path.glob("*.npz"))
+    path.write_bytes(path.read_bytes()[:100])
+    (again,) = every(tones(), where, "L-gauss")
+    assert np.array_equal(first.logits, again.logits)
+
+
+def test_a_fold_is_kept_under_all_that_it_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Data, method, effort, seed, split and code: another name for each of them."""
+    task = fold.Task("L-svm", methods.USUAL, 1, np.arange(5), np.arange(5, 9))
+    others = [
+        fold.Task("L-knn", methods.USUAL, 1, task.train, task.test),
+        fold.Task("recurrent", methods.USUAL, 1, task.train, task.test),
+        fold.Task("recurrent", methods.Effort(0.5), 1, task.train, task.test),
+        fold.Task("L-svm", methods.USUAL, 2, task.train, task.test),
+        fold.Task("L-svm", methods.USUAL, 1, task.train[:4], task.test),
+        fold.Task("L-svm", methods.USUAL, 1, task.train, task.test[:3]),
+    ]
+    names = {fold.key(t, "data") for t in [task, *others]} | {fold.key(task, "other data")}
+    assert len(names) == 8
+    assert fold.key(fold.Task("L-svm", methods.Effort(0.5), 1, task.train, task.test), "data") in names  # nothing to it
+    monkeypatch.setattr(fold, "version", lambda name: "0")
+    assert fold.key(task, "data") not in names
+
+
+def test_a_fold_depends_on_the_code_that_its_method_runs():
+    """What a method imports, directly or not, counts; what stands around it and other methods' networks do not."""
+
+    def reached(method: str) -> set[str]:
+        """Without the packages' names."""
+        return {name.split(".")[-1] for name in fold.reached((methods.module_of(method), "train.evaluation.fold"))}
+
+    assert {"neural_methods", "networks", "training", "graph_builder", "heads", "fold"} <= reached("paper-cnn")
+    classical = reached("L-svm")
+    assert {"baselines", "heads", "graph_builder", "features", "time_series", "prior_work"} <= classical
+    assert not {"neural_methods", "networks", "network", "evaluate", "score", "main"} & classical
+    assert all(methods.module_of(name) in methods.MODULES for name in methods.every())
+
+
+@pytest.mark.parametrize(
+    ("names", "protocol", "why"),
+    [
+        (["L-gaus"], "leave:session", "method 'L-gaus' is unknown; use some of L-gauss, L-knn"),
+        (["L-gauss"], "leave:speed", "no group 'speed'"),
+        (["L-gauss"], "random:7", "needs 7 recordings of each material; material 0 has 6"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_named(names: list[str], protocol: str, why: str):
+    """Before anything is trained."""
+    with pytest.raises(FormatError, match=why):
+        every(tones(), HERE, *names, protocols=(protocol,))
+
+
+def command(*args: str, cache: Path) -> int:
+    """palpate-train evaluate in this process."""
+    return main(["evaluate", *args, "--jobs", "1", "--cache", str(cache)])
+
+
+def test_the_command_writes_what_scripts_rely_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A list of results with the keys of the manual, one for each method and seed, in the order asked for."""
+    tones(offset=9.0).save(tmp_path / "tones.npz")
+    out = tmp_path / "deep" / "results.json"
+    args = ("--set", str(tmp_path / "tones.npz"), "--protocol", "leave:session", "--method", "H-knn,L-gauss", "--seeds", "2",
+            "--only", "material=a,c", "session<=2", "--remove-means", "--json", str(out))  # fmt: skip
+    assert command(*args, cache=tmp_path / "cache") == 0
+    results = json.loads(out.read_text())
+    assert [(r["method"], r["seed"]) for r in results] == [("H-knn", 1), ("H-knn", 2), ("L-gauss", 1), ("L-gauss", 2)]
+    for result in results:
+        assert set(result) >= KEYS
+        assert result["protocol"] == "leave:session"
+        assert result["means_removed"] is True
+        assert result["materials"] == ["a", "c"]
+        assert result["window"]["total"] == 24
+        assert result["recording"]["total"] == 12
+        assert 0 <= result["interval"][0] <= result["interval"][1] <= 1
+        assert result["fit_s"] > 0
+        assert result["ms_p50"] > 0
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == 5
+    assert "leave:session" in printed[1]
+    assert " out " in printed[1]
+
+
+def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
+    """Every sweep stands for itself."""
+    whole = tones(windows=1)
+    SweepSet(whole.samples, whole.labels, whole.materials, 100.0, {"day": whole.groups["session"]}).save(
+        tmp_path / "a.npz"
+    )
+    out = tmp_path / "r.json"
+    assert command("--set", str(tmp_path / "a.npz"), "--protocol", "leave:day", "--method", "L-svm", "--json", str(out),
+                   cache=tmp_path) == 0  # fmt: skip
+    (result,) = json.loads(out.read_text())
+    assert "recording" not in result
+
+
+def test_a_method_that_cannot_work_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Windows too short for a spectrum over time: said with its reason and an exit code, after all else was done."""
+    whole, out = tones(), tmp_path / "r.json"
+    short = SweepSet(whole.samples[:, :7], whole.labels, whole.materials, 100.0, whole.groups, "short")
+    short.save(tmp_path / "short.npz")
+    assert command("--set", str(tmp_path / "short.npz"), "--protocol", "leave:session", "--method", "minirocket,L-gauss",
+                   "--json", str(out), cache=tmp_path) == FormatError.exit_code  # fmt: skip
+    assert [r["method"] for r in json.loads(out.read_text())] == ["L-gauss"]
+    assert "minirocket cannot be used here: a window of 7 frames is too short" in capsys.readouterr().err
+
+
+def test_trained_on_one_set_and_tested_on_another(tmp_path: Path):
+    """Two sets make one with a group `set`: T-REAL against T-HARD."""
+    out = tmp_path / "r.json"
+    assert command("--set", "sim:T-REAL:1001:1", "--set", "sim:T-HARD:1002:1", "--protocol", "split:set=0->1",
+                   "--method", "L-gauss", "--json", str(out), cache=tmp_path) == 0  # fmt: skip
+    assert json.loads(out.read_text())[0]["window"]["total"] == 6
+
+
+@pytest.mark.parametrize("args", [("--seeds", "0"), ("--method", "nobody"), ("--protocol", "loo"), ("--only", "x=1")])
+def test_bad_arguments_are_one_line(args: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """With the value and what to try."""
+    tones().save(tmp_path / "t.npz")
+    good = {"--set": str(tmp_path / "t.npz"), "--protocol": "leave:session", "--method": "L-svm"}
+    assert command(*sum((good | dict([args])).items(), ()), cache=tmp_path) == FormatError.exit_code
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert args[1].split("=")[0] in said[0]
+
+
+def test_the_methods_are_listed_with_a_line_each(capsys: pytest.CaptureFixture[str]):
+    """All that the manual promises, and one that needs an extra says so."""
+    assert main(["methods"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    promised = ("L-gauss L-knn L-svm H-knn H-svm fishel-bayes static-svm spectrogram-svm correlation-svm st-hmp paper-cnn "
+                "tactnet2 recurrent minirocket compact")  # fmt: skip
+    assert {line.split()[0] for line in lines} >= set(promised.split())
+    assert all(len(line.split()) > 4 for line in lines)
+    assert any("palpate-train[minirocket]" in line for line in lines)

@@ -1,0 +1,176 @@
+"""Many tasks at once: on this machine, and on a real Dask cluster of two workers on loopback, one of which dies."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import threadpoolctl
+from distributed import Client
+
+from appliance.core.errors import FormatError
+from tests.factories.sweep_sets import tones
+from train.evaluation import evaluate, parallel
+from train.evaluation.evaluate import Plan, Where
+from train.models import methods
+
+
+def add(task: int, data: np.ndarray) -> float:
+    """A task."""
+    return float(data[task] + data.sum())
+
+
+def threads(task: int) -> int:
+    """How many threads a linear algebra library may use."""
+    return max(entry["num_threads"] for entry in threadpoolctl.threadpool_info())
+
+
+def test_every_task_is_done_once_with_its_data():
+    """Two processes; each result comes with its task."""
+    data = np.arange(50.0)
+    done = dict(parallel.results(add, range(20), [data], jobs=2))
+    assert done == {task: task + 1225.0 for task in range(20)}
+    assert not list(parallel.results(add, [], [data]))
+
+
+def test_each_task_has_one_thread():
+    """Linear algebra does not fight for cores, in this process and in others."""
+    for jobs in (1, 2):
+        assert {n for _, n in parallel.results(threads, [0], [], jobs=jobs)} == {1}
+
+
+def test_an_error_in_a_task_is_the_callers():
+    """It is raised here, not swallowed there."""
+    with pytest.raises(IndexError):
+        list(parallel.results(add, [99], [np.arange(3.0)], jobs=2))
+
+
+def test_progress_tells_how_much_is_left():
+    """Done, all, a time, and what was done."""
+    lines: list[str] = []
+    progress = parallel.Progress(2, lines.append)
+    progress("a")
+    progress("b")
+    assert re.fullmatch(r"1/2 done, \d+ s left \(a\)", lines[0])
+    assert lines[1] == "2/2 done, 0 s left (b)"
+    assert parallel.spoken(600) == "10 min"
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
+    """A scheduler and two workers without nannies: who dies stays dead."""
+    command, env = (sys.executable, "-m", "dask"), os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    scheduler = subprocess.Popen(
+        (*command, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
+        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=env,
+    )  # fmt: skip
+    processes = [scheduler]
+    try:
+        for said in scheduler.stderr:
+            if found := re.search(r"tcp://127\.0\.0\.1:\d+", said):
+                break
+        address = found[0]
+        for _ in range(2):
+            options = ("--no-nanny", "--nthreads", "1", "--host", "127.0.0.1", "--no-dashboard")
+            processes.append(
+                subprocess.Popen(
+                    (*command, "worker", address, *options),
+                    stderr=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    text=True,
+                    env=env,
+                )
+            )
+        with Client(address, timeout=20, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=30)
+        yield address, processes[1:]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def test_a_cluster_gives_the_same_bits(cluster):
+    """An evaluation there and here: equal logits, of features with an SVM and of a network."""
+    plan = Plan(("L-svm", "recurrent"), ("leave:session",), effort=methods.Effort(0.02))
+    there, here = (
+        {result.method: result for result in evaluate.evaluate(tones(), plan, where)}
+        for where in (Where(scheduler=cluster[0], cache=None), Where(jobs=1, cache=None))
+    )
+    for name in plan.methods:
+        assert np.array_equal(there[name].logits, here[name].logits), name
+        assert there[name].json()["window"] == here[name].json()["window"]
+
+
+def noted(task: int, folder: str, data: np.ndarray) -> float:
+    """A task that leaves a note for each time it was done; the first to do task 7 is killed in the middle of it."""
+    if task == 7:
+        with contextlib.suppress(FileExistsError):
+            Path(folder, "killed").touch(exist_ok=False)
+            os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.25)
+    Path(folder, f"{task}-{os.getpid()}").touch()
+    return float(data[task])
+
+
+def test_a_worker_that_dies_costs_only_what_it_was_running(cluster, tmp_path: Path):
+    """Twenty tasks, one worker killed: all are done, none but the killed one's was begun twice."""
+    address, workers = cluster
+    data = np.arange(20.0)
+    done = dict(parallel.results(noted, range(20), [str(tmp_path), data], scheduler=address))
+    assert done == {task: float(task) for task in range(20)}
+    assert sum(w.poll() is not None for w in workers) == 1
+    times = Counter(note.name.split("-")[0] for note in tmp_path.glob("*-*"))
+    assert set(times) == {str(task) for task in range(20)}
+    assert sum(times.values()) <= 21  # at most the result that was on its way when its worker died
+
+
+def test_an_error_on_a_worker_is_the_callers(cluster):
+    """It is raised here too."""
+    with pytest.raises(IndexError):
+        list(parallel.results(add, [99], [np.arange(3.0)], scheduler=cluster[0]))
+
+
+def test_a_cluster_without_the_project_is_named(cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What is to be run is not installed there."""
+    (tmp_path / "only_here.py").write_text("def call(task):\n    return task\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(FormatError, match="lacks this version of palpate-train"):
+        list(parallel.results(importlib.import_module("only_here").call, [1], [], scheduler=cluster[0]))
+
+
+def always_dies(task: int) -> None:
+    """A task that takes its worker along."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_task_that_kills_every_worker_ends_with_a_reason(cluster, monkeypatch: pytest.MonkeyPatch):
+    """Nothing hangs when nobody is left."""
+    monkeypatch.setattr(parallel, "CONNECT_S", 1)
+    with pytest.raises(FormatError, match=r"died too often|has no worker"):
+        list(parallel.results(always_dies, [1], [], scheduler=cluster[0]))
+
+
+def test_a_cluster_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
+    """No scheduler at that address: told within its deadline, with the command that starts one."""
+    monkeypatch.setattr(parallel, "CONNECT_S", 1)
+    with pytest.raises(FormatError, match=r"no scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"):
+        list(parallel.results(add, [1], [np.arange(3.0)], scheduler="tcp://127.0.0.1:9"))
+
+
+def test_without_dask_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    """The extra is named."""
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(FormatError, match=r"palpate-train\[dask\]"):
+        list(parallel.results(add, [1], [np.arange(3.0)], scheduler="tcp://127.0.0.1:9"))

@@ -1,0 +1,220 @@
+"""How sure the box may be: figures on Gaussians whose truth is known, and the command's room from set to page."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from train.calibration.posthoc import finish
+from train.data.sets import SweepSet
+from train.evaluation import uncertainty, uncertainty_cases
+from train.evaluation.evaluate import Where
+from train.evaluation.uncertainty_cases import NOBODY, Case
+from train.models.methods import Effort
+from train.reports import uncertainty_report
+
+NAMES = ("a", "b", "c", "d")
+
+
+def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
+    """Features [N, 10, 4] of n sweeps of four materials at each place, told apart from the middle of the sweep on."""
+    rng = np.random.default_rng(seed)
+    labels = np.tile(np.repeat(np.arange(4), n), places)
+    at = np.repeat(np.arange(places), 4 * n) + first
+    grown = np.minimum(np.arange(1, 11) / 5, 1)
+    means = apart / np.sqrt(2) * np.eye(4)  # any two are `apart`
+    x = means[labels][:, None] * grown[:, None] + rng.standard_normal((len(labels), 1, 4)) + 0 * grown[:, None]
+    return x, labels, at
+
+
+def case(left_out: int = NOBODY, apart: float = 6.0, fold: int = 0, places: int = 3) -> Case:
+    """A training on eight places and a test on others."""
+    x, y, at = world(8, 20, 1, apart)
+    keep = y != left_out
+    y = y - (y > left_out) * (left_out != NOBODY)
+    new, labels, there = world(places, 24, 2 + fold, apart, first=100 + 10 * fold)
+    x, y, at = x[keep], y[keep], at[keep]
+    seen = at % 2 == 1
+    copied = x[seen, -1] + np.random.default_rng(9).normal(0, 0.1, (seen.sum(), 4))
+    return Case(left_out, fold, 2, x, y, at, ~seen, copied, y[seen], at[seen], new, labels, there)
+
+
+@pytest.fixture(scope="module")
+def told():
+    """All figures of one fold, each material left out once."""
+    held = [case(k) for k in (NOBODY, 0, 1, 2, 3)]
+    return json.loads(json.dumps(uncertainty.figures(held, NAMES, 1)))
+
+
+def test_error_is_the_gap_between_said_and_right():
+    """.9 said and .7 right is .2 off, whatever the number; honest is 0; bins count by their sweeps."""
+    right = np.arange(100) < 70
+    assert uncertainty.error(np.full(100, 0.9), right) == pytest.approx(0.2)
+    assert uncertainty.error(np.full(100, 0.7), right) == pytest.approx(0)
+    said = np.concatenate([np.full(50, 0.95), np.full(50, 0.55)])
+    assert uncertainty.error(said, np.concatenate([np.ones(50, bool), np.arange(50) < 5])) == pytest.approx(0.25)
+    assert uncertainty.reliability(np.array([1.0, 0.0]), np.array([True, False]))[-1] == {
+        "said": 1.0,
+        "right": 1.0,
+        "n": 1,
+    }
+
+
+def test_an_overconfident_head_is_made_honest():
+    """Places that shift the materials: LDA says too much, the temperature found across places takes it back."""
+    one = case(apart=2.5)
+    rng = np.random.default_rng(0)
+    moved = lambda x, at: x + 1.5 * rng.standard_normal((200, 1, 4))[at]  # noqa: E731
+    one = replace(one, seen=moved(one.seen, one.seen_groups), new=moved(one.new, one.places))
+    # sweeps of one place close together: their scatter says little of other places
+    figures = uncertainty.calibration([(one, finish(one.seen, one.seen_labels, one.seen_groups, one.judged))])
+    assert figures["n"] == 288
+    assert 0 < figures["accuracy"]["low"] < figures["accuracy"]["accuracy"] < figures["accuracy"]["high"] < 1
+
+
+def test_more_sweeps_for_more_certainty(told):
+    """Mean sweeps and accuracy rise with the probability wanted; one sweep where none is."""
+    for held in told["sequence"].values():
+        sweeps = [p["sweeps"] for p in held["points"]]
+        assert sweeps[0] == 1
+        assert sweeps == sorted(sweeps)
+        assert sweeps[-1] > 1
+        assert held["points"][-1]["accuracy"] >= held["points"][0]["accuracy"]
+        assert held["points"][-1]["right_of_decided"] > 0.995
+
+
+def test_the_sequential_test_stops_where_it_is_sure():
+    """By hand: two objects, one sure at the second sweep, one never; the limit ends it."""
+    fused = np.array([[[0.6, 0.4], [0.9, 0.1], [0.99, 0.01]], [[0.5, 0.5], [0.4, 0.6], [0.45, 0.55]]])
+    point = uncertainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.9)
+    assert (point["sweeps"], point["decided"], point["accuracy"], point["right_of_decided"]) == (2.5, 0.5, 0.5, 1.0)
+    assert uncertainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.999)["right_of_decided"] is None
+
+
+def test_strangers_six_deviations_away_are_seen(told):
+    """A material left out is six deviations from the others, known ones are chi-squared: AUROC above .95."""
+    for row in told["unknown"]["materials"].values():
+        assert row["low"] <= row["auroc"] <= row["high"]
+        assert (row["known"], row["unknown"]) == (216, 72)
+    assert 0.99 < told["unknown"]["mean"]["auroc"] <= 1
+    assert told["unknown"]["scores"]["distance, where trained materials differ"] < 0.95  # in their midst
+    assert 0.9 < told["unknown"]["mean"]["kept"] < 0.99
+
+
+def test_a_stranger_that_is_no_stranger_is_not_seen():
+    """Materials that do not differ: AUROC of a half."""
+    held = [case(k, apart=0.0) for k in (0, 1)]
+    done = [(c, finish(c.seen, c.seen_labels, c.seen_groups, c.judged)) for c in held]
+    assert abs(uncertainty.unknown(done, NAMES)["mean"]["auroc"] - 0.5) < 0.06
+
+
+def test_enrolment_from_more_sweeps_comes_nearer(told):
+    """The share of the fully trained accuracy grows with sweeps; old classes lose little; both places are told."""
+    points = {(p["where"], p["sweeps"]): p for p in told["enrolment"]["points"]}
+    assert {w for w, _ in points} == {"same place", "other places"}
+    for where in ("same place", "other places"):
+        assert points[where, 1]["share"] < points[where, 10]["share"]
+        assert 0.9 < points[where, 5]["share"] <= 1.02
+        assert points[where, 5]["old_lost"] < 0.06
+        assert set(points[where, 5]["by_material"]) == set(NAMES)
+
+
+def test_early_needs_half_the_sweep_where_that_tells_all(told):
+    """All is known at the fifth tenth: the share is below .6 and accuracy is that of the whole sweep."""
+    early = told["early"]
+    assert early["share"] < 0.6
+    assert abs(early["lost"]) <= 0.02
+    assert len(early["always"]) == 10
+    assert early["always"][0]["accuracy"] < early["always"][5]["accuracy"]
+
+
+def test_two_materials_leave_nobody_out():
+    """Of two materials none can be left out: calibration, sweeps and early are told, and the page says no more."""
+    one = case()
+    two, test = one.seen_labels < 2, one.labels < 2
+    also = one.copied_labels < 2
+    one = Case(NOBODY, 0, 2, one.seen[two], one.seen_labels[two], one.seen_groups[two], one.judged[two], one.copied[also],
+               one.copied_labels[also], one.copied_groups[also], one.new[test], one.labels[test], one.places[test])  # fmt: skip
+    figures = uncertainty.figures([one], NAMES[:2], 1)
+    assert set(figures) == {"calibration", "sequence", "early"}
+    html, pictures = uncertainty_report.tell(figures | dict.fromkeys(ABOUT, "x"))
+    assert set(pictures) == {"reliability", "sweeps", "touch"}
+    assert "never trained<" not in html
+
+
+ABOUT = ("set", "test", "protocol", "method", "seed", "effort", "folds", "trainings", "sweeps", "tested", "format",
+         "digest", "commit", "machine", "took_s")  # fmt: skip
+
+
+def test_the_page_stands_alone(told):
+    """One file without script or address; its pictures are sound XML; each target says whether it was reached."""
+    html, pictures = uncertainty_report.tell(told | dict.fromkeys(ABOUT, "x"))
+    assert not re.search(r"<script|src=|href=\"http", html)
+    assert len(pictures) == 5
+    for svg in pictures.values():
+        assert ET.fromstring(svg).tag.endswith("svg")
+        assert svg in html
+    assert html.count("reached") >= 5
+    assert "nan" not in html.lower().replace("finance", "")
+
+
+def sweeps(materials: int = 3) -> SweepSet:
+    """Hums of different pitch, four positions, 128 x 16 x 1 float32 at 36 Hz."""
+    rng = np.random.default_rng(0)
+    labels = np.tile(np.repeat(np.arange(materials), 6), 4)
+    t = np.arange(128)[:, None] / 36
+    hum = np.stack([np.sin(2 * np.pi * (3 + 3 * k) * t + rng.uniform(0, 6)) * rng.uniform(0.8, 1.2) for k in labels])
+    x = (hum[:, :, None] + rng.normal(0, 0.5, (len(labels), 128, 16, 1))).astype(np.float32)
+    position = np.repeat(np.arange(4), 6 * materials)
+    return SweepSet(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
+
+
+def test_from_set_to_page_and_again_from_the_cache(tmp_path):
+    """The whole way with a few iterations: results, pictures and page are there; a second run trains nothing."""
+    hums, lines = sweeps(), []
+    where = Where(jobs=1, cache=tmp_path / "cache")
+    first = uncertainty_cases.run(
+        hums, None, "split:position=0,1,2->3", "compact-1k", where, lines.append, Effort(0.02)
+    )
+    assert first["trainings"] == 4
+    assert "4/4 done" in lines[-2]
+    page = uncertainty_cases.write(first, tmp_path / "out")
+    assert sorted(p.name for p in page.parent.iterdir()) == sorted(
+        [
+            *(f"{n}.svg" for n in ("enrolment", "reliability", "sweeps", "touch", "unknown")),
+            "index.html",
+            "results.json",
+        ]
+    )
+    again = uncertainty_cases.run(
+        hums, None, "split:position=0,1,2->3", "compact-1k", replace(where, kept=True), lines.append, Effort(0.02)
+    )
+    assert {k: v for k, v in again.items() if k != "took_s"} == {k: v for k, v in first.items() if k != "took_s"}
+    with pytest.raises(FormatError, match="4 of 4 trainings are not kept"):
+        uncertainty_cases.run(
+            hums, None, "split:position=0,1->2", "compact-1k", replace(where, kept=True), lines.append, Effort(0.02)
+        )
+
+
+def test_methods_without_tenths_are_refused(tmp_path):
+    """L-gauss has no trunk: said by name."""
+    with pytest.raises(FormatError, match="L-gauss"):
+        uncertainty_cases.run(
+            sweeps(), None, "split:position=0,1,2->3", "L-gauss", Where(jobs=1, cache=None), print, Effort(0.02)
+        )
+
+
+def test_a_case_lost_on_the_way_is_trained_again(tmp_path):
+    """A broken cache file is no Case."""
+    path = tmp_path / "x.case.npz"
+    uncertainty_cases._save(case(2), path)
+    kept = uncertainty_cases._load(path)
+    assert kept
+    assert kept.left_out == 2
+    assert np.array_equal(kept.seen, case(2).seen)
+    path.write_bytes(path.read_bytes()[:100])
+    assert uncertainty_cases._load(path) is None

@@ -1,0 +1,66 @@
+"""Every method becomes a bundle that the appliance runs with the answers of the desktop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.cli.main import main as palpate
+from appliance.core.clock import SystemClock
+from appliance.core.errors import BundleError, FormatError
+from appliance.inference.classifier import Classifier
+from tests.factories.sweep_sets import tones
+from train.cli.main import main
+from train.export import pack
+from train.models import methods
+
+HARDLY = methods.Effort(0.1, 20)
+METHODS = methods.every(HARDLY)
+ON_THE_BOX = [name for name, method in METHODS.items() if method.runs_on_the_box]
+
+
+@pytest.mark.parametrize("name", ON_THE_BOX)
+def test_the_box_says_what_the_desktop_says(name: str, tmp_path: Path):
+    """Trained, packed, loaded, checked by its golden sweeps; each held-out sweep gets the label that training saw."""
+    content = pack.trained(METHODS[name], tones(), 1)
+    manifest = pack.pack(content, tmp_path / "b", "any", "1", "0123abcd")
+    assert manifest.input == METHODS[name].input
+    assert manifest.made["method"] == name
+    it = Classifier(bundle.load(tmp_path / "b"), SystemClock())
+    assert it.self_test() < 0.02
+    model = METHODS[name].train(content.train, methods.given(METHODS[name].input, content.train), 1)
+    want = model.logits(methods.given(METHODS[name].input, content.held)).argmax(1)
+    assert (pack.score(it, content.held) == want).all()
+
+
+@pytest.mark.parametrize("name", METHODS.keys() - ON_THE_BOX)
+def test_features_that_the_box_does_not_compute_are_refused(name: str):
+    """Before anything is trained, with the method and its features named."""
+    with pytest.raises(FormatError, match=f"'{name}' looks at the features '{METHODS[name].input}' of prior work"):
+        pack.trained(METHODS[name], tones(), 1)
+
+
+def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """`palpate-train pack`, then `palpate check` and a demo with the bundle: features of the paper, SVM in ONNX."""
+    folder = str(tmp_path / "h")
+    assert main(["pack", "--set", "sim:T-LAB:1001:12", "--method", "H-svm", "--seed", "1", "--out", folder,
+                 "--name", "h", "--version", "2"]) == 0  # fmt: skip
+    assert "bundle: h 2," in capsys.readouterr().out
+    assert bundle.load(tmp_path / "h").manifest.input == "H"
+    chosen = ["--sim", "skin", "--virtual", "--set", f"classifier.bundle={folder}"]
+    assert palpate(["check", *chosen]) == 0
+    assert palpate(["demo", *chosen, "--sweeps", "2"]) == 0
+
+
+def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
+    """Nothing is left behind."""
+    noise = tones(noise=0.0)
+    content = pack.trained(METHODS["L-gauss"], noise, 1)
+    content.train.samples[content.train.labels == 0] = 0
+    with pytest.raises(BundleError, match="no training sweep of 'a' is recognised"):
+        pack.pack(content, tmp_path / "b", "any", "1", "")
+    assert not (tmp_path / "b").exists()
+    assert np.isin(content.held.labels, [0, 1, 2]).all()

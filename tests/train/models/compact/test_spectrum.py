@@ -1,0 +1,193 @@
+"""The spectrum against its definition, in PyTorch and in graphs: what it hears, what it is deaf to, when it is there."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
+from appliance.sim import skin
+from tests.factories.sweep_sets import easy
+from train.models.compact import fit, graph, methods, spectrum
+from train.models.compact.architectures import LADDER, Shape
+from train.models.compact.fit import Recipe
+from train.models.compact.network import Compact
+from train.models.methods import Effort
+from train.onnx_tools import graph_builder
+
+BARE = LADDER["bands"]
+SMALL = Shape((6, 8, 8), 8, 2)
+ODD = SweepFormat(2, 2, 100.0, 163, "int16")
+FORMS = {
+    "skin": (skin.FORMAT, True),
+    "four frames a period": (SweepFormat(1, 1, 200.0, 450, "float32"), True),
+    "three frames a period": (SweepFormat(3, 3, 150.0, 450, "uint16"), False),
+    "less than two periods a tenth": (SweepFormat(4, 4, 750.0, 299, "uint8"), False),
+    "just two": (SweepFormat(4, 4, 750.0, 300, "uint8"), True),
+    "odd": (ODD, False),
+    "line": (SweepFormat(16, 1, 35.6, 128, "float32"), False),
+    "shortest": (SweepFormat(2, 2, 100.0, 40, "uint8"), False),
+}
+"""Forms, and whether the mains are taken away there."""
+
+
+def drawn(form: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
+    """Digits of n sweeps: noise that all taxels feel, and some of their own; none trembles far more than others."""
+    rng = np.random.default_rng(seed)
+    own = rng.standard_normal((n, form.window, form.rows, form.cols))
+    x = 90 + 8 * rng.standard_normal((n, form.window, 1, 1)) + 4 * own
+    return x.astype(form.dtype)
+
+
+def trunk(form: SweepFormat, scale: float = 0.1, tenths: bool = False) -> onnx.ModelProto:
+    """The graph that gives nothing but the spectrum."""
+    return graph.trunk(form, scale, {}, BARE, tenths=tenths)
+
+
+def heard(form: SweepFormat, digits: np.ndarray, scale: float = 0.1) -> np.ndarray:
+    """What PyTorch's head sees where there is nothing but the spectrum."""
+    with torch.no_grad():
+        model = Compact(form, 3, scale, norm=False, shape=BARE)
+        return model.seen(torch.from_numpy(digits.astype(np.float32))).numpy()
+
+
+def turned(x: np.ndarray) -> np.ndarray:
+    """What each taxel of [n, T, R * C] is multiplied with: more than three times the fifth of sixteen is turned down."""
+    step = max(x.shape[1] // 150, 1)
+    trembling = np.abs(x[:, 1::step] - x[:, :-1:step]).mean(1, keepdims=True)
+    limit = 3 * -np.sort(-trembling, axis=2)[:, :, [x.shape[2] // 4]]
+    return np.minimum(limit / trembling, 1)
+
+
+def defined(form: SweepFormat, digits: np.ndarray, mains: bool, scale: float = 0.1, cap: bool = True) -> np.ndarray:
+    """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128.
+
+    Of each tenth of the taxels' mean what offset and mains fit best is taken away; Hann's window, a transform at half
+    bins, the mean of each band.
+    """
+    x, length = digits.reshape(len(digits), form.window, -1).astype(np.float64), form.window // 10
+    wave = scale * (x * turned(x) if cap else x).mean(2)[:, : 10 * length].reshape(-1, length)
+    turn = 2 * np.pi * 50 / form.rate_hz * np.arange(length)
+    fits = np.stack([np.ones(length), np.sin(turn), np.cos(turn)][: 3 if mains else 1], axis=1)
+    wave = wave - (fits @ np.linalg.lstsq(fits, wave.T, rcond=None)[0]).T
+    window = np.hanning(length + 2)[1:-1]
+    power = np.abs(np.fft.fft(wave * window, 2 * length)) ** 2 / (window**2).sum()
+    edges = sorted({round(2 * ((length + 1) / 2) ** (i / 24)) for i in range(25)})
+    bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(len(digits), 10, -1)
+    return np.log(bands.cumsum(1) / np.arange(1, 11)[:, None] + 1e-4)
+
+
+@pytest.mark.parametrize(("form", "mains"), FORMS.values(), ids=FORMS)
+def test_the_spectrum_is_that_of_its_definition(form: SweepFormat, mains: bool):
+    """In PyTorch, in the graph, in the graph of tenths; the mains are taken away where a tenth holds two periods."""
+    digits = drawn(form)
+    want = defined(form, digits, mains)
+    rows, whole = graph_builder.run(trunk(form, tenths=True), digits), graph_builder.run(trunk(form), digits)
+    assert rows.shape == want.shape == (2, 10, spectrum.count(form))
+    np.testing.assert_allclose(rows, want, atol=2e-3)
+    np.testing.assert_allclose(whole, want[:, -1], atol=2e-3)
+    np.testing.assert_allclose(heard(form, digits), whole, atol=1e-3)
+    if mains:
+        assert np.abs(defined(form, digits, False) - want).max() > 0.1
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16"])
+def test_a_noisy_taxel_is_turned_down_as_for_the_trunk(dtype: str):
+    """Behind the trunk's own features, in float and in int8; without the cap it would be heard."""
+    form = SweepFormat(4, 4, 750.0, 600, dtype)
+    digits = drawn(form)
+    digits[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, digits.shape[:2])
+    want = defined(form, digits, True)
+    assert turned(digits.reshape(2, 600, 16).astype(float)).min() < 0.8
+    assert np.abs(defined(form, digits, True, cap=False) - want).max() > 0.3
+    np.testing.assert_allclose(heard(form, digits), want[:, -1], atol=2e-3)
+    plain = Compact(form, 3, 0.1, norm=False, shape=SMALL).eval()
+    weights, reach, size = plain.weights(), plain.reach(digits), want.shape[2]
+    for ranges in (None, reach):
+        for tenths in (False, True):
+            both, alone = (
+                graph_builder.run(graph.trunk(form, 0.1, weights, shape, ranges, tenths), digits)
+                for shape in (SMALL.cut(3, True), SMALL)
+            )
+            np.testing.assert_array_equal(both[..., :-size], alone)
+            np.testing.assert_allclose(both[..., -size:], want if tenths else want[:, -1], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "window", "deaf"), [(750.0, 1500, True), (200.0, 450, True), (750.0, 200, False), (150.0, 450, False)]
+)
+def test_the_hum_of_the_mains_changes_nothing(rate_hz: float, window: int, deaf: bool):
+    """50 Hz of any phase and any strength on each taxel, where it can be told; 60 Hz is heard everywhere."""
+    form = SweepFormat(2, 2, rate_hz, window, "float32")
+    digits, rng = drawn(form), np.random.default_rng(1)
+    strength, phase = rng.uniform(35, 45, (2, 1, 2, 2)), rng.uniform(0, 1, (2, 1, 1, 1))
+    for hz, silent in ((50.0, deaf), (60.0, False)):
+        hum = strength * np.sin(2 * np.pi * (hz / rate_hz * np.arange(window)[:, None, None] + phase))
+        hummed = (digits + hum).astype(np.float32)
+        for ask in (heard, lambda form, x: graph_builder.run(trunk(form, tenths=True), x)):
+            apart = np.abs(ask(form, hummed) - ask(form, digits)).max(-1)
+            assert (apart < 5e-3).all() if silent else (apart > 0.5).all()
+
+
+def test_later_frames_and_offsets_do_not_matter():
+    """Row d is of the first d + 1 tenths alone, to the bit; what is left over at the end is not looked at; a skin that
+    is loaded more has the same spectrum."""
+    digits = drawn(ODD)
+    held, late = digits.copy(), digits.copy()
+    held[:, 64:], late[:, 160:] = held[:, 63:64], 91
+    a, b, c, d = (graph_builder.run(trunk(ODD, tenths=True), x) for x in (digits, held, late, digits + np.int16(300)))
+    np.testing.assert_array_equal(a[:, :4], b[:, :4])
+    assert (np.abs(a[:, 4:] - b[:, 4:]).max(2) > 1e-3).all()
+    np.testing.assert_array_equal(a, c)
+    np.testing.assert_allclose(a, d, atol=5e-3)
+    np.testing.assert_allclose(heard(ODD, digits), heard(ODD, digits + np.int16(300)), atol=5e-3)
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_silence_is_finite(name: str):
+    """No power at all but what is added to each band, whatever the offset."""
+    form, _ = FORMS[name]
+    quiet = np.stack([np.full((form.window, form.rows, form.cols), level, form.dtype) for level in (0, 90)])
+    for have in (
+        heard(form, quiet),
+        graph_builder.run(trunk(form), quiet),
+        graph_builder.run(trunk(form, tenths=True), quiet),
+    ):
+        np.testing.assert_allclose(have, np.log(1e-4), atol=1e-3)
+
+
+def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
+    """What the graph makes of a few numbers is one constant when it is loaded; the file stays below 10 kB for 180 kB."""
+    model = trunk(skin.FORMAT)
+    assert len(model.SerializeToString()) < 10_000
+    options = onnxruntime.SessionOptions()
+    options.optimized_model_filepath, options.log_severity_level = str(tmp_path / "optimized.onnx"), 3
+    onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    optimized = onnx.load(tmp_path / "optimized.onnx").graph
+    done = Counter(n.op_type for n in optimized.node)
+    assert not {"Range", "Mod", "Cos", "Sin", "Less", "And", "Not"} & set(done)
+    assert [150, 2 * 149] in [list(c.dims) for c in optimized.initializer]
+
+
+def test_a_window_too_short_has_no_spectrum():
+    """Less than four frames a tenth: none is counted, a fit has none, and the rung of nothing else refuses by name."""
+    short = replace(easy(12), samples=easy(12).samples[:, :39])
+    assert spectrum.count(short.format) == 0
+    made = fit.fit(short, 1, Recipe(steps=2))
+    assert (made.shape.spectrum, made.bands) == (False, 0)
+    assert made.shape.channels
+    rung = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]
+    with pytest.raises(FormatError, match="a window of 39 frames is too short for a spectrum; take another rung"):
+        rung.train(short, short.samples, 1)
+    enough = replace(easy(12), samples=easy(12).samples[:, :40])
+    assert spectrum.count(enough.format) == 3
+    assert rung.train(enough, enough.samples, 1).logits(enough.samples).shape == (36, 3)

@@ -1,0 +1,171 @@
+"""The room of float against int8: what is lost and how sure that is, what each tensor reaches and what saturates."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from onnx import numpy_helper
+
+from appliance.core.errors import FormatError
+from tests.factories.parity import close
+from tests.factories.sweep_sets import easy
+from train.export import export
+from train.models.compact import fit
+from train.models.compact.fit import Fit, Recipe
+from train.onnx_tools import layers, parity
+from train.onnx_tools.layers import Layer
+from train.onnx_tools.quantize import quantize
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    """A fit on a set that takes all int8 has."""
+    return fit.fit(close(), 1, Recipe(steps=60))
+
+
+def measured(fitted: Fit) -> parity.Parity:
+    """What its two forms do on its held-out sweeps."""
+    reference, int8 = export.graphs(fitted)
+    return parity.measure(int8, fitted.held.samples, fitted.held.labels, reference)
+
+
+def activations(found: parity.Parity) -> list[Layer]:
+    """Its rounded tensors behind convolutions, in order."""
+    return [layer for layer in found.layers if layer.kind == "activations" and layer.against == "float"]
+
+
+def booleans(n: int, wrong: list[int]) -> np.ndarray:
+    """All right but those."""
+    right = np.ones(n, bool)
+    right[wrong] = False
+    return right
+
+
+def test_what_is_lost_is_counted_in_pairs():
+    """Three sweeps lost, one won, by hand with Agresti's and Min's halves; no loss of a hundred is not certainly none."""
+    lost = parity.loss(booleans(50, [7]), booleans(50, [1, 2, 3]))
+    assert (lost.total, lost.float_right, lost.int8_right, lost.lost) == (50, 49, 47, pytest.approx(0.04))
+    middle = (3.5 - 1.5) / 52
+    reach = 1.96 * np.sqrt((5 / 52 - middle**2) / 52)
+    assert (lost.low, lost.high) == (pytest.approx(middle - reach), pytest.approx(middle + reach))
+    none = parity.loss(booleans(100, [4]), booleans(100, [4]))
+    assert (none.lost, none.low) == (0, pytest.approx(-none.high))
+    assert 0.01 < none.high < 0.03
+
+
+def test_the_interval_holds_what_it_promises():
+    """Of 400 draws of 80 sweeps, of which int8 loses 4 % and wins 2 %, at least 93 % of the intervals hold the truth."""
+    rng = np.random.default_rng(0)
+    held = 0
+    for _ in range(400):
+        kind = rng.choice(4, 80, p=[0.04, 0.02, 0.84, 0.1])  # lost, won, both right, both wrong
+        lost = parity.loss(np.isin(kind, (0, 2)), np.isin(kind, (1, 2)))
+        held += lost.low <= 0.02 <= lost.high
+    assert held >= 0.93 * 400
+
+
+def test_sweeps_that_fail_together_count_together():
+    """All losses in one of five recordings: less sure than if they lay anywhere."""
+    wrong = booleans(50, list(range(5)))
+    alone, together = (parity.loss(np.ones(50, bool), wrong, of) for of in (None, np.arange(50) // 10))
+    assert together.low <= alone.low
+    assert together.high > alone.high
+    assert parity.loss(np.ones(50, bool), wrong, np.arange(50) // 10) == together
+
+
+def test_differences_by_hand():
+    """A logit's common part tells nothing; the largest and the mean difference of a probability are of sweeps."""
+    want = np.float32([[1, 0], [0, 0.1]])
+    have = np.float32([[6, 5], [0.3, 0]])
+    apart = parity.compare(want, have)
+    moved = 1 / (1 + np.exp(-0.3)) - 1 / (1 + np.exp(0.1))
+    assert apart.agreement == 0.5
+    assert apart.probability_difference == pytest.approx(moved, abs=1e-6)
+    assert apart.probability_mean == pytest.approx(moved / 2, abs=1e-6)
+    assert (apart.logit_difference, apart.logit_mean) == (pytest.approx(0.2, abs=1e-6), pytest.approx(0.1, abs=1e-6))
+
+
+def test_tensors_are_told_as_pytorch_has_them(fitted: Fit):
+    """Percentiles and the share beyond reach of each stage, against its responses in PyTorch; weights of seven bits."""
+    found = measured(fitted)
+    model = fitted.network()
+    with torch.no_grad():
+        digits = torch.from_numpy(fitted.held.samples.astype(np.float32))
+        responses = [x.numpy() for x in model.responses(model.prepare(digits))]
+    stages = activations(found)
+    assert len(stages) == len(responses)
+    for layer, x in zip(stages, responses, strict=True):
+        np.testing.assert_allclose(layer.percentiles, np.percentile(x, layers.PERCENTILES), atol=1e-4)
+        assert layer.low == 0
+        assert layer.high == pytest.approx(255 * layer.step)
+        assert layer.saturated == pytest.approx(np.mean(x > layer.high + layer.step / 2), abs=2e-4)
+        assert 20 < layer.sqnr_db < 50
+    weights = [layer for layer in found.layers if layer.kind == "weights"]
+    assert len(weights) == len(responses)
+    assert all(35 < layer.sqnr_db < 50 for layer in weights)
+
+
+def test_a_layer_that_saturates_is_the_one_that_is_named(fitted: Fit):
+    """A stage whose range is a fifth: its values are cut off, its signal drowns; those before are as they were."""
+    *before, last = fitted.reach.responses
+    broken = replace(fitted, reach=replace(fitted.reach, responses=(*before, last / 5)))
+    whole, cut = (activations(measured(one)) for one in (fitted, broken))
+    assert cut[:-1] == whole[:-1]
+    assert whole[-1].saturated < 0.005 < 0.1 < cut[-1].saturated
+    assert cut[-1].sqnr_db < 12 < whole[-1].sqnr_db
+
+
+def test_a_tap_that_was_moved_is_found(fitted: Fit):
+    """Taps that sum to zero, then one integer more: an offset can move the first convolution by it."""
+    _, int8 = export.graphs(fitted)
+    conv = next(n for n in int8.graph.node if n.op_type == "Conv")
+    maker = next(n for n in int8.graph.node if conv.input[1] in n.output)
+    held = next(c for c in int8.graph.initializer if c.name == maker.input[0])
+    taps = np.random.default_rng(0).integers(-4, 5, held.dims).astype(np.int8)
+    taps[..., -1] -= taps.sum(axis=2).astype(np.int8)
+    held.CopyFrom(numpy_helper.from_array(taps, held.name))
+    assert layers.tap_sum(int8) == 0
+    taps[2, 1, 0] += 1
+    held.CopyFrom(numpy_helper.from_array(taps, held.name))
+    assert layers.tap_sum(int8) == 1
+
+
+def test_any_quantized_graph_can_be_looked_at(fitted: Fit):
+    """What onnxruntime quantizes has its twins in the float graph, too, behind the ReLU."""
+    reference, _ = export.graphs(fitted)
+    int8 = quantize(reference, fitted.train.samples)
+    found = parity.measure(int8, fitted.held.samples, fitted.held.labels, reference)
+    assert len(activations(found)) == len(fitted.shape.channels)
+    assert all(layer.sqnr_db > 15 for layer in activations(found))
+    assert found.tap_sum > 0
+
+
+def test_a_bundle_is_told_without_float(fitted: Fit):
+    """Each tensor against itself, before it is rounded; a graph without int8 is named."""
+    reference, int8 = export.graphs(fitted)
+    found = parity.measure(int8, fitted.held.samples, fitted.held.labels)
+    assert (found.apart, found.lost, {layer.against for layer in found.layers}) == (None, None, {"itself"})
+    assert len(found.layers) >= len(fitted.shape.channels)
+    assert "holds no float form" in parity.table(found)
+    with pytest.raises(FormatError, match="no int8 tensors"):
+        parity.measure(reference, fitted.held.samples, fitted.held.labels)
+
+
+def test_the_command_tells_fits_and_bundles(fitted: Fit, tmp_path: Path):
+    """Table and JSON of both; a set of another kind is named."""
+    fitted.save(tmp_path / "fit.npz")
+    export.export(fitted, tmp_path / "bundle", "close", "1", "")
+    table = export.compared(tmp_path / "fit.npz", fitted.held, tmp_path / "told.json")
+    told = json.loads((tmp_path / "told.json").read_bytes())
+    assert told["lost"]["total"] == len(fitted.held)
+    assert len(told["layers"]) == len(measured(fitted).layers)
+    assert told["set"] == "close"
+    assert [line.split()[0] for line in table.splitlines()[:3]] == ["labels", "float", "first"]
+    assert "holds no float form" in export.compared(tmp_path / "bundle", fitted.held)
+    with pytest.raises(FormatError, match=r"fit.npz is of 2x2 uint8 .* name a set of the same kind"):
+        export.compared(tmp_path / "fit.npz", easy(dtype="int16"))

@@ -1,0 +1,368 @@
+"""The chart: what is on the front, what a graph costs, how dots are packed and measured, what the files hold."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper
+
+from appliance.bundle import bundle
+from appliance.core.clock import SystemClock
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
+from appliance.inference.classifier import Classifier
+from appliance.sim import skin
+from tests.factories.chart_data import DOTS, FRONT, dot
+from train.data.sets import SweepSet
+from train.evaluation.evaluate import Where
+from train.export import measure, measure_process
+from train.models import methods, minirocket
+from train.models.compact import graph
+from train.models.compact.architectures import LADDER
+from train.models.methods import Method
+from train.onnx_tools import cost
+from train.onnx_tools.graph_builder import Graph, Graphed, run
+from train.onnx_tools.quantize import quantize
+from train.reports import chart_page, chart_report, pareto, scatter
+
+FORM = SweepFormat(2, 2, 100.0, 40, "uint8")
+KEYS = ("method", "precision", "weights", "macs", "file_kb", "rss_mb", "ms_p50", "ms_p99", "touch_s", "runs_on_box")
+"""What the issue asks of each dot, beside `accuracy`."""
+
+
+def sweeps(kind: str = "uint8", n: int = 24) -> SweepSet:
+    """Sweeps of two materials at six positions, the second louder."""
+    labels = np.arange(n) % 2
+    noise = np.random.default_rng(5).standard_normal((n, 40, 2, 2)) * (2 + 18 * labels)[:, None, None, None]
+    groups = {"position": np.arange(n) // 4, "recording": np.arange(n)}
+    return SweepSet((100 + noise).clip(0, 255).astype(kind), labels, ("soft", "loud"), 100.0, groups, "small")
+
+
+def loudness(form: SweepFormat = FORM) -> onnx.ModelProto:
+    """A graph that tells the two apart: a convolution that takes differences, its mean size, a threshold."""
+    g, taxels = Graph(), form.rows * form.cols
+    x = g("Cast", g("Reshape", "sweep", g.constant([1, form.window, taxels], "int64")), to=TensorProto.FLOAT)
+    x = g("Transpose", x, perm=[0, 2, 1])
+    taps = np.zeros((3, taxels, 2))
+    taps[:, :, 0], taps[:, :, 1] = 1, -1
+    x = g("Relu", g("Conv", x, g.constant(taps), g.constant(np.zeros(3)), strides=[1]))
+    x = g("ReduceMean", x, axes=[2], keepdims=0)
+    g("Gemm", x, g.constant([[-1, 1]] * 3), g.constant([45, -45]), output="logits")
+    return g.model(form, "logits", 2)
+
+
+@dataclass
+class Loud:
+    """A model in two precisions."""
+
+    model: onnx.ModelProto
+    forms: dict[str, Graphed] = field(default_factory=dict)
+
+    def logits(self, given: np.ndarray) -> np.ndarray:
+        """As the graph says."""
+        return run(self.model, given)
+
+    def graph(self) -> onnx.ModelProto:
+        """The graph."""
+        return self.model
+
+
+def loud(calls: list[int]) -> Method:
+    """A method that needs no training; `calls` counts how often it was asked to."""
+
+    def train(known: SweepSet, given: np.ndarray, seed: int) -> Loud:
+        calls.append(seed)
+        return Loud(loudness(), {"int8": Graphed(quantize(loudness(), given))})
+
+    return Method("L-gauss", "for tests", "raw", train)
+
+
+# the front
+
+
+def test_the_front_is_what_no_other_dot_beats():
+    """Cheaper or more accurate than every other; a tie in one axis is decided by the other; equals stand together."""
+    assert pareto.front([(1, 0.9), (2, 0.8), (2, 0.95), (3, 0.95), (0.5, 0.1)]) == [True, False, True, False, True]
+    assert pareto.front([(1, 0.9), (1, 0.9)]) == [True, True]
+    assert pareto.front([(1, 0.8), (1, 0.9)]) == [False, True]
+    assert pareto.front([]) == []
+
+
+def test_dots_without_a_figure_are_not_placed():
+    """A dot that lacks the accuracy asked for is not there, and cannot be on the front."""
+    spots = pareto.placed(DOTS, "ms_p50", "lopo")
+    assert len(spots) == 5
+    assert [DOTS.index(spot[0]) for spot in spots if spot[3]] == FRONT["lopo"]
+    assert [spot[1] for spot in spots] == sorted(spot[1] for spot in spots)
+
+
+# costs
+
+
+def test_weights_and_multiply_accumulates_are_counted():
+    """A graph whose sums can be done by hand; int8 counts the same, scales and zero points are no weights."""
+    plain, whole = loudness(), quantize(loudness(), sweeps().samples)
+    assert cost.precision(plain) == "float"
+    assert cost.precision(whole) == "int8"
+    assert cost.macs(plain) == cost.macs(whole) == 39 * 3 * 4 * 2 + 3 * 2
+    assert cost.weights(plain) == cost.weights(whole) == 3 * 4 * 2 + 3 + 3 * 2 + 2
+
+
+def test_the_family_counts_its_costs_as_the_chart_does():
+    """What ladder.py says of a shape is what cost.py counts in its graphs, but for the means of the responses, and for
+    the spectrum: its part of the head, and the few numbers that it is made of."""
+    (method,) = methods.find(["compact-10k"], methods.Effort(share=0.0))
+    known = sweeps()
+    model = method.train(known, known.samples, 1)
+    told, bands = model.made.shape.cost(known.format, 2), model.made.bands
+    alone = graph.trunk(known.format, model.made.scale, {}, LADDER["bands"])
+    more = [count(alone) + 2 * bands if bands else 0 for count in (cost.weights, cost.macs)]
+    for one in (model, model.forms["float"]):
+        assert cost.weights(one.graph()) == told.weights + more[0]
+        assert cost.macs(one.graph()) == pytest.approx(
+            told.macs + more[1], rel=0.15
+        )  # a window so short has long means
+    assert cost.weights(alone) <= 7 * 4 + bands  # window, what is not heard (twice), shares of the bands
+
+
+def test_a_gru_a_kernel_and_neighbours_are_counted():
+    """One node each, by hand."""
+    nodes = {
+        "GRU": ([7, 1, 5], helper.make_node("GRU", ["x", "w", "r"], ["y"], hidden_size=4), 7 * 3 * 4 * (5 + 4)),
+        "CDist": ([1, 5], helper.make_node("CDist", ["x", "w"], ["y"], domain="com.microsoft"), 1 * 12 * 5),
+        "SVM": ([1, 5], helper.make_node("SVMClassifier", ["x"], ["y"], domain="ai.onnx.ml",
+                                         support_vectors=[0.0] * 15, coefficients=[0.0] * 3), 18),
+    }  # fmt: skip
+    for shape, node, expected in nodes.values():
+        held = [onnx.numpy_helper.from_array(np.zeros(of, np.float32), name)
+                for name, of in (("w", [1, 12, 5] if node.op_type == "GRU" else [12, 5]), ("r", [1, 12, 4]))]  # fmt: skip
+        x = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
+        y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
+        graph = helper.make_graph([node], "one", [x], [y], held)
+        domains = [helper.make_opsetid(name, v) for name, v in (("", 17), ("ai.onnx.ml", 3), ("com.microsoft", 1))]
+        assert cost.macs(helper.make_model(graph, opset_imports=domains)) == expected
+
+
+def test_a_graph_of_unknown_shapes_is_refused():
+    """A product of something whose shape nobody knows: it is named, not counted as nothing."""
+    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 3])
+    w = onnx.numpy_helper.from_array(np.zeros((3, 2), np.float32), "w")
+    y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
+    model = helper.make_model(
+        helper.make_graph([helper.make_node("MatMul", ["x", "w"], ["y"], "product")], "g", [x], [y], [w])
+    )
+    with pytest.raises(FormatError, match=r"'product'.*'x' is not known"):
+        cost.macs(model)
+
+
+def test_the_transforms_of_features_are_counted():
+    """L: one of 1500 frames for each of 16 taxels; H: 40 short ones of 75; raw digits: none."""
+    assert cost.feature_macs("L", skin.FORMAT) == pytest.approx(16 * 1500 * np.log2(1500), abs=1)
+    assert cost.feature_macs("H", skin.FORMAT) == pytest.approx(16 * 40 * 75 * np.log2(75), abs=1)
+    assert cost.feature_macs("raw", skin.FORMAT) == 0
+
+
+# packing and measuring
+
+
+def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
+    """Both precisions load in the box's classifier and answer as the model; the second time nothing is trained."""
+    calls: list[int] = []
+    for _ in range(2):
+        made = measure.packed(loud(calls), sweeps(), 3, tmp_path / "kept")
+    assert calls == [3]
+    assert [(one.form, one.precision, one.runtime) for one in made] == [("", "float", "onnx"), ("int8", "int8", "onnx")]
+    for one in made:
+        box = Classifier(bundle.load(one.folder), SystemClock())
+        known = sweeps()
+        assert [box.logits(digits).argmax() for digits in known.samples] == known.labels.tolist()
+        assert one.window_s == 0.4
+        assert one.sizes()[0] == (one.folder / "model.onnx").stat().st_size < one.sizes()[1]
+
+
+def test_all_take_turns():
+    """Every round begins with another dot; each one's first sweep of a turn is not counted."""
+    order: list[str] = []
+    calls = {name: (lambda digits, name=name: order.append(name)) for name in "abc"}
+    took = measure.timed(calls, np.zeros((5, 1)), rounds=3, block=2)
+    assert "".join(order) == "aaabbbccc" + "bbbcccaaa" + "cccaaabbb"
+    assert {name: (len(ms), bool((ms > 0).all())) for name, ms in took.items()} == dict.fromkeys("abc", (6, True))
+
+
+def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
+    """Costs of a real bundle: the keys that the issue names, resident memory of Python with numpy and onnxruntime."""
+    made = measure.packed(loud([]), sweeps(), 1, tmp_path / "kept")
+    (told, _) = measure.measured(made, sweeps().samples, 2)
+    assert set(KEYS) <= told.keys()
+    assert told["runs_on_box"]
+    assert 15 < told["rss_mb"] < 150
+    assert 0 < told["ms_p50"] <= told["ms_p99"]
+    assert told["file_kb"] < told["bundle_kb"]
+    assert not measure._costs(made[0], np.ones(3), {"rss_mb": 400.0, "foreign": ["torch"]})["runs_on_box"]
+
+
+def test_what_does_not_run_by_itself_is_named(tmp_path: Path):
+    """A bundle that was altered on disk is refused with its name and reason."""
+    one, _ = measure.packed(loud([]), sweeps(), 1, tmp_path / "kept")
+    (one.folder / "model.onnx").write_bytes(b"no model")
+    with pytest.raises(measure.BundleError, match=r"L-gauss float does not run by itself.*was altered"):
+        measure.memory(one, sweeps().samples)
+
+
+def test_torch_runs_what_was_trained(tmp_path: Path):
+    """The network as TorchScript gives its own logits."""
+
+    class Network(torch.nn.Module):
+        def forward(self, digits: torch.Tensor) -> torch.Tensor:
+            return digits.flatten(1).float()[:, :2]
+
+    @dataclass
+    class Model:
+        network: torch.nn.Module
+
+    measure._torch(Model(Network()), sweeps(), 1, tmp_path)
+    digits = sweeps().samples[3]
+    assert measure_process.load(tmp_path)(digits).tolist() == digits.ravel()[:2].tolist()
+
+
+def test_aeon_runs_what_was_trained(tmp_path: Path):
+    """aeon's transform with the head that was trained on our graph of it gives the graph's logits."""
+    pytest.importorskip("aeon")
+    known = sweeps()
+    state = np.random.get_state()[1].copy()
+    model = minirocket.train(known, known.samples, 1)
+    measure._aeon(model, known, 1, tmp_path)
+    answer = measure_process.load(tmp_path)
+    assert answer(known.samples[1]) == pytest.approx(model.logits(known.samples[1:2])[0], abs=0.05)
+    assert (np.random.get_state()[1] == state).all()
+
+
+# joining
+
+
+def test_seeds_are_joined():
+    """Mean accuracy, mean ends of the intervals, sweeps of one seed."""
+    results = [{"window": {"right": right, "total": 100}, "interval": [right / 100 - 0.1, right / 100 + 0.05], "seed": seed}
+               for right, seed in ((80, 2), (90, 1))]  # fmt: skip
+    assert chart_report.joined(results) == {"mean": 0.85, "low": 0.75, "high": 0.9, "n": 100, "seeds": [1, 2]}
+
+
+def curve(severities: list[float], accuracy: list[float]) -> dict:
+    """One as stress.merge gives it."""
+    ends = {"low": [a - 0.1 for a in accuracy], "high": [min(a + 0.1, 1) for a in accuracy]}
+    return {"severities": severities, "accuracy": accuracy, "total": 216, "unit": "", "about": ""} | ends
+
+
+def test_stress_is_told_by_the_worst_and_at_the_targets():
+    """The worst is the lowest mean over severities above none; gain is the worse of both ways; noise is read at .3."""
+    curves = {
+        "noise": curve([0, 0.1, 0.3, 0.5], [0.9, 0.8, 0.7, 0.6]),
+        "hum": curve([0, 1, 2], [0.9, 0.5, 0.3]),
+        "gain-up": curve([0, 0.1, 0.3], [0.9, 0.9, 0.7]),
+        "gain-down": curve([0, 0.2], [0.9, 0.85]),
+        "dead": curve([0, 1, 2], [0.9, 0.88, 0.1]),
+    }
+    told = chart_report.under_stress({"curves": curves, "seeds": [1, 2]})
+    assert (told["stress"]["name"], told["stress"]["mean"], told["stress"]["n"]) == ("hum", 0.4, 108)
+    means = {key: entry["mean"] for key, entry in told.items()}
+    assert means["stress:none"] == 0.9
+    assert means["stress:noise"] == 0.7
+    assert means["stress:gain"] == 0.8
+    assert means["stress:dead"] == 0.88
+    assert "stress:lost" not in told
+
+
+def test_touch_time_is_read_or_refused(tmp_path: Path):
+    """A file of another kind is named."""
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps({"method": "compact", "early": {"share": 0.5}}))
+    assert chart_report.touch_shares([path]) == {"compact": 0.5}
+    path.write_text("[1]")
+    with pytest.raises(FormatError, match=r"results\.json: not what palpate-train certainty wrote"):
+        chart_report.touch_shares([path])
+
+
+def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
+    """A small chart end to end; real sweeps that nobody named are left out; kept, the accuracies are the same."""
+    parts = {
+        "lopo": chart_report.Part(("sim:T-REAL:1001:1",), "leave:position", ("position<=2",)),
+        "force": chart_report.FULL.parts["force"],
+    }
+    chart = chart_report.Chart(
+        parts, "sim:T-REAL:1001:2", "sim:T-LAB:1002:1", ("L-gauss", "nobody"), ("H-knn",), rounds=1
+    )
+    where = Where(1, "", tmp_path / "cache")
+    found = []
+    for one in (where, replace(where, kept=True)):
+        charting = chart_report.Charting(chart, one, lambda line: None)
+        found.append(charting.dots())
+        assert charting.left_out.keys() == {"nobody", "force"}
+    ((first,), (again,)) = found
+    assert first["accuracy"] == again["accuracy"]
+    assert {"lopo", "stress", "stress:none"} <= first["accuracy"].keys()
+    assert set(KEYS) | {"commit", "machine", "seeds"} <= first.keys()
+
+
+# what is written
+
+
+def test_the_files(tmp_path: Path):
+    """chart.json is a list of dots; picture and page name them; what is left out is said; quick is stamped."""
+    page = chart_report.write(tmp_path, DOTS, True, {"force": "no <data>"})
+    assert json.loads((tmp_path / "chart.json").read_text()) == DOTS
+    text = page.read_text()
+    assert "quick run" in text
+    assert "Left out: force (no &lt;data&gt;)" in text
+    assert "quick run" not in chart_page.html(DOTS, "")
+    assert not re.search(r'(src|href)="(?!#)|https?://(?!www\.w3\.org)|@import|url\((?!#)', text)
+    assert "{{" not in text
+
+
+def test_no_name_can_break_out_of_the_data():
+    """A label that looks like the end of a script stays text."""
+    odd = [dot("</script><b>", "float", 1.0, 0.5)]
+    text = chart_page.html(odd, "")
+    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    assert json.loads(data[1])["dots"][0]["method"] == "</script><b>"
+
+
+def test_the_picture_is_whole_and_names_do_not_collide():
+    """Well-formed, twice the same, in roles of colour; no two names overlap; the family is told by size."""
+    svg = scatter.chart(DOTS, ("hard", "lopo"))
+    assert svg == scatter.chart(DOTS, ("hard", "lopo"))
+    texts = list(ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text"))
+    said = [node.text for node in texts]
+    assert {"1k", "20k", "MiniRocket", "T-HARD, simulated", "T-REAL, simulated"} <= set(said)
+    assert "var(--accent" in svg
+    crowd = [dot(f"method-{i}", "float", 1 + i / 50, 0.9 + i / 1000, family="L and H") for i in range(12)]
+    texts = ElementTree.fromstring(scatter.chart([*crowd, *DOTS])).iter("{http://www.w3.org/2000/svg}text")
+    boxes = [box(node) for node in texts if (node.text or "").startswith("method-")]
+    assert 2 <= len(boxes) < 12  # the rest finds no place
+    for i, a in enumerate(boxes):
+        assert not any(a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3] for b in boxes[:i])
+
+
+def box(node: ElementTree.Element) -> tuple[float, float, float, float]:
+    """About where a text is."""
+    x, y, width = float(node.get("x", 0)), float(node.get("y", 0)), 5.0 * len(node.text or "")
+    side = re.search(r"text-anchor: (\w+)", node.get("style", ""))
+    left = x - {"start": 0, "middle": width / 2, "end": width}[side[1] if side else "start"]
+    return left, y - 8, left + width, y
+
+
+def test_the_front_of_the_picture_is_dark_and_the_rest_grey():
+    """Ours is in the accent colour where it is on the front, grey where it is not; others dark."""
+    spots = pareto.placed(DOTS, "ms_p50", "hard")
+    told = {pareto.name(spot[0]): scatter.colour(spot[0], spot[3]) for spot in spots}
+    assert told["compact-1k int8"] == scatter.ACCENT
+    assert told["compact-1k float"] == scatter.GREY
+    assert told["minirocket float in aeon"] == scatter.INK
+    assert told["minirocket float"] == scatter.GREY

@@ -1,0 +1,280 @@
+"""The paper's page: what is drawn together, how it is counted, what the page says, and that it needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from appliance.sim.skin import MATERIALS
+from train.evaluation.evaluate import Where
+from train.reports import html, paper_experiment, paper_page, paper_printed
+from train.reports.paper_experiment import Outcome, Part, Step
+
+SURE, VOID = 9.0, {"meta", "br", "!doctype", "path", "use"}
+FIGURES = [f"figure-{n}" for n in (4, 5, 6, 7, 9, 10, 11, 12, 13)] + ["methods"]
+
+
+class Reader(HTMLParser):
+    """All text of a page, and every tag that is not closed in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.links: list[str] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Remember what is open, and every address."""
+        self.links += [v or "" for k, v in attrs if k in ("href", "src", "xlink:href", "srcset")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        """What closes must be what opened last."""
+        if tag not in VOID and (not self.open or self.open.pop() != tag):
+            self.wrong.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        """Text as a reader sees it."""
+        self.text += data + " "
+
+
+def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: int = 3) -> Outcome:
+    """Made up: 4 sweeps of each material at each place, `right` of them named right, all others taken for the next."""
+    labels = np.tile(np.repeat(np.arange(6), 4), places)
+    place = np.repeat(np.arange(places), 24) + 10_000 * world
+    given = np.where(np.random.default_rng(world).random(len(labels)) < right, labels, (labels + 1) % 6)
+    confusion = np.zeros((6, 6), int)
+    np.add.at(confusion, (labels, given), 1)
+    told = {"part": part, "method": method, "world": world, "materials": list(MATERIALS), "machine": "abacus, 2 cores",
+            "confusion": confusion.tolist(), "fit_s": 1.5, "ms_p50": 0.25, "ran": "7 beads" if "cnn" in method else "",
+            "agreement": 1.0}  # fmt: skip
+    costs = [np.array([[1, 1.7], [7, 0.5]])] * 2 if "cnn" in method else []
+    return Outcome(part, method, world, labels, SURE * np.eye(6, dtype=np.float32)[given], place, costs, told)
+
+
+def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
+    """What `run` would tell of made-up outcomes, as it reads back from results.json."""
+    outcomes = [
+        outcome(p, m, w)
+        for p in paper_experiment.FULL
+        for m in (*paper_experiment.BASELINES, "compact")
+        for w in (1, 2)
+    ]
+    outcomes += [outcome(p, cnn, right=0.9) for p in ("lopo", "hard") if cnn]
+    about = {"quick": quick, "commit": "c0ffee<", "took_s": 3}
+    return json.loads(paper_experiment._lines(paper_experiment.summary(outcomes, paper_experiment.FULL) | about))
+
+
+@pytest.fixture(scope="module")
+def told() -> dict[str, Any]:
+    """A summary that many tests look at."""
+    return summary()
+
+
+@pytest.fixture(scope="module")
+def made(told: dict[str, Any]) -> tuple[str, dict[str, str]]:
+    """Its page and pictures."""
+    return paper_page.tell(told)
+
+
+def test_printed_numbers_are_the_papers():
+    """One of each figure by hand; rows of the confusion matrix sum to one, rounded; .917 is 55 of 60."""
+    assert [paper_printed.ACCURACY[p][m] for p, m in (("lab", "H-svm"), ("lopo", "H-knn"), ("random", "L-svm"),
+                                                ("hard", "L-knn"))] == [0.96, 0.75, 0.83, 0.58]  # fmt: skip
+    assert round(55 / 60, 3) == paper_printed.ACCURACY["hard"]["paper-cnn"]
+    assert np.allclose(paper_printed.CONFUSION.sum(1), 1, atol=0.011)
+
+
+def test_objects_begin_with_every_sweep_once_and_mix_nothing():
+    """Numbers in a row differ, are of one material and place, and as many as the smallest such group has."""
+    o = outcome("lopo", "H-svm")
+    keep = np.arange(len(o.labels)) != 5
+    labels, place = o.labels[keep], o.place[keep]
+    drawn = paper_experiment.objects(labels, place, seed=1)
+    assert drawn.shape == (71, 3)
+    assert drawn[:, 0].tolist() == list(range(71))
+    assert (labels[drawn] == labels[:, None]).all()
+    assert (place[drawn] == place[:, None]).all()
+    assert all(len(set(row)) == 3 for row in drawn.tolist())
+    assert np.array_equal(drawn, paper_experiment.objects(labels, place, seed=1))
+    assert not np.array_equal(drawn, paper_experiment.objects(labels, place, seed=2))
+
+
+def test_two_votes_say_what_the_first_said_and_a_product_can_be_better():
+    """Half of the sweeps are sure and right, half a little wrong: votes of two stay at .5, products go beyond it."""
+    o = outcome("lopo", "H-svm", right=1)
+    weak = np.arange(len(o.labels)) % 2 == 0
+    o.logits[weak] = np.eye(6)[(o.labels[weak] + 1) % 6]
+    by = paper_experiment.several([o])
+    assert [by["vote"][n][0] for n in (0, 1)] == [0.5, 0.5]
+    assert by["product"][0][0] == 0.5
+    assert by["product"][1][0] > 0.7
+    assert all(low <= mean <= high for lines in by.values() for mean, low, high in lines)
+
+
+def test_exploration_stops_when_it_is_sure():
+    """Sure sweeps need one; sweeps that know nothing take all four and are right one time in six."""
+    sure = outcome("lopo", "H-svm", right=1)
+    assert [e["sweeps"] for e in paper_experiment.explored([sure])] == [1, 1, 1]
+    assert all(e["share"][0] == 1 for e in paper_experiment.explored([sure]))
+    sure.logits[:] = 0
+    assert [(e["sweeps"], e["share"][0]) for e in paper_experiment.explored([sure])] == [(4, round(1 / 6, 4))] * 3
+
+
+def test_intervals_are_over_places():
+    """Eight places all right or all wrong are no 192 sweeps: the interval is far wider than of independent ones."""
+    place = np.repeat(np.arange(8), 24)
+    _, low, high = paper_experiment.estimate(place % 2 == 0, place)
+    assert high - low > 0.5
+
+
+def test_a_cost_curve_keeps_its_ends_in_few_points():
+    """4,000 iterations become at most 160 points: the first as it was, means later, x in order."""
+    cost = np.stack([np.arange(1, 4001), np.geomspace(2, 0.001, 4000)], axis=1)
+    thin = paper_experiment._thinned(cost)
+    assert len(thin) <= 160
+    assert np.allclose(thin[0], cost[0], atol=1e-4)
+    assert thin[-1, 0] > 3850
+    assert (np.diff(thin[:, 0]) > 0).all()
+    assert len(paper_experiment._thinned(cost[:1])) == 1
+
+
+def test_summary_pools_worlds_and_keeps_each_result(told):
+    """144 sweeps of two worlds, six places; printed beside it; every outcome in results, 11 confusion rows of 24."""
+    row = next(r for r in told["table"] if (r["part"], r["method"]) == ("lopo", "H-svm"))
+    assert (row["total"], row["worlds"], row["printed"], row["attachments"][0]) == (144, [1, 2], 0.86, 6)
+    assert row["share"][0] == round(row["right"] / 144, 4)
+    assert len(told["results"]) == 4 * 6 * 2 + 2
+    assert np.sum(told["confusion"]["H-svm"], 1).tolist() == [24] * 6
+    assert told["costs"] == {"paper-cnn": [[[1, 1.7], [7, 0.5]]] * 2}
+
+
+def test_the_page_is_one_file_that_a_phone_can_read(made):
+    """It parses, is as wide as its reader, follows light and dark, names no address, and its tables scroll."""
+    html, pictures = made
+    read = Reader(html)
+    assert (read.wrong, read.open) == ([], [])
+    assert all(link.startswith("#") for link in read.links)
+    assert not re.search(r"@import|url\((?!#)|<script|<link", html)
+    assert 'name="viewport" content="width=device-width' in html
+    assert "prefers-color-scheme: dark" in html
+    assert html.count("<table>") == html.count('<div class="wide"><table>')
+    assert all(svg in html and len(svg) < 150_000 for svg in pictures.values())
+
+
+def test_the_page_shows_every_figure_with_printed_beside_ours(told, made):
+    """Figures 4 to 7, 9 to 13 and the table of all; each number of ours with interval, printed value and difference."""
+    html, pictures = made
+    assert sorted(pictures) == sorted(FIGURES)
+    text = " ".join(Reader(html).text.split())
+    for row in told["table"]:
+        if row["printed"] is not None:
+            difference = f"{row['share'][0] - row['printed']:+.3f}".replace("0.", ".").replace("-", "−")
+            low, high = (f"{v:.3f}".removeprefix("0") for v in row["share"][1:])
+            value = f"{row['printed']:.3f}".removeprefix("0").removesuffix("0")
+            assert f"{low} – {high} {value} {difference} {row['right']} / {row['total']}" in text
+    for said in (
+        "simulated sweeps",
+        "c0ffee<",
+        "abacus, 2 cores",
+        "7 beads",
+        "55 of them",
+        ".819 to .964",
+        "60 sweeps",
+    ):
+        assert said in text
+
+
+def test_only_a_quick_run_says_that_it_means_nothing(told, made):
+    """The banner is there for --quick and not otherwise."""
+    assert "quick run" not in made[0]
+    assert 'class="stop"' in paper_page.tell(told | {"quick": True})[0]
+
+
+def test_hard_protocols_come_first(made):
+    """In the summary, and in the picture of all methods."""
+    html, pictures = made
+    assert html.index("T-REAL, leave one position out") < html.index("tested on T-HARD") < html.index("T-LAB, random")
+    assert pictures["methods"].index(">leave position<") < pictures["methods"].index(">random<")
+
+
+def test_a_plan_without_the_network_still_makes_a_page():
+    """Figures 9 to 11 need the paper's CNN; all others are there."""
+    html, pictures = paper_page.tell(summary(cnn=""))
+    assert set(FIGURES) - set(pictures) == {"figure-9", "figure-10", "figure-11", "figure-12"}
+    assert not Reader(html).wrong
+
+
+def test_the_network_without_means_is_called_so():
+    """Where only sweeps without means were given to it, the page shows that and says so."""
+    html, pictures = paper_page.tell(summary(cnn=paper_printed.CNNS[1]))
+    assert set(pictures) == set(FIGURES)
+    assert "Fig. 11: paper-cnn, means out" in html
+
+
+def test_text_of_others_is_escaped():
+    """Whatever a method or a machine is called, it cannot become a tag."""
+    assert "&lt;b&gt;" in html.text("<b>") + html.heading("x")
+    assert html.table(["<i>"], [["&"]]).count("&lt;i&gt;") == 1
+    assert "<title>a &lt; b</title>" in html.page("a < b")
+
+
+def test_plans_name_methods_and_parts_that_exist():
+    """Full and quick: every step's methods are known, its parts planned, and both hold every kind of figure.
+
+    The paper's experiment leaves out the other sizes of our own network, and its CNN in the form that is not printed.
+    """
+    known = set(paper_experiment.methods.every())
+    for parts, steps in (
+        (paper_experiment.FULL, paper_experiment.FULL_STEPS),
+        (paper_experiment.QUICK, paper_experiment.QUICK_STEPS),
+    ):
+        ran = {(part, m + step.means_removed * paper_printed.MEANS_OUT) for step in steps for part in step.parts
+               for m in step.methods}  # fmt: skip
+        left = known ^ {m.removesuffix(paper_printed.MEANS_OUT) for _, m in ran}
+        assert left == {m for m in known if m.startswith("compact-")} | {"paper-cnn-centred"}
+        assert {part for part, _ in ran} == set(parts) == set(paper_page.TITLES)
+        cnn = {(p, m) for p in paper_printed.ACCURACY for m in paper_printed.CNNS}
+        assert {(p, m) for p in paper_printed.ACCURACY for m in paper_printed.ACCURACY[p]} - cnn <= ran
+        assert {
+            ("lopo", paper_printed.CNNS[1]),
+            ("hard", paper_printed.CNNS[0]),
+            ("hard", paper_printed.CNNS[1]),
+        } <= ran
+
+
+def test_run_writes_everything_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A tiny plan writes page, pictures and results; a second run takes the kept folds and gives the same figures."""
+    real, one = "sim:T-REAL:100{w}:2", ("position<=1",)
+    parts = {
+        "lopo": Part((real,), "leave:position", 2, one),
+        "hard": Part((real, "sim:T-HARD:100{w}:2"), "split:set=0->1", 1, one),
+        "lab": Part(("sim:T-LAB:100{w}:2",), "random:2", 2),
+        "random": Part((real,), "random:2", 2, one),
+    }
+    monkeypatch.setattr(paper_experiment, "QUICK", parts)
+    monkeypatch.setattr(paper_experiment, "QUICK_STEPS", (Step(("L-gauss", "H-svm"), tuple(parts), (1,), 0.1),))
+    where, lines = Where(jobs=1, cache=tmp_path / "cache"), []
+    made = paper_experiment.run(tmp_path / "a", True, where, lines.append)
+    assert made == tmp_path / "a" / "index.html"
+    assert 'class="stop"' in made.read_text()
+    told = json.loads((tmp_path / "a" / "results.json").read_text())
+    assert {p.stem for p in made.parent.glob("*.svg")} == {f"figure-{n}" for n in (4, 5, 6, 7, 13)} | {"methods"}
+    assert len(told["results"]) == 8
+    assert len(lines) == 14
+    assert "4/4 random, world 1" in lines[-1]
+    assert all(" left" in line for line in lines)
+    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
+    paper_experiment.run(tmp_path / "b", True, where)
+    assert kept == {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
+    again = json.loads((tmp_path / "b" / "results.json").read_text())
+    assert told | {"took_s": 0} == again | {"took_s": 0}

@@ -1,0 +1,223 @@
+"""The picture of a sweep: what stands in it, for every grid and length; the same everywhere, nothing from outside."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from appliance.core.types import Frames, Status, Sweep, SweepFormat, load, save
+from tests.factories.recordings import record
+from tests.factories.sweep_sets import easy
+from train.reports import plot_style, sweep_plot
+
+SVG = "{http://www.w3.org/2000/svg}"
+ABOUT = {
+    "tare": [[1.5] * 4] * 4,
+    "verdict": {"status": "unsure", "label": "cork", "probability": 0.98765, "scores": [0.98765, 0.01235]},
+    "bundle": "9f3c2a1b",
+    "device": {"board": "readout", "serial": "A4", "firmware": [1, 4, 2]},
+    "clock": {"jitter_us": 41.23456},
+}
+
+
+def sweep(path: Path, fmt: SweepFormat, about: dict | None = None, seq: np.ndarray | None = None, **more) -> str:
+    """A recording of noise, a second after its start edge; its last taxel is silent."""
+    seq = np.arange(fmt.window) if seq is None else seq
+    taxels = np.random.default_rng(0).integers(0, 99, (len(seq), fmt.rows, fmt.cols)).astype(fmt.digits)
+    taxels[:, -1, -1] = 0
+    t_ns = (1e9 + seq * fmt.period_ns).astype(np.int64)
+    made = Sweep(7, 0, int(t_ns[-1]) + 1, Status.OK, Frames(t_ns, seq, taxels), **{"material": "cork"} | more)
+    save(path, made, fmt, about or {})
+    return str(path)
+
+
+def words(svg: str) -> str:
+    """All texts of a picture, a line each."""
+    return "\n".join(node.text or "" for node in ElementTree.fromstring(svg).iter(f"{SVG}text"))
+
+
+def drawn(path: Path, *more, **also) -> str:
+    """The picture of `sweep`."""
+    return sweep_plot.draw(sweep_plot.look(sweep(path, *more, **also)))
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> str:
+    """A picture of the paper's skin with all that a sidecar knows."""
+    fmt = SweepFormat(4, 4, 750.0, 1500, "uint8")
+    return drawn(tmp_path / "sweep-000017.npy", fmt, ABOUT, position="3", session="mon", lost=2)
+
+
+def test_the_picture_says_what_is_known(small: str):
+    """Label, places, file, format, losses, verdict, bundle, device, clock; numbers as they are; units at both fields."""
+    told = words(small)
+    for text in (
+        "cork, position 3, session mon", "sweep-000017.npy, sweep 7: ok", "4x4 uint8 at 750 Hz, window 1500",
+        "2 frames lost, filled in from their neighbours", "verdict: status unsure, label cork, probability 0.9877",
+        "bundle: 9f3c2a1b", "device: board readout, serial A4, firmware 1.4.2", "clock: jitter us 41.23", "grey: the skin at rest",
+        "digits over seconds after the start edge", "digits per √Hz over Hz", "what rounding to whole digits makes; without 1 that stand still",
+    ):  # fmt: skip
+        assert text in told, text
+    assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(told.split("\n"))
+
+
+def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
+    """A recording of before, with no sidecar's extras: nothing is said of rest, verdict or device."""
+    record(tmp_path / "1.npy", "a")
+    told = words(sweep_plot.draw(sweep_plot.look(str(tmp_path / "1.npy"))))
+    assert told.startswith("a\n1.npy, sweep 1: ok")
+    for text in ("rest", "verdict", "bundle", "device", "clock", "lost", "None"):
+        assert text not in told
+
+
+def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
+    """Well-formed, titled, drawn twice the same, in roles of colour, its pixels in itself, no text beyond its edges."""
+    fmt = SweepFormat(12, 12, 50.0, 40, "float32")
+    for svg in (small, drawn(tmp_path / "big.npy", fmt)):
+        root = ElementTree.fromstring(svg)
+        assert root.find(f"{SVG}title").text == "one sweep: cork" + (
+            ", position 3, session mon" if svg is small else ""
+        )
+        assert all(link.startswith(("#", "data:image/png;base64,")) for link in re.findall(r'href="([^"]*)"', svg))
+        assert ("data:image/png;base64," in svg) == (svg is not small)  # one image, not a shape for each of its pixels
+        assert "<style" not in svg
+        assert all("fill: var(--" in text.get("style") for text in root.iter(f"{SVG}text"))
+        assert not any(re.search(f"(?<!, ){colour}", svg) for colour in plot_style.ROLES.values())
+        _, _, width, height = map(float, root.get("viewBox").split())
+        for node in root.iter(f"{SVG}text"):
+            long = 0.5 * len(node.text or "") * float(re.search(r"font-size: ([\d.]+)px", node.get("style"))[1])
+            ends = float(node.get("x")) + long * np.array(
+                {"middle": (-0.5, 0.5), "end": (-1, 0)}.get(
+                    (re.search(r"text-anchor: (\w+)", node.get("style")) or "  ")[1], (0, 1)
+                )
+            )
+            assert -1 <= ends[0] < ends[1] + 1e-9 <= width + 1, node.text
+            assert 0 < float(node.get("y")) <= height, node.text
+    assert drawn(tmp_path / "big.npy", fmt) == svg
+
+
+def test_every_peak_is_in_the_line():
+    """Thinned to what can be seen: first and last step, the one frame that stands out, the order of time."""
+    digits = np.zeros(5000)
+    digits[[3210, 4321]] = 99, -99
+    time_s, seen = sweep_plot._thinned(np.arange(5000) / 750, digits)
+    assert len(seen) <= 2 * sweep_plot.FINEST
+    assert (seen.max(), seen.min()) == (99, -99)
+    assert time_s[seen.argmax()] == 3210 / 750
+    assert (np.diff(time_s) > 0).all()
+    assert len(sweep_plot._thinned(np.arange(9), digits[:9])[1]) == 9
+
+
+def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
+    """A sine of 100 Hz has its peak there, and its height as a density: amplitude over root of twice the bin's noise width."""
+    fmt = SweepFormat(1, 1, 750.0, 1500, "float32")
+    tone = 8 * np.sin(2 * np.pi * 100 * np.arange(1500) / 750)[:, None]
+    axes = sweep_plot.add(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
+    sweep_plot._spectrum(axes, tone, fmt)
+    hz, density = axes.lines[0].get_data()
+    assert hz[0] == 1
+    assert hz[-1] == 375
+    assert hz[density.argmax()] == 100
+    assert density.max() == pytest.approx(8 / np.sqrt(2) / np.sqrt(1.5), rel=0.01)  # Hann's noise width is 1.5 bins
+
+
+@pytest.mark.parametrize(
+    ("rows", "cols", "window", "dtype"),
+    [(1, 1, 1, "uint8"), (1, 1, 7, "float32"), (1, 64, 8, "int16"), (9, 1, 9, "uint16"), (8, 8, 30, "uint8"),
+     (5, 13, 3, "int16"), (255, 1, 40, "uint8"), (1, 255, 40, "float32"), (255, 255, 24, "uint8")],
+)  # fmt: skip
+def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: int, dtype: str):
+    """From one taxel and one frame to the largest skin there can be, in a file that a browser opens at once."""
+    svg = drawn(tmp_path / "a.npy", SweepFormat(rows, cols, 0.5, window, dtype))
+    ElementTree.fromstring(svg)
+    assert len(svg) < 2_000_000
+    assert ("no spectrum" in words(svg)) == (window < 8 or rows * cols == 1)
+    assert ("1,1" in words(svg).split("\n")) == (rows <= 8 and cols <= 8)
+
+
+@pytest.mark.parametrize("digits", [0, 255])
+def test_a_silent_skin_can_be_drawn(tmp_path: Path, digits: int):
+    """Nothing moves: no frequency has power, no axis is without length."""
+    fmt = SweepFormat(2, 2, 100.0, 300, "uint8")
+    still = np.full((300, 2, 2), digits, np.uint8)
+    save(tmp_path / "a.npy", Sweep(1, 0, 1, Status.OK, Frames(np.arange(300) * 10**7, np.arange(300), still)), fmt)
+    told = words(sweep_plot.draw(sweep_plot.look(str(tmp_path / "a.npy"))))
+    assert "no material" in told
+    assert "no spectrum: less than 8 frames, or nothing moves" in told
+
+
+@pytest.mark.parametrize("grid", [(2, 2), (9, 9)])
+def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: tuple[int, int]):
+    """Where the numbers jump there is a bar, as wide as the gap lasted; the spectrum is of the longest run without one."""
+    fmt = SweepFormat(*grid, 100.0, 400, "uint8")
+    whole = drawn(tmp_path / "a.npy", fmt)
+    seen = sweep_plot.look(sweep(tmp_path / "b.npy", fmt, seq=np.r_[0:300, 350:400]))
+    assert list(seen.gaps) == [299]
+    axes = sweep_plot.add(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
+    seen.span(axes)
+    (bar,) = axes.patches
+    assert (bar.get_x(), bar.get_width()) == (pytest.approx(3.99), pytest.approx(0.51))
+    heard = []
+    monkeypatch.setattr(sweep_plot, "_spectrum", lambda axes, taxels, form: heard.append(len(taxels)))
+    assert "grey bars: frames are missing" in words(sweep_plot.draw(seen))
+    assert heard == [300]
+    assert "grey bars" not in words(whole)
+
+
+def test_texts_are_shown_as_they_are(tmp_path: Path):
+    """Dollars are no formulas, signs of markup no markup, long texts end with …, what cannot be shown is a �."""
+    fmt = SweepFormat(1, 1, 50.0, 9, "uint8")
+    assert "$a_b$ <&>" in words(drawn(tmp_path / "a.npy", fmt, material="$a_b$ <&>"))
+    first = words(drawn(tmp_path / "a.npy", fmt, material="x" * 300)).split("\n")[0]
+    assert (len(first), first[-1]) == (80, "…")
+    s = easy(2)
+    object.__setattr__(s, "materials", ("a\x01b", "c", "d"))
+    s.save(tmp_path / "a.npz")
+    assert words(sweep_plot.draw(sweep_plot.look(str(tmp_path / "a.npz"), 0))).startswith("a�b, recording 0")
+
+
+def test_a_sweep_of_a_set_is_chosen_by_number(tmp_path: Path):
+    """Of a file, a simulated set, a folder: the one that training counts so; its groups are named."""
+    s = easy(4)
+    s.save(tmp_path / "s.npz")
+    seen = sweep_plot.look(str(tmp_path / "s.npz"), 11)
+    np.testing.assert_array_equal(seen.taxels, s.samples[11])
+    assert (seen.title, seen.since) == ("high, recording 11, speed 3", "seconds")
+    assert sweep_plot.look("sim:T-HARD:1001:1", 5).title == "foam, position 0, world 1001"
+    record(tmp_path / "box" / "0.npy", status=Status.GAP, frames=0)
+    record(tmp_path / "box" / "1.npy", "a", id=50)
+    assert sweep_plot.look(str(tmp_path / "box"), 0).taxels[0, 0, 0] == 50
+
+
+@pytest.mark.parametrize(
+    ("what", "number", "message"),
+    [
+        ("box/1.npy", 0, "box/1.npy is one sweep; leave --number away"),
+        ("box", None, "box holds 1 sweeps; choose one with --number, from 0 on"),
+        ("box", 1, "box holds 1 sweeps and none of number 1; choose one"),
+        ("box", -1, "none of number -1"),
+        ("s.npz", 12, "holds 12 sweeps and none of number 12"),
+        ("box/0.npy", None, "0.npy: has no frames, its status is gap; choose one that is ok"),
+        ("box/2.npy", None, "2.npy: the tare in its .json is no 2 x 3 numbers; write null there"),
+        ("box/3.npy", None, "3.npy: not a recorded sweep"),
+        ("gone.npz", 0, "gone.npz: not a sweep set"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(tmp_path: Path, what: str, number: int | None, message: str):
+    """What was asked for, why not, and what to try."""
+    easy(4).save(tmp_path / "s.npz")
+    record(tmp_path / "box" / "0.npy", status=Status.GAP, frames=0)
+    record(tmp_path / "box" / "1.npy")
+    if "2.npy" in what:
+        for name, tare in (("2", [[1, 2]]), ("4", "x"), ("5", [[1, 2, None]] * 2)):
+            record(tmp_path / "box" / f"{name}.npy")
+            save(tmp_path / "box" / f"{name}.npy", *load(tmp_path / "box" / f"{name}.npy"), {"tare": tare})
+            with pytest.raises(FormatError, match=f"{name}.npy: the tare in its .json is no 2 x 3 numbers"):
+                sweep_plot.look(str(tmp_path / "box" / f"{name}.npy"))
+    with pytest.raises(FormatError, match=message):
+        sweep_plot.look(str(tmp_path / what), number)

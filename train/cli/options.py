@@ -1,0 +1,83 @@
+"""The room of the options that several commands share. In: a parser, or what it read. Out: options, or what they mean."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from appliance.core.errors import FormatError
+from train.data import sets
+from train.evaluation import evaluate
+from train.models import methods
+
+SET = "FILE (.npz, .h5), a folder of recordings or sim:NAME[:SEED[-LAST][:SWEEPS]]; several are joined"
+LOG_EVERY_S = 30
+
+
+def add_set(command: argparse.ArgumentParser) -> None:
+    """--set and --only."""
+    command.add_argument("--set", action="append", required=True, metavar="SET", dest="sets", help=SET)
+    command.add_argument("--only", action="extend", nargs="+", default=[], metavar="NAME=VALUE",
+                         help="keep these sweeps: force=100,150, force<=180, material=Canvas,Linen")  # fmt: skip
+
+
+def add_effort(command: argparse.ArgumentParser) -> None:
+    """How long networks are trained."""
+    usual = methods.USUAL
+    command.add_argument("--effort", type=float, default=usual.share, metavar="SHARE",
+                         help="of the networks' usual iterations (1)")  # fmt: skip
+    command.add_argument("--paper-steps", type=int, metavar="N",
+                         help="iterations of the paper's CNN (4000 on a GPU, fewer on a processor)")  # fmt: skip
+    command.add_argument("--bfloat16", action="store_true", help="compute the paper's CNN in bfloat16 where that helps")
+
+
+def add_where(command: argparse.ArgumentParser) -> None:
+    """Where the work is done and kept."""
+    command.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
+    command.add_argument("--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster that does the work")
+    command.add_argument("--cache", type=Path, default=evaluate.CACHE, metavar="DIR",
+                         help=f"where finished folds are kept, so that an interrupted run goes on ({evaluate.CACHE})")  # fmt: skip
+
+
+def load(args: argparse.Namespace, seed: int = 1) -> sets.SweepSet:
+    """The sets named, joined and narrowed. seed: of simulated ones that name none."""
+    return sets.join([sets.load(spec, seed) for spec in args.sets]).select(args.only)
+
+
+def names(args: argparse.Namespace) -> tuple[str, ...]:
+    """The methods asked for."""
+    return tuple(methods.every()) if args.method == "all" else tuple(args.method.split(","))
+
+
+def seeds(args: argparse.Namespace) -> range:
+    """1 to --seeds. Raises FormatError where that is none."""
+    if args.seeds < 1:
+        raise FormatError(f"--seeds {args.seeds} is none; use 1 or more")
+    return range(1, args.seeds + 1)
+
+
+def effort(args: argparse.Namespace) -> methods.Effort:
+    """How long networks are trained."""
+    return methods.Effort(args.effort, args.paper_steps, args.bfloat16)
+
+
+def where(args: argparse.Namespace) -> evaluate.Where:
+    """Where the work is done and kept."""
+    return evaluate.Where(args.jobs, args.scheduler, args.cache, getattr(args, "kept", False))
+
+
+class Log:
+    """Tells how far it is: one line that is written over for eyes, one line in LOG_EVERY_S for a file."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+
+    def __call__(self, line: str) -> None:
+        """Tell `line`."""
+        if sys.stderr.isatty():
+            print(f"\r{line}\033[K", end="", file=sys.stderr, flush=True)
+        elif time.monotonic() - self._last > LOG_EVERY_S:
+            self._last = time.monotonic()
+            print(line, file=sys.stderr, flush=True)

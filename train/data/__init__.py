@@ -1,0 +1,1 @@
+"""Sweep sets: from files to arrays, checked, split and summed up."""

@@ -1,0 +1,140 @@
+"""The room of protocols: who is trained on and who is tested on. In: a text such as "leave:position". Out: a splitter.
+
+Each is a scikit-learn splitter over the sweeps' numbers: split(X, y, groups) -> pairs (training, test). `groups` are
+recordings there, and no splitter ever has pieces of one recording on both sides.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.model_selection import BaseCrossValidator, StratifiedGroupKFold
+
+from appliance.core.errors import FormatError
+from train.data.sets import SweepSet
+
+Array = NDArray[Any]
+Fold = tuple[Array, Array]
+FORMS = "random:FOLDS, leave:GROUP or split:GROUP=a,b->c"
+RANDOM = re.compile(r"random:(\d+)")
+LEAVE = re.compile(r"leave:(\w+)")
+SPLIT = re.compile(r"split:(\w+)=(-?\d+(?:,-?\d+)*)->(-?\d+(?:,-?\d+)*)")
+
+
+class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn ships no types
+    """Whole recordings drawn into `folds` parts, materials spread evenly: the paper's overestimate."""
+
+    def __init__(self, folds: int, seed: int) -> None:
+        self.folds, self.seed = folds, seed
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """How many folds there are."""
+        return self.folds
+
+    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
+        """Pairs (training, test) of sweep numbers. y: labels [N]; groups: recordings [N].
+
+        Raises FormatError where a material has fewer recordings than there are folds.
+        """
+        for label in np.unique(y):
+            if (n := len(np.unique(groups[y == label]))) < self.folds:
+                raise FormatError(
+                    f"random:{self.folds} needs {self.folds} recordings of each material; material {label} has {n}: "
+                    f"use random:{max(n, 2)} or less"
+                )
+        yield from StratifiedGroupKFold(self.folds, shuffle=True, random_state=self.seed).split(y, y, groups)
+
+
+class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
+    """Tested on one value of the group `name` at a time, trained on all others: leave-one-position-out and its kind."""
+
+    def __init__(self, name: str, group: Array) -> None:
+        self.name, self.group = name, group
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """How many values the group has."""
+        return len(np.unique(self.group))
+
+    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
+        """Pairs (training, test) of sweep numbers. Raises FormatError where the group cannot be left out."""
+        if (n := self.get_n_splits()) < 2:
+            raise FormatError(
+                f"leave:{self.name} needs two values of the group {self.name!r}; all sweeps have {self.group[0]} "
+                f"({n} value): choose another group"
+            )
+        for value in np.unique(self.group):
+            out = self.group == value
+            yield _checked(f"leave:{self.name}, {value} left out", ~out, out, y, groups)
+
+
+class TrainTest(BaseCrossValidator):  # type: ignore[misc]
+    """Trained on some values of the group `name`, tested on others: T-REAL against T-HARD, first block against last."""
+
+    def __init__(self, name: str, group: Array, train: Sequence[int], test: Sequence[int]) -> None:
+        self.name, self.group, self.train, self.test = name, group, tuple(train), tuple(test)
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """One."""
+        return 1
+
+    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
+        """The pair (training, test) of sweep numbers. Raises FormatError where a value is on both sides or unknown."""
+        there = np.unique(self.group)
+        for value in (*self.train, *self.test):
+            if value not in there:
+                raise FormatError(f"group {self.name!r} has no {value}; it has {', '.join(map(str, there[:20]))}")
+        if both := set(self.train) & set(self.test):
+            raise FormatError(f"{self.name}={min(both)} is on both sides of the split; name it once")
+        yield _checked(f"split:{self.name}", np.isin(self.group, self.train), np.isin(self.group, self.test), y, groups)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A protocol by its text. Raises FormatError where the text is none of FORMS."""
+
+    text: str
+
+    def __post_init__(self) -> None:
+        if not any(form.fullmatch(self.text) for form in (RANDOM, LEAVE, SPLIT)):
+            raise FormatError(f"protocol {self.text!r} cannot be read; use {FORMS}")
+        if (found := RANDOM.fullmatch(self.text)) and int(found[1]) < 2:
+            raise FormatError(f"protocol {self.text!r} has too few folds; use random:2 or more")
+
+    def splitter(self, sweeps: SweepSet, seed: int) -> BaseCrossValidator:
+        """The scikit-learn splitter for `sweeps`; seed: of random folds. Raises FormatError for an unknown group."""
+        if found := RANDOM.fullmatch(self.text):
+            return RandomFolds(int(found[1]), seed)
+        if found := LEAVE.fullmatch(self.text):
+            return LeaveOneGroupOut(found[1], sweeps.group(found[1]))
+        name, train, test = SPLIT.fullmatch(self.text).groups()  # type: ignore[union-attr]
+        return TrainTest(name, sweeps.group(name), *([int(v) for v in part.split(",")] for part in (train, test)))
+
+    def folds(self, sweeps: SweepSet, seed: int) -> list[Fold]:
+        """All pairs (training, test) of sweep numbers. Raises FormatError where `sweeps` cannot be split so."""
+        sweeps.of_several().of_whole_recordings()
+        return list(self.splitter(sweeps, seed).split(sweeps.samples, sweeps.labels, sweeps.group("recording")))
+
+    def clusters(self, sweeps: SweepSet) -> Array | None:
+        """Which sweeps [N] succeed or fail together, for the interval: the left-out groups, else recordings of several
+        windows; None where each sweep stands alone."""
+        if found := LEAVE.fullmatch(self.text):
+            return sweeps.group(found[1])
+        recording = sweeps.group("recording")
+        return recording if len(np.unique(recording)) < len(sweeps) else None
+
+
+def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Array) -> Fold:
+    """The masks as numbers, after a look at what would make the fold dishonest or empty."""
+    if shared := set(recordings[train].tolist()) & set(recordings[test].tolist()):
+        raise FormatError(
+            f"{what}: {len(shared)} recordings, {min(shared)} among them, would be trained on and tested on; "
+            "choose a group that does not cut recordings"
+        )
+    if len(np.unique(labels[train])) < 2:
+        raise FormatError(f"{what}: {train.sum()} sweeps of less than two materials are left to train on")
+    return np.flatnonzero(train), np.flatnonzero(test)

@@ -1,0 +1,1 @@
+"""Methods under protocols and corruptions, with intervals."""

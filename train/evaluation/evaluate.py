@@ -1,0 +1,180 @@
+"""The room of evaluation: method x protocol x fold x seed. In: a sweep set, methods, protocols. Out: one Result each.
+
+Every fold is one task, run where pool.py runs it and kept in a cache: what was interrupted goes on where it was.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.data.sets import SweepSet, digest
+from train.data.splitters import Protocol
+from train.evaluation import parallel
+from train.evaluation.fold import Fold, Task, key, run
+from train.metrics.score import Tally, fused, interval, provenance
+from train.models import methods
+from train.onnx_tools import parity
+
+Array = NDArray[Any]
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palpate"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a method did under a protocol with one seed. folds: in the order of the splitter. origin: the set's digest and
+    score.provenance."""
+
+    method: str
+    protocol: str
+    means_removed: bool
+    seed: int
+    sweeps: SweepSet = field(repr=False)
+    folds: list[Fold] = field(repr=False)
+    origin: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def refused(self) -> str:
+        """Why the method cannot work with this set; nothing else is known then."""
+        return next((fold.refused for fold in self.folds if fold.refused), "")
+
+    @property
+    def test(self) -> Array:
+        """Numbers [n] of the tested sweeps."""
+        return np.concatenate([fold.test for fold in self.folds])
+
+    @property
+    def logits(self) -> Array:
+        """Logits float32 [n, K] of the tested sweeps."""
+        return np.concatenate([fold.logits for fold in self.folds])
+
+    def json(self) -> dict[str, Any]:
+        """What scripts read; every count with its 95 % interval."""
+        logits, sweeps = self.logits, self.sweeps
+        confusion = np.zeros((len(sweeps.materials),) * 2, int)
+        np.add.at(confusion, (sweeps.labels[self.test], logits.argmax(1)), 1)
+        told: dict[str, Any] = {
+            "method": self.method, "protocol": self.protocol, "means_removed": self.means_removed, "seed": self.seed,
+        } | self._counts(logits)  # fmt: skip
+        if forms := self.folds[0].forms:
+            told["forms"] = {name: self._form(name) for name in forms}
+        times = {"fit_s": round(float(np.median([f.fit_s for f in self.folds])), 3),
+                 "ms_p50": round(float(np.median([f.ms for f in self.folds])), 4)}  # fmt: skip
+        ran = sorted({f.ran for f in self.folds} - {""})
+        return told | times | {
+            "folds": len(self.folds), "agreement": min(f.agreement for f in self.folds), "ran": ", ".join(ran),
+            "materials": list(sweeps.materials), "confusion": confusion.tolist(), "set": sweeps.source,
+            "format": asdict(sweeps.format),
+        } | self.origin  # fmt: skip
+
+    def _counts(self, logits: Array) -> dict[str, Any]:
+        """Right answers by window, and by recording where there are such."""
+        labels, recording = self.sweeps.labels[self.test], self.sweeps.group("recording")[self.test]
+        clusters = Protocol(self.protocol).clusters(self.sweeps)
+        clusters = None if clusters is None else clusters[self.test]
+        right = logits.argmax(1) == labels
+        told: dict[str, Any] = {"window": Tally.of(right).json(), "interval": interval(right, clusters)}
+        if "recording" in self.sweeps.groups:
+            whole, first = fused(logits, recording)
+            right = whole.argmax(1) == labels[first]
+            told["recording"] = Tally.of(right).json()
+            told["recording_interval"] = interval(right, None if clusters is None else clusters[first])
+        return told
+
+    def _form(self, name: str) -> dict[str, Any]:
+        """The same models in another precision: counts, how far the answers are apart (parity.Apart), and what accuracy
+        int8 loses against float, whichever of the two this form is (parity.Lost)."""
+        logits = np.concatenate([fold.forms[name] for fold in self.folds])
+        precise, int8 = (logits, self.logits) if name == "float" else (self.logits, logits)
+        labels, clusters = self.sweeps.labels[self.test], Protocol(self.protocol).clusters(self.sweeps)
+        right = [x.argmax(1) == labels for x in (precise, int8)]
+        lost = parity.loss(*right, None if clusters is None else clusters[self.test])
+        told = asdict(parity.compare(precise, int8)) | asdict(lost)
+        return self._counts(logits) | {key: round(value, 4) for key, value in told.items()}
+
+
+HEADER = f"{'method':<16} {'protocol':<22} means  {'windows':<30} {'recordings':<30} {'fit s':>7} {'ms':>7}"
+
+
+def line(told: dict[str, Any]) -> str:
+    """A result of Result.json() under HEADER."""
+    means = "out" if told["means_removed"] else "in"
+    counts = [_count(told["window"], told["interval"])]
+    counts.append(_count(told["recording"], told["recording_interval"]) if "recording" in told else "")
+    times = f"{told['fit_s']:>7.2f} {told['ms_p50']:>7.3f}"
+    return f"{told['method']:<16} {told['protocol']:<22} {means:<6} {counts[0]:<30} {counts[1]:<30} {times}"
+
+
+def _count(tally: dict[str, int], sure: Sequence[float]) -> str:
+    return f"{tally['right']}/{tally['total']} {tally['right'] / tally['total']:.3f} [{sure[0]:.3f}, {sure[1]:.3f}]"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to evaluate: every method under every protocol with every seed, and with what effort."""
+
+    methods: Sequence[str]
+    protocols: Sequence[str]
+    seeds: Sequence[int] = (1,)
+    means_removed: bool = False
+    effort: methods.Effort = methods.USUAL
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where folds run and are kept: see pool.results. cache None: nowhere. kept: none is run, those kept must do."""
+
+    jobs: int = -1
+    scheduler: str = ""
+    cache: Path | None = CACHE
+    kept: bool = False
+
+
+def evaluate(
+    sweeps: SweepSet, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
+) -> Iterator[Result]:
+    """Results as they are complete. Raises FormatError where a method or protocol is unknown or does not fit the set."""
+    known = methods.find(plan.methods, plan.effort)
+    sweeps = sweeps.without_means() if plan.means_removed else sweeps
+    origin = {"digest": digest(sweeps)} | provenance()
+    splits = {(p, s): Protocol(p).folds(sweeps, s) for p in plan.protocols for s in plan.seeds}
+    progress = parallel.Progress(len(known) * sum(map(len, splits.values())), log)
+    for kind in dict.fromkeys(method.input for method in known):
+        same = [method.name for method in known if method.input == kind]
+        tasks = {
+            (name, *split, i): Task(name, plan.effort, split[1], *fold)
+            for name in same for split, parts in splits.items() for i, fold in enumerate(parts)
+        }  # fmt: skip
+        done: dict[Any, Fold] = {}
+        for (name, protocol, seed, i), fold in folds(tasks, sweeps, origin["digest"], kind, where):
+            done[name, protocol, seed, i] = fold
+            progress(f"{name}, {protocol}, seed {seed}, fold {i + 1}")
+            whole = [done.get((name, protocol, seed, k)) for k in range(len(splits[protocol, seed]))]
+            if all(whole):
+                yield Result(name, protocol, plan.means_removed, seed, sweeps, whole, origin)  # type: ignore[arg-type]
+
+
+def folds(tasks: dict[Any, Task], sweeps: SweepSet, data: str, kind: str, where: Where) -> Iterator[tuple[Any, Fold]]:
+    """Every task's Fold: those in the cache first, then the others as they finish.
+
+    data: digest of `sweeps`. kind: what the tasks' methods are given of them.
+    """
+    paths = {name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache}
+    kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
+    yield from kept.items()
+    left = [named for named in tasks.items() if named[0] not in kept and not where.kept]
+    shared = (sweeps, methods.given(kind, sweeps)) if left else ()
+    for (name, _), fold in parallel.results(_run, left, shared, where.jobs, where.scheduler):
+        if where.cache:
+            fold.save(paths[name])
+        yield name, fold
+
+
+def _run(named: tuple[Any, Task], sweeps: SweepSet, given: Array) -> Fold:
+    return run(named[1], sweeps, given)

@@ -1,0 +1,190 @@
+"""The room of one fold. In: a method, sweeps to train on and sweeps to test on. Out: a Fold, with logits and times.
+
+A fold is kept under a name made of all that it depends on, the data, the code and the versions too.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import json
+import time
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from appliance.inference.session import session
+from train.data.sets import SweepSet
+from train.features import kinds
+from train.models import methods
+
+Array = NDArray[Any]
+TIMED_SWEEPS = 24
+"""How many test sweeps go one by one through the box's own session, for their time and to compare their labels."""
+NOT_COUNTED = (
+    "train.data.readers",
+    "train.data.sets",
+    "train.evaluation.evaluate",
+    "train.evaluation.parallel",
+    "train.metrics.score",
+    "train.models.methods",
+)
+"""Modules that methods use and that do not decide what a fold gives: their code may change and the fold still holds. Of
+the sets the data themselves count."""
+COUNTED = ("train", "appliance.signal")
+"""Packages whose code may change what a fold gives. The box's other code is compared with the desktop's by `agreement`."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One fold. train, test: numbers of sweeps."""
+
+    method: str
+    effort: methods.Effort
+    seed: int
+    train: Array
+    test: Array
+
+
+@dataclass(frozen=True)
+class Fold:
+    """What one fold gave. logits: float32 [n, K] of its test sweeps; ms: of one sweep, features and graph, the median.
+
+    agreement: share of the timed sweeps to which the exported graph gives the same label. ran: what was trained, where
+    the method has more to tell than its name. cost: the training's cross entropy, [iterations, 2], where it has one.
+    forms: logits float32 [n, K] of the same sweeps by the same model in other precisions.
+    refused: why the method cannot work with this set; all else is empty then.
+    """
+
+    test: Array
+    logits: Array
+    fit_s: float
+    ms: float
+    agreement: float
+    ran: str = ""
+    cost: Array = field(default_factory=lambda: np.empty((0, 2)))
+    refused: str = ""
+    forms: dict[str, Array] = field(default_factory=dict)
+
+    def save(self, path: Path) -> None:
+        """Write the fold, whole or not at all."""
+        packed = io.BytesIO()
+        forms = {FORM + name: logits for name, logits in self.forms.items()}
+        np.savez(packed, **{k: np.asarray(getattr(self, k)) for k in PLAIN}, **forms)
+        put(path, packed.getvalue(), parents=True)
+
+    @classmethod
+    def load(cls, path: Path) -> Fold | None:
+        """What `save` wrote; None where there is nothing that can be read."""
+        try:
+            with np.load(path, allow_pickle=False) as z:
+                held = {k: z[k] for k in PLAIN}
+                forms = {k.removeprefix(FORM): z[k] for k in z.files if k.startswith(FORM)}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        plain = {k: v.item() if v.ndim == 0 else v for k, v in held.items()}
+        return cls(**plain, forms=forms)
+
+
+FORM = "form "
+PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
+
+
+def run(task: Task, sweeps: SweepSet, given: Array) -> Fold:
+    """Train on one side, answer on the other. `given`: what the method's input asks for of all `sweeps`."""
+    (method,) = methods.find([task.method], task.effort)
+    start = time.perf_counter()
+    try:
+        model = method.train(sweeps.take(task.train), given[task.train], task.seed)
+    except FormatError as e:
+        return Fold(task.test, np.empty((0, len(sweeps.materials)), np.float32), 0.0, 0.0, 0.0, refused=str(e))
+    fit_s = time.perf_counter() - start
+    models = {"": model} | dict(getattr(model, "forms", {}))
+    answers = {name: np.asarray(one.logits(given[task.test]), np.float32) for name, one in models.items()}
+    if not all(np.isfinite(logits).all() for logits in answers.values()):
+        raise FormatError(f"{task.method} gave a logit that is no number; please report it with the set")
+    logits = answers.pop("")
+    some = task.test[np.linspace(0, len(task.test) - 1, min(TIMED_SWEEPS, len(task.test))).astype(int)]
+    ms, labels = _as_the_box(method, model, sweeps, some)
+    agreement = float(np.mean(labels == logits[np.searchsorted(task.test, some)].argmax(1)))
+    cost = np.asarray(getattr(model, "cost", []), float).reshape(-1, 2)
+    return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers)
+
+
+def _as_the_box(method: methods.Method, model: methods.Model, sweeps: SweepSet, some: Array) -> tuple[float, Array]:
+    """Median time in ms of one sweep through features and session, and the labels [n] that come out."""
+    graph = session(model.graph().SerializeToString())
+    name, times, labels = graph.get_inputs()[0].name, [], []
+    for digits in sweeps.samples[some]:
+        start = time.perf_counter()
+        x = kinds.given(method.input, digits, sweeps.rate_hz)
+        labels.append(int(graph.run(None, {name: x[None]})[0][0].argmax()))
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(times)), np.array(labels)
+
+
+def key(task: Task, data: str) -> str:
+    """A name for all that the fold depends on; data: the set's digest."""
+    (method,) = methods.find([task.method], task.effort)
+    about = [data, method.name, method.effort, task.seed, task.train.tolist(), task.test.tolist()]
+    return fingerprint(about, methods.module_of(method.name), "train.evaluation.fold")
+
+
+def fingerprint(about: Any, *modules: str) -> str:
+    """32 hex digits of `about` (for JSON), the code of `modules` and of all that these import here, and the libraries."""
+    versions = [version(name) for name in ("numpy", "scikit-learn", "torch")]
+    return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
+
+
+@cache
+def _code(modules: tuple[str, ...]) -> bytes:
+    """SHA-256 of the code, read once: a process goes on with what it began with."""
+    code = hashlib.sha256()
+    for module in sorted(reached(modules)):
+        code.update(_file(module).read_bytes())
+    return code.digest()
+
+
+def reached(modules: Sequence[str]) -> set[str]:
+    """`modules` and all that these import of the packages COUNTED, directly or not, but for NOT_COUNTED."""
+    found, left = set(NOT_COUNTED), list(modules)
+    while left:
+        if (module := left.pop()) not in found:
+            found.add(module)
+            left += _imported(module)
+    return found - set(NOT_COUNTED)
+
+
+def _file(module: str) -> Path:
+    spec = find_spec(module)
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError(f"{module} has no file")
+    return Path(spec.origin)
+
+
+def _imported(module: str) -> list[str]:
+    """The modules of COUNTED that `module` imports."""
+    tree = ast.parse(_file(module).read_bytes())
+    froms = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
+    names = [name for node in froms for name in (node.module or "", *(f"{node.module}.{a.name}" for a in node.names))]
+    return [name for name in names if name.startswith(tuple(f"{p}." for p in COUNTED)) and _is_module(name)]
+
+
+def _is_module(name: str) -> bool:
+    """Whether `name` is a module and not a package or something that stands in a module."""
+    try:
+        spec = find_spec(name)
+    except ModuleNotFoundError:  # its parent is a module, not a package
+        return False
+    return spec is not None and spec.submodule_search_locations is None

@@ -1,0 +1,102 @@
+"""The room where many tasks run at once. In: a function and its tasks. Out: what each gave, in the order of finishing.
+
+joblib runs them on this machine; with the address of a Dask scheduler its workers do. There the data is copied to every
+worker first: one that dies takes nothing along but what it was computing, and that is computed again elsewhere.
+(joblib's own Dask backend waits for ever when a task cannot be run any more; so the cluster is asked directly.)
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from typing import Any, TypeVar
+
+from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
+
+from appliance.core.errors import FormatError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+CONNECT_S = 10
+"""How long a scheduler may take to answer, and its first worker to come."""
+
+
+def results(
+    call: Callable[..., Result], tasks: Sequence[Task], shared: Sequence[Any], jobs: int = -1, scheduler: str = ""
+) -> Iterator[tuple[Task, Result]]:
+    """call(task, *shared) of every task, as they finish; each has one thread.
+
+    jobs: processes on this machine, -1 one for each core. scheduler: address of a Dask scheduler, whose workers then do
+    it all. What a task raises is raised here. Raises FormatError where no scheduler or no worker answers, or where
+    workers died so often that a task is given up, or where they lack this project.
+    """
+    if scheduler and tasks:
+        yield from _on_cluster(call, tasks, shared, scheduler)
+    elif tasks:
+        # a process whose libraries have grown is replaced; nothing is lost by it
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
+        yield from Parallel(jobs, return_as="generator_unordered", batch_size=1)(
+            delayed(_one)(task, call, *shared) for task in tasks
+        )
+
+
+def _one(task: Task, call: Callable[..., Result], *shared: Any) -> tuple[Task, Result]:
+    with threadpool_limits(1):  # sums in one order everywhere, and no core is fought for
+        return task, call(task, *shared)
+
+
+def _on_cluster(
+    call: Callable[..., Result], tasks: Sequence[Task], shared: Sequence[Any], scheduler: str
+) -> Iterator[tuple[Task, Result]]:
+    try:
+        from distributed import Client, KilledWorker, wait
+    except ImportError as e:
+        raise FormatError("--scheduler needs dask; install it with pip install 'palpate-train[dask]'") from e
+    try:
+        client = Client(scheduler, timeout=CONNECT_S)
+    except (OSError, ValueError) as e:
+        raise FormatError(f"no scheduler answers at {scheduler!r} ({e}); start one with: dask scheduler") from e
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=CONNECT_S)
+            everywhere = client.scatter(list(shared), broadcast=True) if shared else ()
+            left = {client.submit(_one, task, call, *everywhere, pure=False) for task in tasks}
+            while left:
+                with suppress(TimeoutError):  # a look at who is alive
+                    done = wait(left, timeout=CONNECT_S, return_when="FIRST_COMPLETED").done
+                    yield from (future.result() for future in done)
+                    left -= done
+                if left and not client.nthreads():
+                    raise TimeoutError
+        except TimeoutError as e:
+            start = f"dask worker {scheduler}"
+            raise FormatError(f"the scheduler at {scheduler!r} has no worker; start some with: {start}") from e
+        except RuntimeError as e:
+            if "deserialization" not in str(e):
+                raise
+            raise FormatError(
+                f"the cluster at {scheduler!r} lacks this version of palpate-train; install it there"
+            ) from e
+        except KilledWorker as e:
+            raise FormatError(f"the workers at {scheduler!r} died too often ({e}); see their logs and memory") from e
+
+
+class Progress:
+    """Tells how far it is and how long it will take, if the rest goes as what has been."""
+
+    def __init__(self, total: int, log: Callable[[str], None]) -> None:
+        self._total, self._log, self._done, self._start = total, log, 0, time.monotonic()
+
+    def __call__(self, what: str) -> None:
+        """One more is done."""
+        self._done += 1
+        left = (time.monotonic() - self._start) / self._done * (self._total - self._done)
+        self._log(f"{self._done}/{self._total} done, {spoken(left)} left ({what})")
+
+
+def spoken(seconds: float) -> str:
+    """A time as one says it."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

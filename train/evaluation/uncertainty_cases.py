@@ -1,0 +1,230 @@
+"""The room of certainty: how sure the box may be. In: a sweep set, a protocol, a method. Out: figures, pictures, a page.
+
+A Case is one training: all materials, or all but one, and what its trunk makes of every sweep, kept in a cache. All
+figures come from Cases without training again. What a rule, a limit or a temperature is found on is never tested on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import time
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from train.calibration.completion import seen
+from train.calibration.posthoc import Copies, Finish, finish
+from train.cli import options
+from train.data import sets
+from train.data.sets import SweepSet, digest, join
+from train.data.splitters import Protocol
+from train.evaluation import parallel, uncertainty
+from train.evaluation.evaluate import Where
+from train.evaluation.fold import fingerprint
+from train.metrics.score import provenance
+from train.models import methods
+from train.models.compact.fit import Fit
+from train.models.methods import Effort
+from train.onnx_tools.graph_builder import run as through
+from train.reports import uncertainty_report
+
+Array = NDArray[Any]
+Log = Callable[[str], None]
+NOBODY = -1
+"""The material left out where none is."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One training. train, test: numbers of sweeps; left_out: a material, or NOBODY."""
+
+    method: str
+    effort: Effort
+    seed: int
+    fold: int
+    train: Array
+    test: Array
+    left_out: int = NOBODY
+
+
+@dataclass(frozen=True)
+class Case:
+    """What one training gave. left_out: the material that it did not see. fixed: so many features nobody trained, last.
+
+    seen: features [N, 10, F] of the tenths of the training sweeps, whose materials are numbered `seen_labels` [N] from
+    0 on without the one left out; seen_groups [N]: positions or recordings; judged: bool [N], those that the trunk did
+    not see, which may judge. copied: features [M, F] of changed copies of the others, of copied_labels and copied_groups [M].
+    new, labels, places: features of test sweeps, the set's labels, and where the skin sat.
+    """
+
+    left_out: int
+    fold: int
+    fixed: int
+    seen: Array
+    seen_labels: Array
+    seen_groups: Array
+    judged: Array
+    copied: Array
+    copied_labels: Array
+    copied_groups: Array
+    new: Array
+    labels: Array
+    places: Array
+
+    def known(self) -> Array:
+        """bool [n], the test sweeps of materials that were trained."""
+        return self.labels != self.left_out
+
+    def finish(self) -> Finish:
+        """What is put on the trunk of this training."""
+        copies = Copies(self.copied, self.copied_labels, self.copied_groups)
+        return finish(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies)
+
+    def numbered(self) -> Array:
+        """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out mean nothing."""
+        if self.left_out == NOBODY:
+            return self.labels
+        return self.labels - (self.labels > self.left_out)
+
+
+def learn(task: Task, sweeps: SweepSet) -> Case:
+    """Train, and look at every sweep with the trunk that came out.
+
+    Raises FormatError where the method is none of the compact family, or cannot work with this set.
+    """
+    (method,) = methods.find([task.method], task.effort)
+    if methods.module_of(task.method) != "train.models.compact.methods":
+        raise FormatError(f"method {task.method!r} gives no features of tenths; use compact or one of its family")
+    kept = task.train[sweeps.labels[task.train] != task.left_out]
+    part = sweeps.take(kept)
+    if task.left_out != NOBODY:
+        others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
+        part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
+    made: Fit = method.train(part, part.samples, task.seed).made  # type: ignore[attr-defined]
+    *looked, fixed, copies = seen(made)
+    places = sweeps.groups.get("position", sweeps.group("recording"))
+    return Case(
+        task.left_out, task.fold, fixed, *looked, copies.features, copies.labels, copies.groups,
+        through(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
+    )  # fmt: skip
+
+
+def tasks(sweeps: SweepSet, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int) -> list[Task]:
+    """Every fold with all materials, and without each of them in turn where at least two remain."""
+    out = [NOBODY, *(range(len(sweeps.materials)) if len(sweeps.materials) > 2 else [])]
+    return [Task(method, effort, seed, i, *fold, left) for left in out for i, fold in enumerate(folds)]
+
+
+def cases(wanted: Sequence[Task], sweeps: SweepSet, where: Where, log: Log) -> list[Case]:
+    """The Case of each task in their order: kept ones from the cache, the others trained. log: is told how far it is."""
+    data, held = digest(sweeps), {}
+    keys = [fingerprint([data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
+                        methods.module_of(t.method), "train.calibration.completion") for t in wanted]  # fmt: skip
+    for i, key in enumerate(keys):
+        if where.cache and (case := _load(where.cache / f"{key}.case.npz")):
+            held[i] = replace(case, fold=wanted[i].fold)
+    left = [(i, task) for i, task in enumerate(wanted) if i not in held]
+    if left and where.kept:
+        raise FormatError(f"{len(left)} of {len(wanted)} trainings are not kept; run without --kept first")
+    progress = parallel.Progress(len(left), log)
+    for (i, task), case in parallel.results(_learn, left, (sweeps,), where.jobs, where.scheduler):
+        held[i] = case
+        if where.cache:
+            _save(case, where.cache / f"{keys[i]}.case.npz")
+        out = "" if task.left_out == NOBODY else f" without {sweeps.materials[task.left_out]}"
+        progress(f"{task.method}, fold {task.fold + 1}{out}")
+    return [held[i] for i in range(len(wanted))]
+
+
+def run(
+    sweeps: SweepSet, test: SweepSet | None, protocol: str, method: str, where: Where, log: Log,
+    effort: Effort = methods.USUAL, seed: int = 1,
+) -> dict[str, Any]:  # fmt: skip
+    """All figures, as results.json holds them. test: tested on this set; else `protocol` says what is left out.
+
+    Raises FormatError where the sets do not fit, or the method cannot do it.
+    """
+    start = time.monotonic()
+    if test is not None:
+        both = join([sweeps.of_several(), test])
+        protocol, whole_set = "split:set=0->1", both
+    else:
+        whole_set = sweeps
+    folds = Protocol(protocol).folds(whole_set, seed)
+    held = cases(tasks(whole_set, folds, method, effort, seed), whole_set, where, log)
+    log("figures")
+    told = uncertainty.figures(held, whole_set.materials, seed)
+    about = {
+        "set": sweeps.source, "test": test.source if test else "", "protocol": "train and test" if test else protocol,
+        "method": method, "effort": effort.share, "seed": seed, "folds": len(folds), "trainings": len(held),
+        "sweeps": len(whole_set), "tested": int(sum(len(test) for _, test in folds)), "digest": digest(whole_set),
+        "materials": list(whole_set.materials), "format": str(whole_set.format),
+        "took_s": round(time.monotonic() - start, 1),
+    }  # fmt: skip
+    return about | provenance() | told
+
+
+def write(told: dict[str, Any], out: Path) -> Path:
+    """results.json, the pictures and the page in the folder `out`; the page's path."""
+    page, pictures = uncertainty_report.tell(told)
+    put(out / "results.json", (json.dumps(told) + "\n").encode(), parents=True)
+    for name, svg in pictures.items():
+        put(out / f"{name}.svg", svg.encode(), parents=True)
+    put(out / "index.html", page.encode(), parents=True)
+    return out / "index.html"
+
+
+def register(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """The command `certainty`; add: as palpate-train adds its commands."""
+    one = add(
+        "certainty", command, "tell how sure a model may be: calibration, more sweeps, unknown materials, enrolment"
+    )
+    options.add_set(one)
+    one.add_argument("--test", metavar="SET", help="test on this set")
+    one.add_argument(
+        "--protocol", default="leave:position", help="what is tested on where --test is not given (leave:position)"
+    )
+    one.add_argument("--method", default="compact", metavar="NAME", help="compact or one of its family (compact)")
+    one.add_argument("--seed", type=int, default=1, help="of training and draws (1)")
+    one.add_argument(
+        "--out", type=Path, default=Path("docs/certainty"), metavar="DIR", help="where it goes (docs/certainty)"
+    )
+    one.add_argument("--kept", action="store_true", help="train nothing, tell what an earlier run has finished")
+    options.add_effort(one)
+    options.add_where(one)
+
+
+def command(args: argparse.Namespace) -> None:
+    """All of it; the page is named at the end."""
+    test = sets.load(args.test).select(args.only) if args.test else None
+    told = run(options.load(args), test, args.protocol, args.method, options.where(args), options.Log(),
+               options.effort(args), args.seed)  # fmt: skip
+    print(write(told, args.out))
+
+
+def _learn(numbered: tuple[int, Task], sweeps: SweepSet) -> Case:
+    return learn(numbered[1], sweeps)
+
+
+def _save(case: Case, path: Path) -> None:
+    packed = io.BytesIO()
+    np.savez(packed, **{k: np.asarray(getattr(case, k)) for k in Case.__dataclass_fields__})
+    put(path, packed.getvalue(), parents=True)
+
+
+def _load(path: Path) -> Case | None:
+    try:
+        with np.load(path, allow_pickle=False) as z:
+            held = {k: z[k] for k in Case.__dataclass_fields__}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return Case(**{k: v.item() if v.ndim == 0 else v for k, v in held.items()})

@@ -1,0 +1,210 @@
+"""The room of where the skin sat. In: a training set; a bundle and simulated sweeps. Out: a Place, and what moving costs.
+
+A Place goes into the bundle, so that the box can say how far a contact lies from those of training. How well that goes
+with accuracy is measured by `palpate-train placing`: the same sweeps again and again, with the skin ever further off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.bundle import bundle
+from appliance.core.clock import SystemClock
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from appliance.core.types import Frames, Status, Sweep
+from appliance.inference.classifier import Classifier
+from appliance.signal.contact import MOST_POSITIONS, Place, centre
+from appliance.sim import skin
+from train.calibration import novelty
+from train.cli import options
+from train.data.sets import SweepSet
+from train.evaluation.robustness_data import Trial
+from train.metrics.score import interval, provenance
+from train.reports import plot_style
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+LEAST = 1 / 8
+"""The limit is never below this share of the pitch: by so much another taping of the skin in the same place moves the
+centre (0.5 of 4 mm hold over 95 % of the simulated ones), whatever few or equal positions say."""
+OFF_MM = tuple(np.arange(0.5, 6.25, 0.5).tolist())
+"""How far the skin is moved."""
+WAYS = {"rows": "dx_mm", "columns": "dy_mm"}
+FALL = 0.05
+"""Accuracy counts as lost where it is so far below that of a skin in its place."""
+
+
+def place_of(sweeps: SweepSet, contact: float, pitch_mm: float | None = None) -> Place | None:
+    """Where the contact lay at each position of a training set (else at each recording); None where nothing says how
+    far apart the taxels are, or nothing touched them.
+
+    contact: the bundle's threshold. pitch_mm: of the skin; a simulated one's is known. The digits are taken as the box
+    takes them without a TARE: counted from the unloaded skin.
+    The limit keeps 97 % of positions whose own sweeps were left out (their farthest one counts), as known.limit takes
+    it; of 33 and less all.
+    """
+    if pitch_mm is None and all(part.startswith("sim:") for part in sweeps.source.split(" + ")):
+        pitch_mm = skin.PITCH_MM
+    if pitch_mm is None:
+        return None
+    tare = np.zeros(sweeps.samples.shape[2:])
+    found = [centre(window, tare, contact) for window in sweeps.samples]
+    touched = np.array([point is not None for point in found])
+    if not touched.any():
+        return None
+    points = np.array([point for point in found if point]) * pitch_mm
+    member = np.unique(sweeps.groups.get("position", sweeps.group("recording"))[touched], return_inverse=True)[1]
+    centres = np.stack([points[member == one].mean(axis=0) for one in range(member.max() + 1)])
+    limit = max(pitch_mm * LEAST, novelty.limit(farthest(points, member, centres)) if len(centres) > 1 else 0.0)
+    kept = centres[np.linspace(0, len(centres) - 1, min(len(centres), MOST_POSITIONS)).round().astype(int)].round(3)
+    return Place(float(pitch_mm), tuple(kept[:, 0].tolist()), tuple(kept[:, 1].tolist()), round(limit, 3))
+
+
+def farthest(points: Array, member: Array, centres: Array) -> Array:
+    """For each position [P] how far (mm) its farthest sweep lies from the nearest of the others: points [N, 2], of the
+    positions member [N], whose centres are [P, 2]."""
+    told = np.zeros(len(centres))
+    for one in range(len(centres)):
+        others = np.delete(centres, one, axis=0)
+        away = np.linalg.norm(points[member == one][:, None] - others, axis=2).min(axis=1)
+        told[one] = away.max()
+    return told
+
+
+def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[str], None]) -> Json:
+    """What the box says of simulated sweeps with the skin where it was not: sets of positions that were not trained
+    (`unseen`, which are then moved), of those that were (`seen`), and of T-HARD's. Raises FormatError where the bundle
+    has no positions."""
+    place = box.bundle.manifest.place
+    if place is None:
+        raise FormatError(f"bundle {box.bundle.id} has no positions to compare with; export it again")
+    told: Json = {"bundle": box.bundle.id, "limit_mm": place.limit_mm, "positions": len(place.rows_mm)}
+    told |= {name: _point(box, Trial.simulated(spec)) | {"set": spec} for name, spec in
+             (("trained positions, other sweeps", seen), ("other positions", unseen), ("T-HARD", hard))}  # fmt: skip
+    trial, told["moved"] = Trial.simulated(unseen), {}
+    for way, name in WAYS.items():
+        points = []
+        for mm in (*(-off for off in reversed(OFF_MM)), 0.0, *OFF_MM):
+            log(f"{way} {mm:+g} mm")
+            points.append({"mm": mm} | _point(box, trial, partial(_shifted, name=name, mm=mm)))
+        told["moved"][way] = points
+        told |= {f"{way}, {word}": _fall(part) for word, part in _halves(points)}
+    return told | provenance()
+
+
+def _shifted(placement: skin.Placement, name: str, mm: float) -> skin.Placement:
+    return replace(placement, **{name: getattr(placement, name) + mm})
+
+
+def _point(box: Classifier, trial: Trial, where: Callable[[skin.Placement], skin.Placement] = lambda p: p) -> Json:
+    """The box's answers to the trial's sweeps, with the skin moved. Sweeps of one taping count as together."""
+    assert trial.scene
+    sweeps, place, limits = trial.sweeps, box.bundle.manifest.place, box.bundle.manifest.thresholds
+    assert place
+    right, moved, wrong, told = (np.zeros(len(sweeps)) for _ in range(4))
+    for i, window in enumerate(trial.scene.draw(where)):
+        n = np.arange(len(window))
+        verdict = box(Sweep(i, 0, 0, Status.OK, Frames(n, n, window)))
+        right[i] = verdict.label == sweeps.materials[sweeps.labels[i]]
+        wrong[i], moved[i] = bool(verdict.label) and not right[i], bool(verdict.moved)
+        found = centre(window, box.tare, limits.contact)
+        told[i] = np.hypot(*place.offset(found)) if found else np.nan
+    taping = sweeps.group("position")
+    return {
+        "n": len(sweeps), "tapings": len(np.unique(taping)), "accuracy": _share(right, taping),
+        "moved": _share(moved, taping), "wrong": int(wrong.sum()), "wrong_unflagged": int((wrong * (1 - moved)).sum()),
+        "told_mm": round(float(np.nanmedian(told)), 2) if np.isfinite(told).any() else None,
+    }  # fmt: skip
+
+
+def _share(values: Array, taping: Array) -> list[float]:
+    """Mean and its 95 % interval."""
+    return [round(float(values.mean()), 4), *interval(values, taping)]
+
+
+def _halves(points: Sequence[Json]) -> Iterator[tuple[str, list[Json]]]:
+    """Points from 0 outwards, each way."""
+    middle = len(points) // 2
+    yield "forwards", list(points[middle:])
+    yield "backwards", list(points[middle::-1])
+
+
+def _fall(points: Sequence[Json]) -> Json:
+    """The first displacement where accuracy has fallen by FALL, and how many sweeps are flagged there and one before."""
+    at_home = points[0]["accuracy"][0]
+    for before, point in pairwise(points):
+        if point["accuracy"][0] <= at_home - FALL:
+            return {"lost_at_mm": abs(point["mm"]), "moved": point["moved"], "moved_before": before["moved"]}
+    return {"lost_at_mm": None, "moved": points[-1]["moved"], "moved_before": points[-2]["moved"]}
+
+
+def chart(told: Json) -> str:
+    """Share right and share flagged over how far the skin was moved, along the finger and across: SVG."""
+    figure, height = plot_style.Figure((plot_style.WIDTH, 4.7)), 4.7
+    for number, (way, points) in enumerate(told["moved"].items()):
+        top = 1 - (0.5 + 2.15 * number) / height
+        axes = plot_style.add(figure, 0.09, 0.97, top, top - 1.45 / height)
+        mm = [point["mm"] for point in points]
+        for name, colour, said, up in (
+            ("accuracy", plot_style.ACCENT, "named rightly", 0.85), ("moved", plot_style.INK, "flagged\nas moved", 0.58),
+        ):  # fmt: skip
+            mean, low, high = np.array([point[name] for point in points]).T
+            axes.fill_between(mm, low, high, color=colour, alpha=0.13, linewidth=0)
+            axes.plot(mm, mean, color=colour, linewidth=2, linestyle="-" if name == "accuracy" else (0, (4, 1.5)))
+            plot_style.write(axes, 0, up, said, colour, plot_style.SMALL)
+        axes.set(xlim=(mm[0], mm[-1]), ylim=(-0.03, 1.03))
+        axes.grid(axis="y", color=plot_style.FAINT, linewidth=0.8)
+        plot_style.scale(axes.yaxis, (0, 0.5, 1))
+        plot_style.scale(axes.xaxis, range(-6, 7, 2))
+        along = {"rows": "along the finger, towards row 4", "columns": "across, towards column 4"}[way]
+        plot_style.write(axes, mm[0], 1.17, f"skin moved {along}", ha="left")
+        if number:
+            plot_style.write(
+                axes, 0, -0.28, "mm from a place like those of training", plot_style.GREY, plot_style.SMALL
+            )
+    n, tapings = (told["moved"]["rows"][0][name] for name in ("n", "tapings"))
+    return plot_style.svg(
+        figure, f"Share of {n} simulated sweeps ({tapings} tapings) that are named rightly, and flagged as moved"
+    )
+
+
+def register(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """The command `palpate-train placing`."""
+    one = add("placing", run, "tell whether a skin that has moved is flagged before accuracy is lost (simulated)")
+    one.add_argument("--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)")
+    one.add_argument("--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on")
+    one.add_argument("--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places")
+    one.add_argument("--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead")
+    one.add_argument("--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure, write, and say the least of it."""
+    box = Classifier(bundle.load(args.bundle), SystemClock())
+    told = measure(box, args.unseen, args.seen, args.hard, options.Log())
+    args.out.mkdir(parents=True, exist_ok=True)
+    put(args.out / "place.json", (json.dumps(told, indent=1) + "\n").encode(), parents=True)
+    put(args.out / "place.svg", (chart(told) + "\n").encode(), parents=True)
+    print("\n".join(lines(told)))
+
+
+def lines(told: Json) -> Iterator[str]:
+    """For a person: accuracy and share flagged, with intervals, at each displacement."""
+    yield f"bundle {told['bundle']}, {told['positions']} positions, limit {told['limit_mm']} mm"
+    named = {k: v for k, v in told.items() if isinstance(v, dict) and "tapings" in v}
+    rows = [(name, point) for name, point in named.items()]
+    rows += [(f"{way} {p['mm']:+.1f} mm", p) for way, points in told["moved"].items() for p in points]
+    for name, point in rows:
+        right, moved = ("{:.3f} [{:.3f}, {:.3f}]".format(*point[key]) for key in ("accuracy", "moved"))
+        yield f"{name:<32} n {point['n']:>4}  right {right}  moved {moved}  told {point['told_mm']} mm"

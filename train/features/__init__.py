@@ -1,0 +1,1 @@
+"""Features of prior work, which the box does not compute."""

@@ -1,0 +1,35 @@
+"""All feature sets by name: those the box computes, and those of prior work, for the desktop alone. In: raw counts of
+one sweep's window, frame rate. Out: float32 features. A bundle may name only a feature set of appliance.signal.features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.signal import features
+from train.features import prior_work
+
+Array = NDArray[np.float64]
+KINDS: Mapping[str, Callable[[NDArray[Any], float], Array]] = MappingProxyType(
+    features.KINDS
+    | {
+        "static": prior_work.static,
+        "spectrogram": prior_work.spectrogram,
+        "correlation": prior_work.correlation,
+    }
+)
+
+
+def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float32]:
+    """The feature set `kind` of KINDS of raw counts [T, R, C] at `rate_hz`, as float32 [n]. Raises FormatError."""
+    return features.compute(kind, taxels, rate_hz, KINDS)
+
+
+def given(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
+    """What a graph with the input `kind` is given of raw counts [T, R, C]: them where it is "raw", else `compute`."""
+    return features.given(kind, taxels, rate_hz, KINDS)

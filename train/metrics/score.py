@@ -1,0 +1,82 @@
+"""The room of counting: right answers of how many, and how sure that is. In: right or wrong, logits. Out: figures."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.provenance import commit
+from appliance.core.statistics import wilson
+from appliance.inference.classifier import LEAST_PROBABILITY, softmax
+
+Array = NDArray[Any]
+DRAWS = 2000
+"""Of the bootstrap."""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """`right` of `total`."""
+
+    right: int
+    total: int
+
+    @classmethod
+    def of(cls, right: Array) -> Tally:
+        """Of booleans [n]."""
+        return cls(int(right.sum()), len(right))
+
+    def json(self) -> dict[str, int]:
+        """As scripts read it."""
+        return {"right": self.right, "total": self.total}
+
+
+def interval(right: Array, clusters: Array | None = None) -> tuple[float, float]:
+    """The 95 % interval of the share of `right` [n] (booleans, or shares over seeds).
+
+    Without clusters it is Wilson's. Where sweeps succeed or fail together, as those of one position do (clusters [n]),
+    it is the bootstrap's over clusters (percentiles of 2,000 draws), or Wilson's where that is wider: a bootstrap of
+    few clusters, or where all is right, is too sure.
+    """
+    low, high = widened(wilson(float(right.sum()), len(right)), right, clusters)
+    return round(float(max(low, 0.0)), 4), round(float(min(high, 1.0)), 4)
+
+
+def widened(sure: tuple[float, float], values: Array, clusters: Array | None) -> tuple[float, float]:
+    """An interval of the mean of `values` [n], made as wide as the bootstrap's over `clusters` [n] where that is wider:
+    2.5 and 97.5 % of DRAWS draws."""
+    if clusters is None:
+        return sure
+    member = np.unique(clusters, return_inverse=True)[1]
+    sums, size = np.bincount(member, values), np.bincount(member)
+    drawn = np.random.default_rng(0).integers(len(size), size=(DRAWS, len(size)))
+    means = sums[drawn].sum(1) / size[drawn].sum(1)
+    return min(sure[0], float(np.quantile(means, 0.025))), max(sure[1], float(np.quantile(means, 0.975)))
+
+
+def fused(logits: Array, together: Array) -> tuple[Array, Array]:
+    """One log score [G, K] for each value of `together` [n], the product of its probabilities, and the number [G] of
+    the first sweep of each."""
+    _, first, member = np.unique(together, return_index=True, return_inverse=True)
+    scores = np.zeros((len(first), logits.shape[1]))
+    np.add.at(scores, member, np.log(np.maximum(softmax(logits), LEAST_PROBABILITY)))
+    return scores, first
+
+
+def figure(right: int, n: int) -> dict[str, Any]:
+    """An accuracy with n and its 95 % Wilson interval."""
+    low, high = wilson(right, n)
+    return {"accuracy": round(right / n, 4), "n": n, "low": round(low, 4), "high": round(high, 4)}
+
+
+@cache
+def provenance() -> dict[str, str]:
+    """What a result file says of its origin, beside its sets and seeds; the commit as it was when first asked for, since
+    a long run may see others."""
+    return {"commit": commit(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}

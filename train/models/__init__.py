@@ -1,0 +1,1 @@
+"""Every way to name a material, behind one interface."""

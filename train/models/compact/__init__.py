@@ -1,0 +1,1 @@
+"""The default network family: architecture, training, graphs."""

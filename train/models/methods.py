@@ -1,0 +1,119 @@
+"""The room of methods: every way to name a material, behind one interface. In: a name. Out: a Method that trains Models.
+
+A model answers for many sweeps at once on the desktop, and gives the ONNX graph with which the box answers the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+from appliance.signal import features
+from train.data.sets import SweepSet
+from train.features import kinds
+
+Array = NDArray[Any]
+MODULES = (
+    "train.models.baselines",
+    "train.models.prior_work",
+    "train.models.sthmp",
+    "train.models.minirocket",
+    "train.models.neural_methods",
+    "train.models.compact.methods",
+)
+"""Each holds METHODS, or methods(effort) where it trains networks."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long networks are trained, for all of them in one place.
+
+    share: of each network's usual iterations. paper_steps: of the paper's CNN; None stands for the paper's 4,000 on a
+    GPU and fewer on a processor. bfloat16: compute the paper's CNN so, where the processor can.
+    """
+
+    share: float = 1.0
+    paper_steps: int | None = None
+    bfloat16: bool = False
+
+
+USUAL = Effort()
+
+
+class Model(Protocol):
+    """A trained method. K: number of the training set's materials, whether or not each occurred in training.
+
+    It may have more to tell, each by a name that fold.py knows: `ran`, `cost`, and `forms`, the same model in other
+    precisions as Models by name.
+    """
+
+    def logits(self, given: Array) -> Array:
+        """What the method's `input` asks for, of n sweeps -> float32 [n, K]; their softmax are honest probabilities.
+
+        given: digits [n, T, R, C] where `input` is "raw", else features float32 [n, F].
+        """
+        ...
+
+    def graph(self) -> onnx.ModelProto:
+        """What the box runs: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits` float32 [1, K]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to name a material.
+
+    about: one line with its source. input: "raw" or a key of train.features.kinds.KINDS.
+    train: (training sweeps, what `input` asks for of them, seed) -> Model; the same arguments give the same model.
+    extra: the optional dependency that it needs, named as in train/pyproject.toml. effort: what an Effort changes in it.
+    """
+
+    name: str
+    about: str
+    input: str
+    train: Callable[[SweepSet, Array, int], Model]
+    extra: str = ""
+    effort: str = ""
+
+    @property
+    def runs_on_the_box(self) -> bool:
+        """Whether the box computes what the graph is given."""
+        return self.input == "raw" or self.input in features.KINDS
+
+
+def given(kind: str, sweeps: SweepSet) -> Array:
+    """What a method with the input `kind` is given of `sweeps`: their digits, or float32 [N, F] as the box computes."""
+    if kind == "raw":
+        return sweeps.samples
+    return np.stack([kinds.compute(kind, digits, sweeps.rate_hz) for digits in sweeps.samples])
+
+
+def every(effort: Effort = USUAL) -> dict[str, Method]:
+    """All methods by name."""
+    return {method.name: method for name in MODULES for method in _of(import_module(name), effort)}
+
+
+def module_of(name: str) -> str:
+    """The full name of the module that holds the method `name`, which is known."""
+    return next(module for module in MODULES if name in {m.name for m in _of(import_module(module), USUAL)})
+
+
+def find(names: Sequence[str], effort: Effort = USUAL) -> list[Method]:
+    """The methods of these names. Raises FormatError naming one that is unknown."""
+    known = every(effort)
+    for name in names:
+        if name not in known:
+            raise FormatError(f"method {name!r} is unknown; use some of {', '.join(known)}")
+    return [known[name] for name in names]
+
+
+def _of(module: ModuleType, effort: Effort) -> Iterable[Method]:
+    return module.methods(effort) if hasattr(module, "methods") else module.METHODS

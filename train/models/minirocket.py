@@ -1,0 +1,102 @@
+"""The room of MiniRocket, the peer that a user would pick instead. In: sweeps. Out: aeon's transform and a ridge head.
+
+aeon fits the transform; what it found is written as a graph, and the graph is what trains the head and runs on the box.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto
+from sklearn.linear_model import RidgeClassifierCV
+from sklearn.preprocessing import StandardScaler
+
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
+from train.data.sets import SweepSet
+from train.models.linear_head import Headed, headed
+from train.models.methods import Method
+from train.onnx_tools.graph_builder import Graph
+
+Array = NDArray[Any]
+LENGTH, KERNELS = 9, np.array(list(combinations(range(9), 3)))
+"""Of a kernel, and the 84 of them: which three of the nine taps are 2, the others -1 (the paper's section 3.1)."""
+FEATURES = 10_000
+"""aeon's default, and the paper's; rounded down to a multiple of 84."""
+ALPHAS = np.logspace(-3, 3, 10)
+"""Ridge penalties that leave-one-out chooses from: what aeon's MiniRocketClassifier and the authors' code use."""
+
+
+def train(sweeps: SweepSet, given: Array, seed: int) -> Headed:
+    """MiniRocket and ridge on `given`, the digits [N, T, R, C] of `sweeps`.
+
+    Raises FormatError where aeon is missing, a window is shorter than a kernel, or `sweeps` are too few.
+    """
+    return headed(transform(sweeps.of_several().format, fitted(given, seed)), _ridge, sweeps, given, seed)
+
+
+def fitted(given: Array, seed: int) -> tuple[Array, ...]:
+    """aeon's parameters of the transform, fitted to digits [N, T, R, C]; `transform` says what they are.
+
+    numpy's global random state, which aeon seeds, is put back. Raises FormatError as `train`.
+    """
+    if given.shape[1] < LENGTH:
+        raise FormatError(f"a window of {given.shape[1]} frames is too short for minirocket; record at least {LENGTH}")
+    try:
+        from aeon.transformations.collection.convolution_based import MiniRocket
+    except ImportError as e:
+        raise FormatError(f"minirocket needs aeon ({e}); try pip install 'palpate-train[minirocket]'") from e
+    # in C order: for another one numba compiles all over again
+    series = np.ascontiguousarray(given.reshape(*given.shape[:2], -1).transpose(0, 2, 1), np.float32)
+    before = np.random.get_state()
+    try:
+        found: tuple[Array, ...] = MiniRocket(FEATURES, n_jobs=1, random_state=seed).fit(series).parameters
+    finally:
+        np.random.set_state(before)
+    return found
+
+
+def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelProto:
+    """The fitted transform as a graph: `sweep` -> `features` float32 [1, F], each the share of frames above a bias.
+
+    parameters: of each dilation times kernel the number of taxels, those taxels one after another, the dilations [D],
+    the number of biases of each kernel there [D], the biases [F] by dilation and kernel, as the features are. Where
+    dilation number plus kernel number is even, the window is padded with zeros; else the kernel stays within it.
+    """
+    counts, taxels, dilations, per_kernel, biases = parameters
+    g, size, at = Graph(), form.rows * form.cols, 0
+    chosen = iter(np.split(taxels, np.cumsum(counts)[:-1]))
+    x = g("Cast", g("Reshape", "sweep", g.constant([1, form.window, size], "int64")), to=TensorProto.FLOAT)
+    x, parts = g("Transpose", x, perm=[0, 2, 1]), []
+    for number, (dilation, n) in enumerate(zip(dilations.tolist(), per_kernel.tolist(), strict=True)):
+        weights = np.zeros((len(KERNELS), size, LENGTH))
+        for weight, kernel in zip(weights, KERNELS, strict=True):
+            weight[next(chosen)] = np.where(np.isin(np.arange(LENGTH), kernel), 2, -1)
+        bias = biases[at : at + n * len(KERNELS)].reshape(len(KERNELS), 1, n, 1)
+        at, halves = at + bias.size, []
+        for half in (0, 1):
+            padding = 0 if (number + half) % 2 else LENGTH // 2 * dilation
+            y = g("Conv", x, g.constant(weights[half::2]), dilations=[dilation], pads=[padding, padding])
+            above = g("Greater", g("Unsqueeze", y, g.constant([2, 3], "int64")), g.constant(bias[half::2]))
+            halves.append(g("ReduceMean", g("Cast", above, to=TensorProto.FLOAT), axes=[4], keepdims=0))
+        parts.append(g("Flatten", g("Concat", *halves, axis=2)))
+    g("Concat", *parts, axis=1, output="features")
+    return g.model(form, "features", len(biases))
+
+
+def _ridge(seen: Array, labels: Array) -> tuple[Array, Array]:
+    """Coefficients and intercepts of the ridge, for features as they are: the scaling is folded in."""
+    scaler, ridge = StandardScaler(with_mean=False), RidgeClassifierCV(ALPHAS)
+    ridge.fit(scaler.fit_transform(seen), labels)
+    return ridge.coef_ / scaler.scale_, ridge.intercept_
+
+
+METHODS = (
+    Method(
+        "minirocket", "MiniRocket of aeon + ridge (Dempster et al. 2021), the peer to beat", "raw", train, "minirocket"
+    ),
+)

@@ -1,0 +1,201 @@
+"""The room of ST-HMP, learnt dictionaries. In: sweeps. Out: a graph of sparse codes, pooled, with a linear SVM on it.
+
+Madry, Bo, Kragic, Fox, ICRA 2014, built on hierarchical matching pursuit: Bo, Ren, Fox, NIPS 2011 and ISER 2012. Theirs,
+as far as is known here, where the text of 2014 was not at hand: a dictionary learnt with K-SVD on patches less their
+means, orthogonal matching pursuit with a fixed number of atoms, codes split by sign, the largest of each over a pyramid
+of cells in space and in time, each cell divided by its length (contrast normalisation), a linear SVM. Our reading for a
+skin that slides instead of a hand that closes: texture is in time, so a patch has several frames as well as taxels; its
+taxels are its channels, and each loses its own mean, as colours do there; the grid is hardly larger than one patch, so
+there is one layer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto
+from sklearn.svm import LinearSVC
+
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
+from train.data.sets import SweepSet
+from train.models.linear_head import Headed, headed
+from train.models.methods import Method
+from train.onnx_tools.graph_builder import Graph, run
+
+Array = NDArray[Any]
+FRAMES, SIDE, STEP = 16, 2, 8
+"""Of a patch: frames, taxels each way, and frames from one to the next. Fixed before any data was looked at, as long as
+the compact network's first kernel. A short window's patches are half as long as it, and none is wider than the grid."""
+LEAST = 8
+"""Frames of the shortest window."""
+ATOMS, ACTIVE = 100, 4
+"""Of the dictionary, and of each patch's code."""
+SAMPLED, ROUNDS = 4000, 8
+"""Patches that the dictionary is learnt from, and rounds of K-SVD."""
+NEW = 0.01
+"""Squared length, of 1, that an atom must have beside those chosen before; less is taken for it and divides safely."""
+LEVELS = (1, 2, 4)
+"""Of the pyramid in time: parts of the window. In space there are two: the whole grid, and its quarters."""
+CONTRAST = 0.1
+"""Added to a cell's squared length, as in HMP: a silent cell stays silent."""
+
+
+def train(sweeps: SweepSet, given: Array, seed: int) -> Headed:
+    """ST-HMP and a linear SVM on `given`, the digits [N, T, R, C] of `sweeps`.
+
+    Raises FormatError where a window is too short, or `sweeps` are too few.
+    """
+    form = sweeps.of_several().format
+    if form.window < LEAST:
+        raise FormatError(f"a window of {form.window} frames is too short for st-hmp; record at least {LEAST}")
+    rng = np.random.default_rng(seed)
+    patches = sampled(given, rng)
+    scale = 1 / max(float(np.sqrt(np.mean(patches**2))), 1e-6)
+    atoms = dictionary(patches * scale, rng)
+    return headed(pooled(form, atoms, scale), _svm, sweeps, given, seed)
+
+
+def sampled(given: Array, rng: np.random.Generator) -> Array:
+    """Patches drawn from digits [N, T, R, C]: float64 [SAMPLED, frames, r, c], each taxel less its mean there."""
+    frames, (rows, cols) = min(FRAMES, given.shape[1] // 2), (min(SIDE, n) for n in given.shape[2:])
+    room = np.array(given.shape) - (1, frames, rows, cols) + 1
+    corners = rng.integers(0, room, (SAMPLED, 4))
+    cut = np.stack([given[i, t : t + frames, r : r + rows, c : c + cols] for i, t, r, c in corners]).astype(np.float64)
+    centred: Array = cut - cut.mean(axis=1, keepdims=True)
+    return centred
+
+
+def dictionary(patches: Array, rng: np.random.Generator) -> Array:
+    """K-SVD (Aharon, Elad, Bruckstein 2006) on patches [n, frames, r, c]: atoms float32 [ATOMS, frames, r, c].
+
+    Each atom in turn is the main direction of what the others leave of the patches that use it, by one step of power
+    iteration (Rubinstein, Zibulevsky, Elad 2008). An atom that nothing uses becomes the patch that is explained worst.
+    Atoms have the length 1, or 0 where the patches have nothing more to give.
+    """
+    x = patches.reshape(len(patches), -1)
+    atoms = _unit(x[rng.choice(len(x), ATOMS, replace=False)])
+    for _ in range(ROUNDS):
+        code = coded(patches, atoms.reshape(-1, *patches.shape[1:])).astype(np.float64)
+        left = x - code @ atoms
+        worst = iter(np.argsort(-np.square(left).sum(1), kind="stable"))
+        for k, atom in enumerate(atoms):
+            users = np.flatnonzero(code[:, k])
+            if not len(users):
+                atoms[k] = _unit(x[next(worst)])
+                continue
+            without = left[users] + np.outer(code[users, k], atom)
+            atoms[k] = _unit(code[users, k] @ without)
+            code[users, k] = without @ atoms[k]
+            left[users] = without - np.outer(code[users, k], atoms[k])
+    return atoms.reshape(-1, *patches.shape[1:]).astype(np.float32)
+
+
+def coded(patches: Array, atoms: Array) -> Array:
+    """Codes float32 [n, ATOMS] of patches [n, frames, r, c], by the nodes that the box runs, as one long sweep."""
+    n, frames, rows, cols = patches.shape
+    g, form = Graph(), SweepFormat(rows, cols, 1.0, n * frames, "float32")
+    g("Reshape", _codes(g, form, atoms, frames, 1.0), g.constant([1, -1], "int64"), output="features")
+    sweep = patches.reshape(1, n * frames, rows, cols).astype(np.float32)
+    return run(g.model(form, "features", n * len(atoms)), sweep).reshape(n, len(atoms))
+
+
+def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
+    """`sweep` -> `features` float32 [1, F]: the largest codes of each cell of the pyramids, above zero and below.
+
+    atoms: [ATOMS, frames, r, c]. scale: makes of digits what the atoms were learnt from.
+    """
+    g, steps = Graph(), (form.window - atoms.shape[1]) // STEP + 1
+    rows, cols = (n - size + 1 for n, size in zip((form.rows, form.cols), atoms.shape[2:], strict=True))
+    codes = g("Reshape", _codes(g, form, atoms, STEP, scale), g.constant([steps, rows, cols, -1], "int64"))
+    both = g("Concat", codes, g("Neg", codes), axis=3)
+    times = [part for level in LEVELS if level <= steps for part in _parts(steps, level)]
+    spaces = {(r, c): None for level in (1, 2) for r in _parts(rows, level) for c in _parts(cols, level)}
+    cells = []
+    for time in times:
+        during = g("ReduceMax", _cut(g, both, 0, time), axes=[0])
+        for r, c in spaces:
+            cells.append(g("ReduceMax", _cut(g, _cut(g, during, 1, r), 2, c), axes=[1, 2], keepdims=0))
+    above = g("Relu", g("Concat", *cells, axis=0))
+    length = g("Sqrt", g("Add", g("ReduceSumSquare", above, axes=[1]), g.constant(CONTRAST)))
+    g("Reshape", g("Div", above, length), g.constant([1, -1], "int64"), output="features")
+    return g.model(form, "features", len(cells) * 2 * len(atoms))
+
+
+def _parts(n: int, parts: int) -> list[tuple[int, int]]:
+    """`n` places in so many parts (first, last + 1), which share a place where they do not divide evenly."""
+    return [(i * n // parts, -(-(i + 1) * n // parts)) for i in range(parts)]
+
+
+def _cut(g: Graph, x: str, axis: int, part: tuple[int, int]) -> str:
+    """`x` from part[0] to part[1] along `axis`."""
+    return g("Slice", x, *(g.constant([n], "int64") for n in (*part, axis)))
+
+
+def _codes(g: Graph, form: SweepFormat, atoms: Array, step: int, scale: float) -> str:
+    """Orthogonal matching pursuit of all patches of `sweep` at once: codes [patches, ATOMS], by time, row, column.
+
+    Atoms sum to zero on each taxel, so their products with a patch are those with it less its means: one convolution.
+    From there on the pursuit needs only the products of atoms with each other (batch OMP; Rubinstein et al. 2008).
+    """
+    flat = atoms.reshape(len(atoms), -1)
+    shape = [1, 1, form.window, form.rows, form.cols]
+    x = g("Cast", g("Reshape", "sweep", g.constant(shape, "int64")), to=TensorProto.FLOAT)
+    products = g("Conv", x, g.constant(atoms[:, None] * scale), strides=[step, 1, 1])
+    left = g("Transpose", g("Reshape", products, g.constant([len(atoms), -1], "int64")), perm=[1, 0])
+    return _pursuit(g, left, flat @ flat.T)
+
+
+def _pursuit(g: Graph, left: str, gram: Array) -> str:
+    """Codes [n, K] from products of n patches with K atoms, `left` [n, K], and those of the atoms, `gram` [K, K].
+
+    The atoms that a patch chooses are made orthogonal one after another (Cholesky); the products of those directions
+    with all atoms stand for the directions. At the end the triangle is solved from its last row up.
+    """
+    products, least, zeros = g.constant(gram), g.constant(NEW), g("Mul", left, g.constant(0.0))
+    chosen: list[str] = []
+    directions: list[str] = []
+    lengths: list[str] = []
+    amounts: list[str] = []
+    triangle: list[list[str]] = []
+    for _ in range(ACTIVE):
+        best = g("ArgMax", g("Abs", left), axis=1, keepdims=0)
+        at = g("Unsqueeze", best, g.constant([1], "int64"))
+        beside = [g("GatherElements", direction, at, axis=1) for direction in directions]
+        new = g("Gather", products, best)
+        for share, direction in zip(beside, directions, strict=True):
+            new = g("Sub", new, g("Mul", share, direction))
+        length = g("Sqrt", g("Max", g("GatherElements", new, at, axis=1), least))
+        direction = g("Div", new, length)
+        amount = g("Div", g("GatherElements", left, at, axis=1), length)
+        left = g("Sub", left, g("Mul", amount, direction))
+        for row, value in zip((chosen, directions, lengths, amounts), (at, direction, length, amount), strict=True):
+            row.append(value)
+        triangle.append(beside)
+    solved: dict[int, str] = {}
+    for i in reversed(range(ACTIVE)):
+        for later, value in solved.items():
+            amounts[i] = g("Sub", amounts[i], g("Mul", triangle[later][i], value))
+        solved[i] = g("Div", amounts[i], lengths[i])
+    values = [solved[i] for i in range(ACTIVE)]
+    return g(
+        "ScatterElements", zeros, g("Concat", *chosen, axis=1), g("Concat", *values, axis=1), axis=1, reduction="add"
+    )
+
+
+def _unit(vectors: Array) -> Array:
+    """Vectors [..., d] at length 1; what has none stays zero."""
+    scaled: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+    return scaled
+
+
+def _svm(seen: Array, labels: Array) -> tuple[Array, Array]:
+    """Coefficients and intercepts of a linear SVM, one material against the others."""
+    machine = LinearSVC(random_state=0).fit(seen, labels)
+    return machine.coef_, machine.intercept_
+
+
+METHODS = (Method("st-hmp", "codes of learnt dictionaries, pooled, linear SVM (Madry et al. 2014)", "raw", train),)

@@ -1,0 +1,101 @@
+"""The room of costs that a graph tells by itself. In: an ONNX graph, the form of a sweep. Out: weights, multiply-adds.
+
+Time and memory are measured, in dots.py; what stands here is counted and the same on every machine.
+"""
+
+from __future__ import annotations
+
+from math import log2, prod
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import onnx
+from onnx import TensorProto
+
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
+from appliance.signal import time_series
+from train.features import kinds
+
+NUMBERS = {TensorProto.FLOAT, TensorProto.INT8, TensorProto.UINT8, TensorProto.INT32}
+"""Types of trained constants: shapes and indices are int64."""
+SCALED = {"QuantizeLinear", "DequantizeLinear"}
+GATES = 3
+"""Of a GRU."""
+
+
+def precision(model: onnx.ModelProto) -> str:
+    """ "int8" where nodes of the graph compute in it, else "float"."""
+    return "int8" if any(node.op_type in SCALED for node in model.graph.node) else "float"
+
+
+def weights(model: onnx.ModelProto) -> int:
+    """How many trained numbers the graph holds, float or int8: its constants and the tables of its classifiers.
+
+    Single numbers and the scales and zero points of int8 are not counted.
+    """
+    graph = model.graph
+    scales = {name for node in graph.node if node.op_type in SCALED for name in node.input[1:]}
+    held = [c for c in graph.initializer if prod(c.dims) > 1 and c.data_type in NUMBERS and c.name not in scales]
+    tables = [len(a.floats) for node in graph.node for a in node.attribute if len(a.floats) > 1]
+    return sum(prod(c.dims) for c in held) + sum(tables)
+
+
+def macs(model: onnx.ModelProto) -> int:
+    """Multiply-accumulates of one sweep: convolutions, matrix products, GRU, kernels of an SVM, distances to neighbours.
+
+    Shapes are inferred. Raises FormatError naming a node whose shape is not known.
+    """
+    graph = onnx.shape_inference.infer_shapes(model).graph
+    known = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in (*graph.value_info, *graph.output)}
+    known |= {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in graph.input}
+    known |= {c.name: list(c.dims) for c in graph.initializer}
+    moved = {v.name for v in graph.input}  # what no sweep moves is computed once, when the box loads the graph
+    for node in graph.node:
+        moved |= set(node.output) if moved & set(node.input) else set()
+    return sum(_macs(node, known) for node in graph.node if moved & set(node.output))
+
+
+def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
+    given = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
+
+    def shape(name: str) -> list[int]:
+        if not all(found := known.get(name, [0])):
+            raise FormatError(f"node {node.name!r} ({node.op_type}): the shape of {name!r} is not known")
+        return found
+
+    if node.op_type == "Conv":
+        return prod(shape(node.output[0])) * prod(shape(node.input[1])[1:])
+    if node.op_type in ("MatMul", "MatMulInteger"):
+        return prod(shape(node.input[0])) * shape(node.input[1])[-1]
+    if node.op_type == "Gemm":
+        return prod(shape(node.input[0])) * shape(node.input[1])[0 if given.get("transB") else -1]
+    if node.op_type == "GRU":
+        steps, _, inputs = shape(node.input[0])
+        hidden = given["hidden_size"]
+        return steps * shape(node.input[1])[0] * GATES * hidden * (inputs + hidden)
+    if node.op_type == "SVMClassifier":
+        return len(given["support_vectors"]) + len(given["coefficients"])
+    return prod(shape(node.input[1])) if node.op_type == "CDist" else 0
+
+
+def feature_macs(kind: str, form: SweepFormat) -> int:
+    """Multiply-accumulates of the Fourier transforms in the features `kind`: n log2 n for one of n real numbers.
+
+    A transform of n real numbers is n/4 log2 n complex products of four each. All else in features is not counted.
+    """
+    if kind == "raw":
+        return 0
+    seen: list[int] = []
+    real = time_series.power
+
+    def counted(x: Any, frames: int) -> Any:
+        seen.append(round(x.size * log2(max(x.shape[-1], 1))))
+        return real(x, frames)
+
+    rng = np.random.default_rng(0)  # a silent sweep may be spared its transforms
+    digits = rng.integers(0, 100, (form.window, form.rows, form.cols)).astype(form.digits)
+    with mock.patch.object(time_series, "power", counted):
+        kinds.compute(kind, digits, form.rate_hz)
+    return sum(seen)

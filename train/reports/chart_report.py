@@ -1,0 +1,294 @@
+"""The room of the command `chart`: speed against accuracy. In: what to compare. Out: chart.json, a picture and a page.
+
+Accuracy comes from evaluate and stress, whose finished work is kept; every dot's costs are measured at once, in one
+run. An interrupted command goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appliance.core.errors import BundleError, FormatError
+from appliance.core.storage import put
+from train.cli import options
+from train.data import sets
+from train.evaluation import evaluate, parallel, robustness
+from train.evaluation.evaluate import Plan, Where
+from train.evaluation.fold import fingerprint
+from train.evaluation.robustness_data import Trial
+from train.export import measure
+from train.export.measure import Packed
+from train.metrics import score
+from train.models import methods
+from train.models.compact.architectures import LADDER
+from train.models.methods import USUAL, Effort
+from train.reports import chart_page, scatter
+
+Json = dict[str, Any]
+Log = Callable[[str], None]
+Accuracy = dict[tuple[str, str], dict[str, Json]]
+"""By method and form, then by protocol: mean, low, high, n, seeds."""
+FABRICS = "fabricslide/fabricslide.npz"
+SEVEN = ("direction=0", "force<=180")
+FAMILIES = {
+    "train.models.compact.methods": "Palpate",
+    "train.models.baselines": "L and H",
+    "train.models.neural_methods": "deep networks",
+    "train.models.minirocket": "MiniRocket",
+}
+OTHERS = "related work"
+TARGETS = {
+    "none": (("noise", 0.0),),
+    "noise": (("noise", 0.3),),
+    "dead": (("dead", 1.0),),
+    "gain": (("gain-down", 0.2), ("gain-up", 0.2)),
+    "lost": (("lost", 0.05),),
+    "shift": (("shift-rows", 1.0), ("shift-grid", 1.0)),
+}
+"""Stresses and severities that the project has set itself limits for; of several the worst counts."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """An axis of accuracy. sets: joined; with real, files in the folder of real sweeps. only: of each set."""
+
+    sets: tuple[str, ...]
+    protocol: str
+    only: tuple[str, ...] = ()
+    real: bool = False
+
+    def load(self, data: Path | None) -> sets.SweepSet | None:
+        """Its sweeps; None where they are real and nobody said where."""
+        if self.real and data is None:
+            return None
+        named = [str(data / name) if self.real and data else name for name in self.sets]
+        return sets.join([sets.load(name).select(self.only) for name in named])
+
+
+@dataclass(frozen=True)
+class Chart:
+    """What is compared. train, trial: of the stress; the bundles are trained on `train` too.
+
+    named: methods that belong there; others: those that join where an earlier run has left results. rounds: of timing.
+    """
+
+    parts: dict[str, Part]
+    train: str
+    trial: str
+    named: tuple[str, ...]
+    others: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()
+    rounds: int = measure.ROUNDS
+
+
+RUNGS = ("compact", *(f"compact-{size}" for size in LADDER))
+FULL = Chart(
+    {
+        "hard": Part(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1"),
+        "lopo": Part(("sim:T-REAL:1",), "leave:position"),
+        "force": Part((FABRICS,), "leave:force", SEVEN, True),
+        "speed": Part((FABRICS,), "leave:speed", SEVEN, True),
+    },
+    "sim:T-REAL:1",
+    "sim:T-REAL:2:2",
+    (*RUNGS, "L-gauss", "L-knn", "L-svm", "H-knn", "H-svm", "minirocket", "tactnet2", "paper-cnn-centred"),
+    ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm", "st-hmp", "recurrent"),
+)
+QUICK = Chart(
+    {
+        "hard": Part(("sim:T-REAL:1001:3", "sim:T-HARD:1001-1002:2"), "split:set=0->1", ("position<=2",)),
+        "lopo": Part(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)),
+    },
+    "sim:T-REAL:1001:3",
+    "sim:T-LAB:1002:1",
+    ("compact-1k", "compact", "L-gauss", "H-svm", "minirocket"),
+    only=("position<=2",),
+    rounds=5,
+)
+QUICK_EFFORT = Effort(share=0.02)
+
+
+@dataclass
+class Charting:
+    """One run of the command. left_out: what is missing, and why."""
+
+    chart: Chart
+    where: Where
+    log: Log
+    data: Path | None = None
+    effort: Effort = USUAL
+    seeds: Sequence[int] = (1,)
+    touch: Json = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    def dots(self) -> list[Json]:
+        """All of them, as chart.json lists them."""
+        held = self.accuracy()
+        with tempfile.TemporaryDirectory() as aside:
+            made = list(self.packed({method for method, _ in held}, self.where.cache or Path(aside)))
+            self.log(f"{len(made)} models take turns")
+            train = sets.load(self.chart.train).select(self.chart.only)
+            some = train.samples[:: max(len(train) // 60, 1)]
+            costs = measure.measured(made, some, self.chart.rounds)
+        known = {"seeds": list(self.seeds), "set": train.source} | score.provenance()
+        return [self._dot(one, told, held.get((one.method, one.form), {})) | known
+                for one, told in zip(made, costs, strict=True)]  # fmt: skip
+
+    def _dot(self, one: Packed, told: Json, accuracy: Json) -> Json:
+        """Costs and accuracy of one; touch time is what deciding early has left of it, for the method itself."""
+        share = self.touch.get(one.method, 1.0) if not one.form else 1.0
+        family = FAMILIES.get(methods.module_of(one.method), OTHERS)
+        return told | {"touch_s": round(one.window_s * share, 3), "family": family, "accuracy": accuracy}
+
+    def accuracy(self) -> Accuracy:
+        """Of all methods and their forms, by protocol."""
+        known = methods.every(self.effort)
+        named = [name for name in self.chart.named if name in known]
+        self.left_out |= {name: "no such method here" for name in self.chart.named if name not in known}
+        found: Accuracy = {}
+        for names, where in ((named, self.where), (self.chart.others, replace(self.where, kept=True))):
+            if not names:
+                continue
+            for protocol, part in self.chart.parts.items():
+                self._evaluated(found, protocol, part, names, where)
+            self._stressed(found, [name for name in names if (name, "") in found], where)
+        return found
+
+    def _evaluated(self, found: Accuracy, protocol: str, part: Part, names: Sequence[str], where: Where) -> None:
+        """Add what methods and their forms reach under one protocol."""
+        sweeps = part.load(self.data)
+        if sweeps is None:
+            self.left_out[protocol] = "real sweeps; name their folder with --data or PALPATE_DATA"
+            return
+        told: dict[tuple[str, str], list[Json]] = {}
+        plan = Plan(names, (part.protocol,), self.seeds, part.real, self.effort)
+        for result in evaluate.evaluate(sweeps, plan, where, self.log):
+            if result.refused:
+                self.left_out[f"{result.method}, {protocol}"] = result.refused
+                continue
+            figures = result.json()
+            for form, one in {"": figures, **figures.get("forms", {})}.items():
+                told.setdefault((result.method, form), []).append(one | {"seed": result.seed})
+        for named, results in told.items():
+            found.setdefault(named, {})[protocol] = joined(results)
+
+    def _stressed(self, found: Accuracy, names: Sequence[str], where: Where) -> None:
+        """Add accuracies under stress of the methods themselves; stress.py does not test their other forms."""
+        train, trial = sets.load(self.chart.train).select(self.chart.only), Trial.simulated(self.chart.trial)
+        result = robustness.run(names, train, trial, where, seeds=self.seeds, effort=self.effort, log=self.log)
+        for name, entry in result["methods"].items():
+            if entry["curves"]:
+                found[name, ""] |= under_stress(entry)
+
+    def packed(self, names: set[str], cache: Path) -> Iterator[Packed]:
+        """The bundles of those `names` of the chart that can be packed."""
+        train = sets.load(self.chart.train).select(self.chart.only)
+        order = [name for name in (*self.chart.named, *self.chart.others) if name in names]
+        progress = parallel.Progress(len(order), self.log)
+        for method in methods.find(order, self.effort):
+            about = [sets.digest(train), method.name, method.effort, self.seeds[0]]
+            folder = (
+                cache
+                / "dots"
+                / fingerprint(about, methods.module_of(method.name), "train.export.measure", "train.export.pack")
+            )
+            if self.where.kept and not folder.exists():
+                self.left_out[method.name] = "not packed yet"
+                continue
+            try:
+                yield from measure.packed(method, train, self.seeds[0], folder)
+            except (FormatError, BundleError) as e:
+                self.left_out[method.name] = str(e)
+            progress(f"{method.name} packed")
+
+
+def joined(results: Sequence[Json]) -> Json:
+    """Several seeds' results of one protocol as one: means of their accuracies, and of the ends of their intervals."""
+    shares = [(r["window"]["right"] / r["window"]["total"], *r["interval"]) for r in results]
+    seeds = sorted(r["seed"] for r in results)
+    return _entry(*np.mean(shares, axis=0), results[0]["window"]["total"], seeds)
+
+
+def under_stress(entry: Json) -> dict[str, Json]:
+    """Accuracies under stress from an entry of stress.merge: "stress", the worst's mean over severities, and TARGETS."""
+    curves, seeds = entry["curves"], entry["seeds"]
+    n = next(iter(curves.values()))["total"] // len(seeds)
+    mean = {name: [float(np.mean(c[k][1:])) for k in ("accuracy", "low", "high")] for name, c in curves.items()}
+    worst = min(mean, key=lambda name: (mean[name][0], name))
+    told = {"stress": _entry(*mean[worst], n, seeds) | {"name": worst}}
+    for key, those in TARGETS.items():
+        there = [_at(curves[name], severity) for name, severity in those if name in curves]
+        if there:
+            told[f"stress:{key}"] = _entry(*min(there), n, seeds)
+    return told
+
+
+def _at(curve: Json, severity: float) -> tuple[float, ...]:
+    """Accuracy and its interval at a severity, on the line between two that were measured."""
+    return tuple(float(np.interp(severity, curve["severities"], curve[k])) for k in ("accuracy", "low", "high"))
+
+
+def _entry(mean: float, low: float, high: float, n: int, seeds: Sequence[int]) -> Json:
+    return {"mean": round(mean, 4), "low": round(low, 4), "high": round(high, 4), "n": n, "seeds": list(seeds)}
+
+
+def register(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """Register the command."""
+    one = add("chart", command, "chart accuracy against cost: every method as a bundle, timed as on the box")
+    one.add_argument("--out", type=Path, default=Path("docs/chart"), metavar="DIR", help="where it goes (docs/chart)")
+    one.add_argument("--quick", action="store_true", help="small sets, hardly trained: all is tried, nothing told")
+    one.add_argument("--kept", action="store_true", help="train nothing, chart what an earlier run has finished")
+    one.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
+                     help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
+    one.add_argument("--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)")
+    one.add_argument("--certainty", type=Path, action="append", default=[], metavar="FILE",
+                     help="results.json of palpate-train certainty, for the touch time of its method")  # fmt: skip
+    options.add_effort(one)
+    options.add_where(one)
+
+
+def command(args: argparse.Namespace) -> None:
+    """All of it, written to --out; the page is named at the end. Raises FormatError where nothing is left to draw."""
+    chart, effort = (QUICK, QUICK_EFFORT) if args.quick else (FULL, options.effort(args))
+    touch = touch_shares(args.certainty)
+    charting = Charting(chart, options.where(args), options.Log(), args.data, effort, options.seeds(args), touch)
+    found = charting.dots()
+    for name, why in charting.left_out.items():
+        print(f"left out: {name}: {why}")
+    if not found:
+        raise FormatError("no model is left to chart; see above, and run it without --kept")
+    print(write(args.out, found, args.quick, charting.left_out))
+
+
+def touch_shares(paths: Sequence[Path]) -> dict[str, float]:
+    """Mean share of the sweep that each method needs where it decides early, of what `palpate-train certainty` wrote.
+
+    Raises FormatError where a file is none of these.
+    """
+    shares = {}
+    for path in paths:
+        try:
+            told = json.loads(path.read_bytes())
+            shares[told["method"]] = float(told["early"]["share"])
+        except (ValueError, KeyError, TypeError) as e:
+            raise FormatError(f"{path.name}: not what palpate-train certainty wrote: {e!r}") from e
+    return shares
+
+
+def write(out: Path, found: Sequence[Json], quick: bool = False, left_out: dict[str, str] | None = None) -> Path:
+    """chart.json, chart.svg and index.html in the folder `out`; the page's path."""
+    lines = ",\n".join(json.dumps(dot, allow_nan=False) for dot in found)
+    put(out / "chart.json", f"[\n{lines}\n]\n".encode(), parents=True)
+    picture = scatter.chart(found)
+    put(out / "chart.svg", picture.encode(), parents=True)
+    put(out / "index.html", chart_page.html(found, picture, quick, left_out or {}).encode(), parents=True)
+    return out / "index.html"

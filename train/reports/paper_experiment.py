@@ -1,0 +1,297 @@
+"""The room of the paper: its experiment on the simulated sets, and what it did not compare. In: a plan. Out: a folder.
+
+The folder holds results.json, the pictures and a page that tells the story (story.py). Folds are kept by evaluate, so
+that what was interrupted goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.storage import put
+from appliance.inference.classifier import LEAST_PROBABILITY, fuse, softmax
+from train.data import sets
+from train.evaluation.evaluate import Plan, Result, Where, evaluate
+from train.evaluation.parallel import spoken
+from train.metrics import score
+from train.models import methods, prior_work
+from train.models.methods import USUAL, Effort
+from train.reports import paper_page, paper_printed
+
+Array = NDArray[Any]
+Log = Callable[[str], None]
+BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
+NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
+NETWORKS = ("tactnet2", "recurrent")
+SURE = (0.9, 0.95, 0.99)
+"""Posteriors at which no more sweeps are added."""
+SEVERAL = 3
+ATTACHMENTS = 20
+"""Seeds of T-HARD for each world, 60 sweeps each."""
+COST_POINTS = 160
+
+
+@dataclass(frozen=True)
+class Part:
+    """A column of the paper's results: what is trained on, what is tested on.
+
+    sets: joined; {w} stands for the world, {a} and {b} for its first and last seed of T-HARD. only: of each set.
+    """
+
+    sets: tuple[str, ...]
+    protocol: str
+    folds: int
+    only: tuple[str, ...] = ()
+
+    def load(self, world: int) -> sets.SweepSet:
+        """Its sweeps."""
+        last = ATTACHMENTS * world
+        names = [name.format(w=world, a=last - ATTACHMENTS + 1, b=last) for name in self.sets]
+        return sets.join([sets.load(name).select(self.only) for name in names])
+
+
+@dataclass(frozen=True)
+class Step:
+    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, for the time left only.
+
+    means_removed: of sweeps without each taxel's mean; then their names say so.
+    """
+
+    methods: tuple[str, ...]
+    parts: tuple[str, ...]
+    worlds: tuple[int, ...]
+    fold_s: float
+    means_removed: bool = False
+
+
+ALL = ("lopo", "hard", "lab", "random")
+FULL = {
+    "lopo": Part(("sim:T-REAL:{w}",), "leave:position", 9),
+    "hard": Part(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}"), "split:set=0->1", 1),
+    "lab": Part(("sim:T-LAB:{w}",), "random:10", 10),
+    "random": Part(("sim:T-REAL:{w}",), "random:9", 9),
+}
+HARD, EASY = ("hard", "lopo"), ("lab", "random")
+FULL_STEPS = (
+    Step(BASELINES, ALL, (1, 2, 3, 4, 5), 1),
+    Step(NEIGHBOURS, ALL, (1, 2, 3), 1),
+    Step(("minirocket", "st-hmp"), HARD, (1,), 12),
+    Step(("compact",), HARD, (1,), 32),
+    Step(NETWORKS, HARD, (1,), 30),
+    Step(("paper-cnn",), HARD, (1,), 170, means_removed=True),
+    Step(("paper-cnn",), ("hard",), (1,), 170),
+    Step(("minirocket", "st-hmp"), EASY, (1,), 12),
+    Step(("compact",), EASY, (1,), 32),
+    Step(NETWORKS, EASY, (1,), 30),
+    Step(("paper-cnn",), ("lopo",), (1,), 170),
+)
+"""What is hard comes first, so that a run that was broken off has told the most: see `kept`."""
+QUICK = {
+    "lopo": Part(("sim:T-REAL:{w}:4",), "leave:position", 3, ("position<=2",)),
+    "hard": Part(("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", 1, ("position<=2",)),
+    "lab": Part(("sim:T-LAB:{w}:10",), "random:3", 3),
+    "random": Part(("sim:T-REAL:{w}:4",), "random:3", 3, ("position<=2",)),
+}
+QUICK_STEPS = (
+    Step(BASELINES, ALL, (1, 2), 0.3),
+    Step((*NEIGHBOURS, "minirocket", "st-hmp", "compact", *NETWORKS), ("lopo", "hard"), (1,), 1),
+    Step(("paper-cnn",), ("hard", "lopo"), (1,), 15, means_removed=True),
+    Step(("paper-cnn",), ("hard",), (1,), 15),
+)
+QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a method did in a part of a world, without the sweeps: labels [n], logits [n, K] of what was tested.
+
+    place: int [n], where the skin sat; no two worlds share one. costs: of each fold that has them, [iterations, 2].
+    """
+
+    part: str
+    method: str
+    world: int
+    labels: Array
+    logits: Array
+    place: Array
+    costs: list[Array] = field(repr=False)
+    told: dict[str, Any] = field(repr=False)
+
+    @classmethod
+    def of(cls, part: str, world: int, result: Result) -> Outcome:
+        """Of what evaluate gave."""
+        test, sweeps = result.test, result.sweeps
+        place = sweeps.group("position")[test] + 10_000 * world
+        costs = [_thinned(fold.cost) for fold in result.folds if len(fold.cost)]
+        method = result.method + result.means_removed * paper_printed.MEANS_OUT
+        about = result.json() | {"part": part, "world": world}
+        return cls(part, method, world, sweeps.labels[test], result.logits, place, costs, about)
+
+    @cached_property
+    def explorations(self) -> Array:
+        """What `objects` draws of it."""
+        return objects(self.labels, self.place, self.world)
+
+    @property
+    def right(self) -> Array:
+        """Which [n] were named right."""
+        return self.logits.argmax(1) == self.labels
+
+
+def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effort: Effort = USUAL) -> Path:
+    """Train and test all of the plan, write results.json, the pictures and the page into `out`; the page's path.
+
+    quick: a few sweeps and iterations of everything, whatever `effort` says. Raises FormatError as evaluate.
+    """
+    start = time.monotonic()
+    parts, steps = (QUICK, QUICK_STEPS) if quick else (FULL, FULL_STEPS)
+    effort = QUICK_EFFORT if quick else effort
+    outcomes = list(_outcomes(parts, steps, where, effort, log))
+    told = summary(outcomes, parts, effort) | {
+        "quick": quick,
+        "commit": score.provenance()["commit"],
+        "took_s": round(time.monotonic() - start),
+    }
+    put(out / "results.json", _lines(told).encode(), parents=True)
+    page, pictures = paper_page.tell(told)
+    for name, svg in pictures.items():
+        put(out / f"{name}.svg", svg.encode(), parents=True)
+    put(out / "index.html", page.encode(), parents=True)
+    return out / "index.html"
+
+
+def _outcomes(
+    parts: dict[str, Part], steps: Sequence[Step], where: Where, effort: Effort, log: Log
+) -> Iterator[Outcome]:
+    """Step by step; after each fold `log` gets how far it is and how long all that is left will take."""
+    todo = [(step, part, world) for step in steps for part in step.parts for world in step.worlds]
+    expected = [len(step.methods) * parts[part].folds * step.fold_s for step, part, _ in todo]
+    pace = 1 / (os.cpu_count() or 1)
+    for i, (step, part, world) in enumerate(todo):
+        start, done, folds = time.monotonic(), 0, len(step.methods) * parts[part].folds
+
+        def count(line: str) -> None:
+            nonlocal done
+            done += 1
+            left = sum(expected[i:]) - expected[i] * done / folds  # noqa: B023  # called within this turn of the loop
+            where_now = f"{i + 1}/{len(todo)} {part}, world {world}"  # noqa: B023
+            log(f"{where_now}: {line}; in all about {spoken(pace * left)} left")  # noqa: B023
+
+        plan = Plan(step.methods, (parts[part].protocol,), (world,), step.means_removed, effort)
+        for result in evaluate(parts[part].load(world), plan, where, count):
+            yield Outcome.of(part, world, result)
+        took = time.monotonic() - start
+        if took > expected[i] * pace / 10:  # else it came out of the cache
+            pace = took / expected[i]
+
+
+def summary(outcomes: Sequence[Outcome], parts: dict[str, Part], effort: Effort = USUAL) -> dict[str, Any]:
+    """All that the page tells, as plain numbers; see story.py, which reads it."""
+    held: dict[tuple[str, str], list[Outcome]] = {}
+    for outcome in outcomes:
+        held.setdefault((outcome.part, outcome.method), []).append(outcome)
+    lopo = {method: those for (part, method), those in held.items() if part == "lopo"}
+    return {
+        "parts": {k: {"sets": part.sets, "only": part.only, "protocol": part.protocol} for k, part in parts.items()},
+        "table": [_row(*key, those) for key, those in held.items()],
+        "costs": {m: [cost.tolist() for o in lopo[m] for cost in o.costs] for m in paper_printed.CNNS if m in lopo},
+        "confusion": {m: np.sum([o.told["confusion"] for o in those], 0).tolist() for m, those in lopo.items()},
+        "several": {m: several(those) for m, those in lopo.items()},
+        "explored": {m: explored(those) for m, those in lopo.items()},
+        "methods": {
+            name: method.about for name, method in methods.every(effort).items() if name in {m for _, m in held}
+        },
+        "results": [outcome.told for outcome in outcomes],
+    }
+
+
+def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
+    """One line of the table. attachments: accuracies of the worst and the best single one, as many as were tested."""
+    right, place = (np.concatenate([getattr(o, name) for o in those]) for name in ("right", "place"))
+    each = [float(right[place == p].mean()) for p in np.unique(place)]
+    return {
+        "part": part, "method": method, "worlds": [o.world for o in those], "right": int(right.sum()),
+        "total": len(right), "share": estimate(right, place), "printed": paper_printed.ACCURACY[part].get(method),
+        "attachments": [len(each), round(min(each), 4), round(max(each), 4)], "ran": those[0].told["ran"],
+        **{k: round(float(np.median([o.told[k] for o in those])), 4) for k in ("fit_s", "ms_p50")},
+        "agreement": min(o.told["agreement"] for o in those),
+    }  # fmt: skip
+
+
+def estimate(right: Array, place: Array) -> list[float]:
+    """Share of `right` [n] and its 95 % interval, over the places that the skin sat at (score.interval)."""
+    return [round(float(right.mean()), 4), *score.interval(right, place)]
+
+
+def objects(labels: Array, place: Array, seed: int) -> Array:
+    """Explorations of one object each, numbers of sweeps [n, S]: sec. V.D, sweeps of one material from the test set.
+
+    Every sweep comes first once, others of its material and place follow in random order, as many as all have.
+    """
+    rng = np.random.default_rng(seed)
+    alike = np.unique(np.stack([labels, place]), axis=1, return_inverse=True)[1].ravel()
+    least, rows = np.bincount(alike).min(), []
+    for i in range(len(labels)):
+        others = np.flatnonzero(alike == alike[i])
+        rows.append([i, *rng.permutation(others[others != i])[: least - 1]])
+    return np.array(rows)
+
+
+def several(those: Sequence[Outcome]) -> dict[str, list[list[float]]]:
+    """By "vote" and by "product", as the box fuses: the estimate after one, two, three sweeps of an object."""
+    told: dict[str, list[list[float]]] = {}
+    for how in ("vote", "product"):
+        for n in range(1, SEVERAL + 1):
+            right = np.concatenate([_fused(o, n, how) for o in those])
+            told.setdefault(how, []).append(estimate(right, np.concatenate([o.place for o in those])))
+    return told
+
+
+def _fused(outcome: Outcome, n: int, how: str) -> Array:
+    scores = softmax(outcome.logits)
+    drawn = outcome.explorations[:, :n]
+    return np.array([fuse([scores[i] for i in row], how).argmax() for row in drawn]) == outcome.labels
+
+
+def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """Sweeps added one by one until the posterior is sure (Xu et al. 2013): estimate and mean number of sweeps."""
+    told = []
+    for sure in SURE:
+        right, used = [], []
+        for o in those:
+            log_p = np.log(np.maximum(softmax(o.logits), LEAST_PROBABILITY))
+            ends = [prior_work.explore(log_p[row], sure) for row in o.explorations]
+            labels, counts = np.array(ends).T
+            right.append(labels == o.labels)
+            used.append(counts)
+        share = estimate(np.concatenate(right), np.concatenate([o.place for o in those]))
+        told.append({"sure": sure, "share": share, "sweeps": round(float(np.concatenate(used).mean()), 3)})
+    return told
+
+
+def _thinned(cost: Array) -> Array:
+    """A cost curve [n, 2] in at most COST_POINTS points, evenly on a logarithmic axis: means of what lies between."""
+    ends = np.unique(np.geomspace(1, len(cost) + 1, COST_POINTS + 1).round().astype(int)) - 1
+    return np.array([cost[a:b].mean(0) for a, b in pairwise(ends)]).round(5)
+
+
+def _lines(told: dict[str, Any]) -> str:
+    """JSON with one line for each figure and each result, so that a change can be read."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            return "[\n" + ",\n".join(json.dumps(item) for item in value) + "\n]"
+        return json.dumps(value)
+
+    return "{\n" + ",\n".join(f"{json.dumps(k)}: {text(v)}" for k, v in told.items()) + "\n}\n"

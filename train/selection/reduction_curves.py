@@ -1,0 +1,204 @@
+"""The room of what a scene does not need. In: a Choice. Out: a curve for each thing that may be left out, and a Change.
+
+Each curve trains the chosen method anew with less, on the same parts, and compares with the whole, sweep by sweep. What
+is kept is the least for which it, and all that is more, loses no more than one standard error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+from train.data import transforms
+from train.data.transforms import WHOLE, Change
+from train.selection.nested_cv import Trials
+from train.selection.scene import Scene
+from train.selection.select import Choice
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+Step = tuple[str, float, list[Change], Change]
+"""One point of a curve: its name, the share that is left, the change for each part, that for all sweeps."""
+WINDOWS, RATES, BITS = (0.75, 0.5, 0.25), (2, 4, 8), (1, 2, 3, 4)
+BEYOND = 2
+"""A curve ends at the second point that loses too much: two show where it falls."""
+CONFUSED = 0.25
+"""Two materials are proposed as one where so many of their sweeps are taken for each other; tossing a coin gives half."""
+SET_IT = {
+    "window": "nothing to set: the box takes the middle of each sweep; the robot may slide for less long",
+    "rate": "set the readout board to average {0} frames and send one",
+    "taxels": "connect only these taxels, in this order, or leave the others out on the readout board",
+    "bits": "a converter of this many bits will do; the digits keep their type, and nothing changes in the bundle",
+}
+
+
+def curves(choice: Choice, scene: Scene, log: Callable[[str], None]) -> tuple[list[Json], Change, Json]:
+    """The curves of scene.reduce; what of scene.apply is left out together, and the accuracy with it."""
+    told, least = [], {}
+    for kind in scene.reduce:
+        if kind == "classes":
+            told.append(classes(choice, scene.accuracy))
+            continue
+        log(f"with less of {kind}")
+        curve, least[kind] = _curve(choice, scene, kind)
+        told.append(curve)
+    applied, accuracy = _together(choice, scene, {kind: least[kind] for kind in scene.apply if kind in least})
+    for curve in told:
+        curve["applied"] = getattr(applied, curve["kind"], None) != getattr(WHOLE, curve["kind"], None)
+    return told, applied, accuracy
+
+
+def _curve(choice: Choice, scene: Scene, kind: str) -> tuple[Json, Step]:
+    trials, method = choice.trials, choice.final.chosen
+    full = choice.final.scores[method]
+    whole: Step = ("all", 1.0, [WHOLE] * len(trials.parts), WHOLE)
+    points, kept, beyond = [_point(trials, full, full, whole, True)], whole, 0
+    for step in STEPS[kind](trials):
+        try:
+            scores = _scores(trials, method, step)
+        except FormatError as e:
+            points.append({"name": step[0], "share": step[1], "refused": str(e)})
+            break
+        fine = _fine(trials, scene, full, scores)
+        points.append(_point(trials, full, scores, step, fine))
+        beyond += not fine
+        if beyond == BEYOND:
+            break
+        if not beyond:
+            kept = step
+    change = kept[3]
+    set_it = SET_IT[kind].format(change.rate) if change != WHOLE else ""
+    taxels = {"taxels": [list(divmod(t, trials.sweeps.format.cols)) for t in sorted(change.taxels)]}
+    return {"kind": kind, "points": points, "kept": kept[0], "set": set_it} | (taxels if change.taxels else {}), kept
+
+
+def _scores(trials: Trials, method: str, step: Step) -> Array:
+    trials.run(method, [(p,) for p in range(len(trials.parts))], step[2])
+    return trials.scores(method, None, step[2])
+
+
+def _fine(trials: Trials, scene: Scene, full: Array, scores: Array) -> bool:
+    """Less is enough, and does not fall below what is wanted where the whole does not."""
+    falls_short = trials.mean(scores) < scene.accuracy <= trials.mean(full)
+    return trials.difference(full, scores).within and not falls_short
+
+
+def _point(trials: Trials, full: Array, scores: Array, step: Step, fine: bool) -> Json:
+    behind = trials.difference(full, scores).json()
+    return {
+        "name": step[0],
+        "share": round(step[1], 4),
+        "accuracy": trials.accuracy(scores),
+        "behind": behind,
+        "fine": fine,
+    }
+
+
+def _windows(trials: Trials) -> Iterator[Step]:
+    for share in WINDOWS:
+        seconds = share * trials.sweeps.format.window / trials.sweeps.rate_hz
+        yield f"{seconds:.3g} s", share, [Change(window=share)] * len(trials.parts), Change(window=share)
+
+
+def _rates(trials: Trials) -> Iterator[Step]:
+    for rate in RATES:
+        yield (
+            f"{trials.sweeps.rate_hz / rate:.4g} Hz",
+            1 / rate,
+            [Change(rate=rate)] * len(trials.parts),
+            Change(rate=rate),
+        )
+
+
+def _bits(trials: Trials) -> Iterator[Step]:
+    kind = trials.sweeps.samples.dtype
+    of = 8 if kind.kind == "f" else 8 * kind.itemsize
+    for bits in BITS:
+        yield f"{of - bits} bits", 1 - bits / of, [Change(bits=bits)] * len(trials.parts), Change(bits=bits)
+
+
+def _taxels(trials: Trials) -> Iterator[Step]:
+    """Powers of two. Which ones is found anew without each part: that is part of what is judged."""
+    form = trials.sweeps.format
+    many = form.rows * form.cols
+    orders = [transforms.order(trials.sweeps.take(~part.out)) for part in trials.parts]
+    overall = transforms.order(trials.sweeps)
+    n = 2 ** ((many - 1).bit_length() - 1) if many > 1 else 0
+    while n:
+        change = [Change(taxels=tuple(sorted(order[:n]))) for order in orders]
+        yield f"{n} taxels", n / many, change, Change(taxels=tuple(sorted(overall[:n])))
+        n //= 2
+
+
+STEPS: dict[str, Callable[[Trials], Iterator[Step]]] = {
+    "window": _windows, "rate": _rates, "taxels": _taxels, "bits": _bits,
+}  # fmt: skip
+
+
+def _together(choice: Choice, scene: Scene, least: dict[str, Step]) -> tuple[Change, Json]:
+    """What is left out of all that may be, one after another as long as all together lose no more than may be lost."""
+    trials, method = choice.trials, choice.final.chosen
+    full = held = choice.final.scores[method]
+    changes, total = [WHOLE] * len(trials.parts), WHOLE
+    for name, share, each, change in least.values():
+        if change == WHOLE:
+            continue
+        both = [a.and_then(b) for a, b in zip(changes, each, strict=True)]
+        try:
+            scores = _scores(trials, method, (name, share, both, total.and_then(change)))
+        except FormatError:
+            continue
+        if _fine(trials, scene, full, scores):
+            changes, total, held = both, total.and_then(change), scores
+    return total, trials.accuracy(held) | {"behind": trials.difference(full, held).json()}
+
+
+def classes(choice: Choice, wanted: float) -> Json:
+    """What is gained by counting materials as one, the most confused pair first; counted, not trained anew.
+
+    Proposed are pairs that are CONFUSED, and as many as it takes to reach what is wanted. Nothing is applied: whether
+    two materials may be one is not ours to say.
+    """
+    trials = choice.trials
+    group, _, sweep, probability = trials.tested(choice.final.chosen)
+    label, names = trials.sweeps.labels[sweep], [(name,) for name in trials.sweeps.materials]
+    points: list[Json] = []
+    proposed, merged, going = [(name,) for name in trials.sweeps.materials], "", True
+    while True:
+        rows = _rows(trials, group, sweep, probability.argmax(1) == label)
+        accuracy, share = trials.accuracy(rows), len(names) / len(trials.sweeps.materials)
+        points.append({"name": f"{len(names)}", "share": round(share, 4), "accuracy": accuracy, "merged": merged})
+        if len(names) == 2:
+            break
+        confused = _confused(label, probability)
+        a, b = np.unravel_index(confused.argmax(), confused.shape)
+        names[a], merged = names[a] + names[b], " + ".join(names[a] + names[b])
+        names.pop(b)
+        if going := going and (confused[a, b] >= CONFUSED or accuracy["mean"] < wanted):
+            proposed = list(names)
+        probability[:, a] += probability[:, b]
+        probability = np.delete(probability, b, axis=1)
+        label = np.where(label == b, a, label - (label > b))
+    together = [list(those) for those in proposed if len(those) > 1]
+    return {"kind": "classes", "points": points, "kept": points[0]["name"], "proposed": together, "set": ""}
+
+
+def _confused(label: Array, probability: Array) -> Array:
+    """[K, K], above the diagonal: the share of two materials' sweeps that are taken for the other one."""
+    k = probability.shape[1]
+    counts = np.zeros((k, k))
+    np.add.at(counts, (label, probability.argmax(1)), 1)
+    size = counts.sum(1)
+    return np.triu((counts + counts.T) / np.maximum(size[:, None] + size, 1), 1)
+
+
+def _rows(trials: Trials, group: Array, sweep: Array, right: Array) -> Array:
+    """`right` of all tests as scores [groups, N]."""
+    total, many = np.zeros((2, len(trials.groups), len(trials.sweeps)))
+    np.add.at(total, (group, sweep), right)
+    np.add.at(many, (group, sweep), 1)
+    return np.where(many > 0, total / np.maximum(many, 1), np.nan)

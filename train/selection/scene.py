@@ -1,0 +1,223 @@
+"""The room of scenes: what an integrator has, and what must do there. In: scene.toml. Out: a checked Scene and its sweeps.
+
+docs/choose/tubes.toml shows every key. The dataclasses are the schema: a field's type and limits say what the file may hold.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import Field, dataclass, field, fields, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appliance.bundle.bundle import LABEL
+from appliance.core.errors import FormatError
+from train.data import sets
+from train.data.sets import SweepSet
+from train.evaluation import corruptions
+from train.models import methods
+
+REDUCTIONS = ("window", "rate", "taxels", "bits", "classes")
+"""What may be tried with less of."""
+APPLICABLE = ("window", "rate", "taxels")
+"""Of these, what a bundle's format holds. The others are told only."""
+Read = Callable[[Any], Any]
+
+
+def _key(default: Any, allowed: str, read: Read) -> Any:
+    """A field that a file may set. read: a value -> what is kept, None where it is not `allowed`."""
+    return field(default=default, metadata={"allowed": allowed, "read": read})
+
+
+def _table(allowed: str, read: Read) -> Any:
+    return field(default_factory=dict, metadata={"allowed": allowed, "read": read})
+
+
+def _number(default: float, least: float, most: float, *, whole: bool = False) -> Any:
+    kinds, name = ((int,), "a whole number") if whole else ((int, float), "a number")
+
+    def read(value: Any) -> Any:
+        return value if type(value) in kinds and least <= value <= most else None
+
+    return _key(default, f"{name} from {least:g} to {most:g}", read)
+
+
+def _text(default: str, form: re.Pattern[str] = LABEL) -> Any:
+    def read(value: Any) -> Any:
+        return value if isinstance(value, str) and form.fullmatch(value) else None
+
+    return _key(default, "a text of 1 to 24 letters, digits, spaces, '.', '_' or '-'", read)
+
+
+def _texts(value: Any) -> tuple[str, ...] | None:
+    sound = isinstance(value, list) and all(isinstance(v, str) and v for v in value) and len(set(value)) == len(value)
+    return tuple(value) if sound else None
+
+
+def _list(default: tuple[str, ...] = (), of: tuple[str, ...] = ()) -> Any:
+    def read(value: Any) -> Any:
+        found = _texts(value)
+        return None if found is None or (of and set(found) - set(of)) else found
+
+    return _key(default, f"a list of some of {', '.join(of)}" if of else "a list of different texts", read)
+
+
+def _severities(value: Any) -> dict[str, float] | None:
+    numbers = isinstance(value, dict) and all(type(v) in (int, float) and v > 0 for v in value.values())
+    return {name: float(v) for name, v in value.items()} if numbers else None
+
+
+def _merged(value: Any) -> dict[str, tuple[str, ...]] | None:
+    held = {name: _texts(names) for name, names in value.items()} if isinstance(value, dict) else {"": None}
+    sound = all(names and LABEL.fullmatch(name) for name, names in held.items())
+    return held if sound else None  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What the board has for a sweep. Without a limit a figure does not count.
+
+    ms: for features and network together. kb: 1000 bytes, of the whole bundle. mb: 2**20 bytes, resident with it.
+    slower: how many of this machine's ms are one of the board's: an assumption, until it is measured there.
+    """
+
+    ms: float = _number(math.inf, 1e-3, 1e6)
+    kb: float = _number(math.inf, 1, 1e6)
+    mb: float = _number(math.inf, 1, 1e6)
+    slower: float = _number(1.0, 0.01, 1000)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What scene.toml says. Every field but `sets` may be left out.
+
+    name, version: of the bundle; the file's own name, and "1". sets: as --set, files relative to scene.toml, $NAMES of
+    the environment filled in; only: as --only. materials: those at hand, all where empty; merge: of several labels
+    one. varies: groups that are others at work than in training. folds: into how many parts the values of each are
+    drawn (0: five for one group, four for two, else three). stress: severity by name. accuracy: wanted; 0: as much as
+    there is. seeds: of training, 1 to so many. methods: the ladder, where it is not the usual one. reduce: what may be
+    tried with less of; apply: with what of it the bundle is packed. full_scale: the sensor's highest digit; 0: its type's.
+    """
+
+    name: str = _text("")
+    version: str = _text("1")
+    sets: tuple[str, ...] = _list()
+    only: tuple[str, ...] = _list()
+    materials: tuple[str, ...] = _list()
+    merge: Mapping[str, tuple[str, ...]] = _table("lists of materials by their new name", _merged)
+    varies: tuple[str, ...] = _list()
+    folds: int = _number(0, 3, 20, whole=True)
+    stress: Mapping[str, float] = _table("numbers above 0 by a stress's name", _severities)
+    accuracy: float = _number(0.0, 0, 1)
+    seeds: int = _number(1, 1, 20, whole=True)
+    methods: tuple[str, ...] = _list()
+    reduce: tuple[str, ...] = _list(REDUCTIONS, REDUCTIONS)
+    apply: tuple[str, ...] = _list(("window",), APPLICABLE)
+    full_scale: float = _number(0.0, 1, 1e9)
+    budget: Budget = Budget()
+    path: Path = Path()
+
+    def sweeps(self) -> SweepSet:
+        """The sweeps at hand, narrowed and merged. Raises FormatError naming scene.toml and what does not fit the sets."""
+        whole = sets.join([sets.load(self._place(spec), 1) for spec in self.sets]).select(self.only)
+        known = whole.materials
+        for name in (*self.materials, *(m for names in self.merge.values() for m in names)):
+            if name not in known:
+                raise self._error("material", name, known)
+        kept = [m for m in known if m in (self.materials or known)]
+        new = {m: name for name, names in self.merge.items() for m in names}
+        labels = tuple(dict.fromkeys(new.get(m, m) for m in kept))
+        for label in labels:
+            if not LABEL.fullmatch(label):
+                raise FormatError(
+                    f"{self.path.name}: label {label!r} cannot be sent by the box; name it anew in [merge]"
+                )
+        at = np.array([labels.index(new.get(m, m)) if m in kept else -1 for m in known])[whole.labels]
+        part = whole.take(at >= 0)
+        part = replace(part, labels=at[at >= 0], materials=labels).of_several().of_whole_recordings()
+        for name in self.varies:
+            if name not in {"recording", *part.groups}:
+                raise self._error("varies", name, (*sorted(part.groups), "recording"))
+        return part
+
+    def _place(self, spec: str) -> str:
+        full = os.path.expandvars(spec)
+        if "$" in full:
+            raise FormatError(f"{self.path.name}: sets: {spec!r} names a variable that is not set; set it to a folder")
+        return full if full.startswith("sim:") else str(self.path.parent / full)
+
+    def _error(self, key: str, value: str, known: tuple[str, ...]) -> FormatError:
+        return FormatError(f"{self.path.name}: {key} {value!r} is unknown{_near(value, known)}")
+
+
+def read(path: Path) -> Scene:
+    """The scene in a file. Raises FormatError naming the file, the key, its value and what is allowed."""
+    try:
+        told = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        raise FormatError(f"{path.name}: not TOML: {e}") from e
+    budget = told.pop("budget", {})
+    if not isinstance(budget, dict):
+        raise FormatError(f"{path.name}: budget = {budget!r} is not allowed; write a table [budget]")
+    name = re.sub(r"[^A-Za-z0-9 _.-]", "-", path.stem).lstrip(" _.-")[:24] or "scene"
+    found = {"name": name} | _values(path.name, "", Scene, told)
+    scene = Scene(**found, budget=Budget(**_values(path.name, "budget.", Budget, budget)), path=path)
+    _check(scene, told)
+    return scene
+
+
+def _values(file: str, section: str, schema: type[Any], told: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of one table, each as its field has it."""
+    keys: dict[str, Field[Any]] = {f.name: f for f in fields(schema) if f.metadata}
+    found = {}
+    for name, value in told.items():
+        if name not in keys:
+            raise FormatError(f"{file}: key {section}{name} is unknown{_near(name, tuple(keys))}")
+        if (kept := keys[name].metadata["read"](value)) is None:
+            raise FormatError(
+                f"{file}: {section}{name} = {value!r} is not allowed; use {keys[name].metadata['allowed']}"
+            )
+        found[name] = kept
+    return found
+
+
+def _check(scene: Scene, told: Mapping[str, Any]) -> None:
+    """What fits no single key. Raises FormatError."""
+    file = scene.path.name
+    if not scene.sets:
+        raise FormatError(f'{file}: no sets; name some, e.g. sets = ["recordings.npz"]')
+    merged = [m for names in scene.merge.values() for m in names]
+    for name in merged:
+        if merged.count(name) > 1:
+            raise FormatError(f"{file}: merge names {name!r} twice; a material goes into one label")
+        if scene.materials and name not in scene.materials:
+            raise FormatError(f"{file}: merge names {name!r}, which is not among materials; add it there")
+    known = tuple(methods.every())
+    for name in scene.methods:
+        if name not in known:
+            raise FormatError(f"{file}: method {name!r} is unknown{_near(name, known)}")
+    digital = {s.name: s for s in corruptions.STRESSES if s.only != "simulated"}
+    for name, severity in scene.stress.items():
+        if name not in digital:
+            raise FormatError(
+                f"{file}: stress {name!r} is none that any sweep can be put under{_near(name, tuple(digital))}"
+            )
+        if severity > (most := digital[name].severities[-1]):
+            raise FormatError(
+                f"{file}: stress.{name} = {severity:g} is out of range; use up to {most:g} {digital[name].unit}"
+            )
+    if "apply" in told and (unused := set(scene.apply) - set(scene.reduce)):
+        raise FormatError(f"{file}: apply names {min(unused)!r}, which is not in reduce; add it there")
+
+
+def _near(value: str, known: tuple[str, ...]) -> str:
+    by_lower = {name.lower(): name for name in known}
+    close = get_close_matches(value.lower(), by_lower, 1)
+    return f"; did you mean {by_lower[close[0]]!r}?" if close else f"; use {', '.join(known)}"
