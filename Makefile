@@ -68,9 +68,10 @@ fuzz: $(DESKTOP) ## fuzz all that comes from outside: MINUTES=10 of processor ti
 	$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install atheris==3.0.0
 	$(BIN)/python -m tests.fuzz $(TARGETS) --minutes $(or $(MINUTES),10)
 
-lint: $(DESKTOP) ## ruff
+lint: $(DESKTOP) ## ruff, and which package may import which
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 
 machines: $(DESKTOP) ## the same bundles on older x86 and on arm64 (emulated; gets what that needs)
 	PALPATE_MACHINES=1 $(BIN)/python -m pytest -q -rP tests/campaigns/test_machines.py

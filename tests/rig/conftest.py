@@ -4,7 +4,6 @@ skipped. `make test-rig` sets it, and makes the box first.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,8 +15,7 @@ from tests.rig.cell import Cell
 from tests.rig.image import Image
 from tests.rig.image import image as make_image
 from tests.rig.machine import Machine
-
-HOW = os.environ.get("PALPATE_RIG", "")
+from tests.rig.notes import HOW
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

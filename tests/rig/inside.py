@@ -1,5 +1,5 @@
 """What a test that runs inside the guest stands on. In: a Machine. Out: a folder for its second disk, and a bench that does
-outside what such a test asks for (tests/undersides/remote.py).
+outside what such a test asks for (tests/backends/remote.py).
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ SETTLE_S = 0.2
 
 
 def pack(folder: Path, tests: Iterable[str]) -> None:
-    """Put these files and folders of tests/ and what runs them into `folder`."""
+    """Put these files and folders of the checkout and what runs them into `folder`, each where it lies in the checkout."""
     for name in tests:
-        source = ROOT / "tests" / name
+        source, place = ROOT / name, folder / name
+        place.parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():
-            shutil.copytree(source, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(source, place, ignore=shutil.ignore_patterns("__pycache__"))
         else:
-            shutil.copy(source, folder)
+            shutil.copy(source, place)
     for name in RUNNER:
         made = distribution(name)
         for file in made.files or []:

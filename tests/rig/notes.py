@@ -7,12 +7,16 @@ the last.
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 from tests.factories.emulated_machines import ROOT
 
 FILE = ROOT / "build" / "rig" / "faults.jsonl"
+
+HOW = os.environ.get("PALPATE_RIG", "")
+"""How the virtual box is tested: quick, full, or not at all."""
 
 
 def write(test: str, fault: str, outcome: str, times: int, file: Path = FILE) -> None:

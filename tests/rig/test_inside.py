@@ -12,16 +12,26 @@ from tests.rig.image import Image
 from tests.rig.inside import Bench, pack
 from tests.rig.machine import Machine
 
-PYTEST = "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider test_contract.py"
+PYTEST = "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider tests/appliance/io/test_backends.py"
+CODE = (
+    "pyproject.toml",
+    "tests/conftest.py",
+    "tests/factories/no-site.toml",
+    "tests/factories/paths.py",
+    "tests/factories/simulated_box.py",
+    "tests/backends",
+    "tests/appliance/io/test_backends.py",
+)
+"""What the guest needs of this checkout beside the box that is installed there."""
 
 
 def test_the_contract_holds_on_a_real_kernel(
     image: Image, tmp_path: Path, count: Callable[[int, int], int], note: Callable[[str, str, int], None]
 ):
-    """test_contract.py with real libusb, libgpiod and termios on xHCI, PL061 and a 16550; a part of it where time is short."""
+    """test_backends.py with real libusb, libgpiod and termios on xHCI, PL061 and a 16550; a part of it where time is short."""
     code = tmp_path / "code"
     code.mkdir()
-    pack(code, ["conftest.py", "no-site.toml", "test_contract.py", "undersides"])
+    pack(code, CODE)
     some = count(1, 0) * " -k 'without_a_gap or start_and_stop or test_outputs or arrive_whole'"
     with Machine(image, tmp_path, snapshot=True, code=code) as machine:
         asking = threading.Thread(

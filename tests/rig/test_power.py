@@ -22,10 +22,10 @@ from appliance.core.types import Frames, Status, Sweep
 from appliance.io.robot_link import sentence
 from appliance.sim import script, skin
 from tests.rig.cell import Cell, Touch
-from tests.rig.conftest import HOW
 from tests.rig.image import Image
 from tests.rig.kept import KEPT, Ledger, found, lost, owed, runs_with, sweeps, whole
 from tests.rig.machine import Machine
+from tests.rig.notes import HOW
 from tests.rig.sound import known
 
 START_S = 12

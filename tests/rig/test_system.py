@@ -17,9 +17,9 @@ from appliance.recording.capture import Playback
 from appliance.sim import script
 from appliance.tools.score import Answer
 from tests.rig.cell import Cell
-from tests.rig.conftest import HOW
 from tests.rig.image import GUEST_PYTHON
 from tests.rig.kept import KEPT, runs_with
+from tests.rig.notes import HOW
 from tests.rig.sound import TRIES, begin, known, not_wrong, state, until_state
 
 CAPTURE = "/run/capture"

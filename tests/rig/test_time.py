@@ -19,9 +19,9 @@ import pytest
 from appliance.core.types import EPOCH_BITS, Sweep, load
 from appliance.sim import rig, script, skin
 from tests.rig.cell import Cell
-from tests.rig.conftest import HOW
 from tests.rig.kept import KEPT, runs_with
 from tests.rig.machine import Machine
+from tests.rig.notes import HOW
 from tests.rig.sound import LATE, known, not_wrong
 
 Note = Callable[[str, str, int], None]

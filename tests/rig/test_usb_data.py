@@ -16,7 +16,7 @@ import pytest
 from appliance.io import packets
 from appliance.sim import script
 from tests.rig.cell import Cell
-from tests.rig.conftest import HOW
+from tests.rig.notes import HOW
 from tests.rig.sound import begin, comes_back, known, not_wrong, only_answer, state, until, until_state
 
 Count = Callable[[int, int], int]

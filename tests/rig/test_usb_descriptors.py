@@ -14,7 +14,7 @@ import pytest
 
 from appliance.sim import script
 from tests.rig.cell import Cell
-from tests.rig.conftest import HOW
+from tests.rig.notes import HOW
 from tests.rig.sound import comes_back, known, state, until_state
 from tests.rig.usbredir import Descriptors
 

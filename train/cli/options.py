@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from appliance.core.errors import FormatError
@@ -12,6 +13,8 @@ from train.data import sets
 from train.evaluation import evaluate
 from train.models import methods
 
+Add = Callable[[str, Callable[[argparse.Namespace], None], str], argparse.ArgumentParser]
+"""How a command is added: its name, what runs, what it does -> its parser."""
 SET = "FILE (.npz, .h5), a folder of recordings or sim:NAME[:SEED[-LAST][:SWEEPS]]; several are joined"
 LOG_EVERY_S = 30
 

@@ -7,7 +7,6 @@ whatever ends the connection, no half of one is left under them, and the next ca
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import re
 import shlex
@@ -25,7 +24,6 @@ from appliance.core import storage
 from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.types import load
-from train.cli import options
 
 FOLDER = f"{StoreConfig().folder}/sweeps"
 PAIR = (".json", ".npy")
@@ -101,51 +99,6 @@ class Tally:
     relabelled: list[str] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
-
-
-def register(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """The command `pull`."""
-    one = add("pull", run_pull, "fetch what a box has recorded and is not here yet")
-    one.add_argument("host", metavar="HOST", help="as for ssh: user@box")
-    one.add_argument("--from", default=FOLDER, metavar="DIR", dest="folder", help=f"on the box ({FOLDER})")
-    one.add_argument("--out", type=Path, required=True, metavar="DIR", help="here; its folders are those of the box")
-    one.add_argument("--port", type=int, metavar="N", help="of the box's sshd")
-    one.add_argument("--ssh-option", action="append", default=[], metavar="OPTION", help="as for ssh -o, e.g. User=pi")
-
-
-def run_pull(args: argparse.Namespace) -> None:
-    """Say what was fetched and what was not."""
-    chosen = [part for option in args.ssh_option for part in ("-o", option)]
-    box = Box(args.host, args.folder, [*chosen, *(["-p", str(args.port)] if args.port else [])])
-    tally = Tally()
-    try:
-        pull(box, args.out, tally, options.Log())
-    finally:
-        print(
-            f"fetched {len(tally.fetched)}, there already {len(tally.there)}, refused {len(tally.refused)}", flush=True
-        )
-        _tell(tally, args.out)
-    if bad := len(tally.refused) + len(tally.others):
-        raise FormatError(f"{bad} recordings of {args.host} were not taken; the lines above say why")
-
-
-def _tell(tally: Tally, out: Path) -> None:
-    """A line for each kind of recording that needs somebody's eyes."""
-    for names, what in (
-        (tally.halves, "without its .json or .npy on the box; left there"),
-        (
-            tally.relabelled,
-            f"described otherwise on the box; what is in {out} stays: remove its .npy and .json to take the box's",
-        ),
-        (
-            tally.others,
-            f"another sweep on the box under the same name; the one in {out} stays: remove it, or pull into another folder",
-        ),
-        (tally.refused, "refused"),
-    ):
-        if names:
-            more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-            print(f"{', '.join(sorted(names)[:SHOWN])}{more}: {what}")
 
 
 def pull(box: Box, out: Path, tally: Tally, log: Callable[[str], None]) -> None:

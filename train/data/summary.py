@@ -6,58 +6,24 @@ keeps the folder from being trained on is said.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from appliance.core.errors import FormatError
-from appliance.core.storage import put
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
-from train.cli import options
 from train.data import readers, sets
 from train.data.readers import Recording
 from train.data.sets import SweepSet, shortened
-from train.reports import sweep_plot
 
 Names = Mapping[str, Mapping[int, str]]
 """Of a group, and in it of a number: what it is called."""
 WIDEST = 12
 """Columns that a table has at most; a group of more values is told by its line alone."""
 NAMELESS = "(none)"
-
-
-def register(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """The command `sets` with what it can do."""
-    parts = add("sets", run_known, "tell what sweep sets can be named, what is in some, or show one sweep")
-    more = parts.add_subparsers(metavar="COMMAND")
-    one = more.add_parser("describe", help="count what is in sets: materials by position and session, frames lost")
-    one.add_argument("sets", nargs="+", metavar="SET", help=options.SET)
-    one.set_defaults(run=run_describe)
-    two = more.add_parser("view", help="draw one sweep: its taxels over time, and their spectrum")
-    two.add_argument("sweep", metavar="SWEEP", help="an .npy that the box recorded, or a SET with --number")
-    two.add_argument("--number", type=int, metavar="N", help="which sweep of the set, from 0 on")
-    two.add_argument("--out", type=Path, required=True, metavar="FILE.svg")
-    two.set_defaults(run=run_view)
-
-
-def run_known(args: argparse.Namespace) -> None:
-    """What can be named."""
-    print(known())
-
-
-def run_describe(args: argparse.Namespace) -> None:
-    """What is in the sets named."""
-    print("\n\n".join(describe(spec) for spec in args.sets))
-
-
-def run_view(args: argparse.Namespace) -> None:
-    """The picture's name."""
-    put(args.out, sweep_plot.draw(sweep_plot.look(args.sweep, args.number)).encode(), parents=True)
-    print(args.out)
 
 
 def describe(spec: str) -> str:

@@ -6,24 +6,17 @@ what they would be without each of the simulator's effects. No network is looked
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.errors import FormatError
-from appliance.core.storage import put
 from appliance.sim import skin
-from train.cli import options
 from train.data import sets
 from train.data.splitters import Protocol
 from train.evaluation import parallel
-from train.metrics.score import provenance
 from train.models import baselines, methods
 
 Array = NDArray[Any]
@@ -173,24 +166,3 @@ def _short(value: float, form: str) -> str:
 
 def _spoken(match: dict[str, Any]) -> str:
     return f"largest difference {_short(match['largest'], '.3f')}, mean {_short(match['mean'], '.3f')}"
-
-
-def register(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """The command `palpate-train calibrate`."""
-    one = add("calibrate", run, "compare the simulator with the twenty accuracies that the paper prints")
-    one.add_argument("--seeds", default="201-208", metavar="FIRST-LAST", help="of the simulated worlds (201-208)")
-    one.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
-    one.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    one.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
-
-
-def run(args: argparse.Namespace) -> None:
-    """The table; the figures as JSON where asked for."""
-    first, _, last = args.seeds.partition("-")
-    if not first.isdigit() or not (last or first).isdigit() or int(last or first) < int(first):
-        raise FormatError(f"--seeds {args.seeds} cannot be read; write FIRST-LAST, e.g. 201-208")
-    seeds = range(int(first), int(last or first) + 1)
-    told = measure(seeds, args.ablate, options.Log(), jobs=args.jobs) | provenance()
-    if args.json:
-        put(args.json, (json.dumps(told, indent=1) + "\n").encode(), parents=True)
-    print(table(told))

@@ -6,9 +6,7 @@ figures come from Cases without training again. What a rule, a limit or a temper
 
 from __future__ import annotations
 
-import argparse
 import io
-import json
 import time
 import zipfile
 from collections.abc import Callable, Sequence
@@ -23,8 +21,6 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.calibration.completion import seen
 from train.calibration.posthoc import Copies, Finish, finish
-from train.cli import options
-from train.data import sets
 from train.data.sets import SweepSet, digest, join
 from train.data.splitters import Protocol
 from train.evaluation import parallel, uncertainty
@@ -35,7 +31,6 @@ from train.models import methods
 from train.models.compact.fit import Fit
 from train.models.methods import Effort
 from train.onnx_tools.graph_builder import run as through
-from train.reports import uncertainty_report
 
 Array = NDArray[Any]
 Log = Callable[[str], None]
@@ -171,44 +166,6 @@ def run(
         "took_s": round(time.monotonic() - start, 1),
     }  # fmt: skip
     return about | provenance() | told
-
-
-def write(told: dict[str, Any], out: Path) -> Path:
-    """results.json, the pictures and the page in the folder `out`; the page's path."""
-    page, pictures = uncertainty_report.tell(told)
-    put(out / "results.json", (json.dumps(told) + "\n").encode(), parents=True)
-    for name, svg in pictures.items():
-        put(out / f"{name}.svg", svg.encode(), parents=True)
-    put(out / "index.html", page.encode(), parents=True)
-    return out / "index.html"
-
-
-def register(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """The command `certainty`; add: as palpate-train adds its commands."""
-    one = add(
-        "certainty", command, "tell how sure a model may be: calibration, more sweeps, unknown materials, enrolment"
-    )
-    options.add_set(one)
-    one.add_argument("--test", metavar="SET", help="test on this set")
-    one.add_argument(
-        "--protocol", default="leave:position", help="what is tested on where --test is not given (leave:position)"
-    )
-    one.add_argument("--method", default="compact", metavar="NAME", help="compact or one of its family (compact)")
-    one.add_argument("--seed", type=int, default=1, help="of training and draws (1)")
-    one.add_argument(
-        "--out", type=Path, default=Path("docs/certainty"), metavar="DIR", help="where it goes (docs/certainty)"
-    )
-    one.add_argument("--kept", action="store_true", help="train nothing, tell what an earlier run has finished")
-    options.add_effort(one)
-    options.add_where(one)
-
-
-def command(args: argparse.Namespace) -> None:
-    """All of it; the page is named at the end."""
-    test = sets.load(args.test).select(args.only) if args.test else None
-    told = run(options.load(args), test, args.protocol, args.method, options.where(args), options.Log(),
-               options.effort(args), args.seed)  # fmt: skip
-    print(write(told, args.out))
 
 
 def _learn(numbered: tuple[int, Task], sweeps: SweepSet) -> Case:

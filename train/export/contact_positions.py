@@ -6,32 +6,24 @@ with accuracy is measured by `palpate-train placing`: the same sweeps again and 
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
-from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
-from appliance.core.storage import put
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
 from appliance.signal.contact import MOST_POSITIONS, Place, centre
 from appliance.sim import skin
 from train.calibration import novelty
-from train.cli import options
 from train.data.sets import SweepSet
 from train.evaluation.robustness_data import Trial
 from train.metrics.score import interval, provenance
-from train.reports import plot_style
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -147,56 +139,6 @@ def _fall(points: Sequence[Json]) -> Json:
         if point["accuracy"][0] <= at_home - FALL:
             return {"lost_at_mm": abs(point["mm"]), "moved": point["moved"], "moved_before": before["moved"]}
     return {"lost_at_mm": None, "moved": points[-1]["moved"], "moved_before": points[-2]["moved"]}
-
-
-def chart(told: Json) -> str:
-    """Share right and share flagged over how far the skin was moved, along the finger and across: SVG."""
-    figure, height = plot_style.Figure((plot_style.WIDTH, 4.7)), 4.7
-    for number, (way, points) in enumerate(told["moved"].items()):
-        top = 1 - (0.5 + 2.15 * number) / height
-        axes = plot_style.add(figure, 0.09, 0.97, top, top - 1.45 / height)
-        mm = [point["mm"] for point in points]
-        for name, colour, said, up in (
-            ("accuracy", plot_style.ACCENT, "named rightly", 0.85), ("moved", plot_style.INK, "flagged\nas moved", 0.58),
-        ):  # fmt: skip
-            mean, low, high = np.array([point[name] for point in points]).T
-            axes.fill_between(mm, low, high, color=colour, alpha=0.13, linewidth=0)
-            axes.plot(mm, mean, color=colour, linewidth=2, linestyle="-" if name == "accuracy" else (0, (4, 1.5)))
-            plot_style.write(axes, 0, up, said, colour, plot_style.SMALL)
-        axes.set(xlim=(mm[0], mm[-1]), ylim=(-0.03, 1.03))
-        axes.grid(axis="y", color=plot_style.FAINT, linewidth=0.8)
-        plot_style.scale(axes.yaxis, (0, 0.5, 1))
-        plot_style.scale(axes.xaxis, range(-6, 7, 2))
-        along = {"rows": "along the finger, towards row 4", "columns": "across, towards column 4"}[way]
-        plot_style.write(axes, mm[0], 1.17, f"skin moved {along}", ha="left")
-        if number:
-            plot_style.write(
-                axes, 0, -0.28, "mm from a place like those of training", plot_style.GREY, plot_style.SMALL
-            )
-    n, tapings = (told["moved"]["rows"][0][name] for name in ("n", "tapings"))
-    return plot_style.svg(
-        figure, f"Share of {n} simulated sweeps ({tapings} tapings) that are named rightly, and flagged as moved"
-    )
-
-
-def register(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """The command `palpate-train placing`."""
-    one = add("placing", run, "tell whether a skin that has moved is flagged before accuracy is lost (simulated)")
-    one.add_argument("--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)")
-    one.add_argument("--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on")
-    one.add_argument("--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places")
-    one.add_argument("--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead")
-    one.add_argument("--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go")
-
-
-def run(args: argparse.Namespace) -> None:
-    """Measure, write, and say the least of it."""
-    box = Classifier(bundle.load(args.bundle), SystemClock())
-    told = measure(box, args.unseen, args.seen, args.hard, options.Log())
-    args.out.mkdir(parents=True, exist_ok=True)
-    put(args.out / "place.json", (json.dumps(told, indent=1) + "\n").encode(), parents=True)
-    put(args.out / "place.svg", (chart(told) + "\n").encode(), parents=True)
-    print("\n".join(lines(told)))
 
 
 def lines(told: Json) -> Iterator[str]:

@@ -5,9 +5,7 @@ Nothing leaves whose int8 form answers otherwise than what was trained.
 
 from __future__ import annotations
 
-import argparse
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,6 @@ from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.sim import skin
-from train.cli import options
 from train.data.sets import SweepSet
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
@@ -149,18 +146,6 @@ def compared(source: Path, sweeps: SweepSet, file: Path | None = None) -> str:
         told = {"model": source.name, "set": sweeps.source} | found.json() | provenance()
         put(file, (json.dumps(told, indent=1) + "\n").encode(), parents=True)
     return parity.table(found)
-
-
-def register(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """The command `parity`. add: as in __main__, (name, what runs, what it does) -> its parser."""
-    one = add(
-        "parity",
-        lambda args: print(compared(args.model, options.load(args), args.json)),
-        "tell what int8 does to a model's answers, and to each tensor",
-    )
-    one.add_argument("model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form")
-    options.add_set(one)
-    one.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
 
 
 def yardsticks(folder: Path, seed: int = 0) -> tuple[Path, Path]:

@@ -6,8 +6,6 @@ signed, can be put back unnoticed. The counter is the signer's: count what you d
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,20 +32,3 @@ def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
     text = manifest.json()
     storage.put_all({folder / bundle.SIGNATURE: signature.sign(text, key), folder / bundle.MANIFEST: text})
     return manifest
-
-
-def register(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """The command `sign`. add: as in __main__, (name, what runs, what it does) -> its parser."""
-    one = add("sign", _run, "sign a bundle, so that boxes take it")
-    one.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
-    one.add_argument("--key", type=Path, required=True, metavar="KEY", help="yours: ssh-keygen -t ed25519 makes one")
-    one.add_argument(
-        "--counter", type=int, metavar="N", help="above that of all bundles that were delivered before (1 is the first)"
-    )
-
-
-def _run(args: argparse.Namespace) -> None:
-    made = sign(args.bundle, args.key, args.counter)
-    print(
-        f"signed: {made.name} {made.version}, counter {made.counter}, {bundle.identity(made.json())} in {args.bundle}"
-    )

@@ -6,9 +6,7 @@ run. An interrupted command goes on where it was.
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +17,6 @@ import numpy as np
 
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.storage import put
-from train.cli import options
 from train.data import sets
 from train.evaluation import evaluate, parallel, robustness
 from train.evaluation.evaluate import Plan, Where
@@ -239,34 +236,6 @@ def _at(curve: Json, severity: float) -> tuple[float, ...]:
 
 def _entry(mean: float, low: float, high: float, n: int, seeds: Sequence[int]) -> Json:
     return {"mean": round(mean, 4), "low": round(low, 4), "high": round(high, 4), "n": n, "seeds": list(seeds)}
-
-
-def register(add: Callable[..., argparse.ArgumentParser]) -> None:
-    """Register the command."""
-    one = add("chart", command, "chart accuracy against cost: every method as a bundle, timed as on the box")
-    one.add_argument("--out", type=Path, default=Path("docs/chart"), metavar="DIR", help="where it goes (docs/chart)")
-    one.add_argument("--quick", action="store_true", help="small sets, hardly trained: all is tried, nothing told")
-    one.add_argument("--kept", action="store_true", help="train nothing, chart what an earlier run has finished")
-    one.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
-                     help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
-    one.add_argument("--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)")
-    one.add_argument("--certainty", type=Path, action="append", default=[], metavar="FILE",
-                     help="results.json of palpate-train certainty, for the touch time of its method")  # fmt: skip
-    options.add_effort(one)
-    options.add_where(one)
-
-
-def command(args: argparse.Namespace) -> None:
-    """All of it, written to --out; the page is named at the end. Raises FormatError where nothing is left to draw."""
-    chart, effort = (QUICK, QUICK_EFFORT) if args.quick else (FULL, options.effort(args))
-    touch = touch_shares(args.certainty)
-    charting = Charting(chart, options.where(args), options.Log(), args.data, effort, options.seeds(args), touch)
-    found = charting.dots()
-    for name, why in charting.left_out.items():
-        print(f"left out: {name}: {why}")
-    if not found:
-        raise FormatError("no model is left to chart; see above, and run it without --kept")
-    print(write(args.out, found, args.quick, charting.left_out))
 
 
 def touch_shares(paths: Sequence[Path]) -> dict[str, float]:

@@ -5,11 +5,14 @@ Nothing is computed here; every sentence with a number takes it from the figures
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 
+from appliance.core.storage import put
 from train.calibration.novelty import KEPT
 from train.reports import html
 from train.reports.plot_style import ACCENT, FAINT, GREY, INK, SMALL, field, scale, share, svg
@@ -276,3 +279,13 @@ def _points(value: float) -> str:
 
 def _met(met: bool) -> str:
     return "reached" if met else "not reached"
+
+
+def write(told: dict[str, Any], out: Path) -> Path:
+    """results.json, the pictures and the page in the folder `out`; the page's path."""
+    page, pictures = tell(told)
+    put(out / "results.json", (json.dumps(told) + "\n").encode(), parents=True)
+    for name, picture in pictures.items():
+        put(out / f"{name}.svg", picture.encode(), parents=True)
+    put(out / "index.html", page.encode(), parents=True)
+    return out / "index.html"

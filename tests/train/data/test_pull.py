@@ -13,7 +13,6 @@ import os
 import shutil
 import subprocess
 import tarfile
-from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ import pytest
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.types import Status, load
 from tests.factories.recordings import record
+from train.cli.main import parser
 from train.data import pull
 from train.data.pull import Box, Tally
 
@@ -55,9 +55,8 @@ class Ground:
 
     def pull(self, *more: str) -> None:
         """The command."""
-        parser = ArgumentParser()
-        pull.register(lambda name, run, text: parser)
-        pull.run_pull(parser.parse_args(["user@box", "--from", str(self.box), "--out", str(self.here), *more]))
+        args = parser().parse_args(["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more])
+        args.run(args)
 
     def fetch(self) -> Tally:
         """The same as a call."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from appliance.core.errors import FormatError
 from appliance.core.types import Status
 from tests.factories.recordings import record
 from tests.factories.sweep_sets import easy, write
+from train.cli.main import parser
 from train.data import sets, summary
 
 
@@ -23,14 +23,7 @@ def lines(s: sets.SweepSet) -> list[str]:
 
 def command(*words: str) -> None:
     """The command `sets`."""
-    parser = ArgumentParser()
-
-    def add(name: str, run: object, text: str) -> ArgumentParser:
-        parser.set_defaults(run=run)
-        return parser
-
-    summary.register(add)
-    args = parser.parse_args(words)
+    args = parser().parse_args(["sets", *words])
     args.run(args)
 
 

@@ -182,7 +182,7 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
     )
     assert first["trainings"] == 4
     assert "4/4 done" in lines[-2]
-    page = uncertainty_cases.write(first, tmp_path / "out")
+    page = uncertainty_report.write(first, tmp_path / "out")
     assert sorted(p.name for p in page.parent.iterdir()) == sorted(
         [
             *(f"{n}.svg" for n in ("enrolment", "reliability", "sweeps", "touch", "unknown")),

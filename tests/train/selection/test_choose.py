@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,13 +14,14 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.core.errors import FormatError
+from train.cli.main import main
 from train.data.sets import SweepSet
 from train.evaluation import evaluate
 from train.evaluation.evaluate import Where
 from train.models import methods
 from train.models.methods import USUAL, Method
 from train.onnx_tools.graph_builder import Graph, run
-from train.selection import choose, nested_cv, reduction_curves, scene, select
+from train.selection import nested_cv, reduction_curves, scene, select
 from train.selection import prices as rungs
 from train.selection.prices import Price
 
@@ -92,7 +92,7 @@ def fakes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def put(known: dict[str, Method] = FAKES, prices: dict[str, Price] = COSTS) -> None:
         monkeypatch.setattr(methods, "every", lambda effort=USUAL: known)
-        monkeypatch.setattr(methods, "module_of", lambda name: "methods")
+        monkeypatch.setattr(methods, "module_of", lambda name: "train.models.methods")
         monkeypatch.setattr(rungs, "ladder", lambda asked: list(known))
         monkeypatch.setattr(rungs, "prices", lambda *args: prices)
 
@@ -401,9 +401,8 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, monkeypatc
         'name = "drawer"\nsets = ["skin.npz"]\nmaterials = ["a", "d"]\nvaries = ["place"]\nfolds = 3\naccuracy = 0.8\n'
         'methods = ["L-svm", "L-gauss"]\nreduce = ["window", "classes"]\n[budget]\nms = 50\nkb = 500\nmb = 500\nslower = 3\n'
     )
-    parser = argparse.ArgumentParser()
-    choose.register(lambda *about: parser)
     args = [
+        "choose",
         "--scene",
         str(tmp_path / "scene.toml"),
         "--out",
@@ -413,7 +412,7 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, monkeypatc
         "--cache",
         str(tmp_path / "c"),
     ]
-    choose.run(parser.parse_args(args))
+    assert main(args) == 0
     told = json.loads((tmp_path / "b-why" / "choice.json").read_text())
     packed = bundle.load(tmp_path / "b")
     assert told["chosen"] == packed.manifest.made["method"]
@@ -428,7 +427,7 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, monkeypatc
     said = capsys.readouterr().out
     assert f"{told['chosen']} with" in said or f"{told['chosen']} is enough" in said
     assert "Reached: .800 is wanted" in said
-    choose.run(parser.parse_args(args))  # again, from what is kept
+    assert main(args) == 0  # again, from what is kept
     assert json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"] == told["rungs"]
 
 
@@ -439,10 +438,8 @@ def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, mon
     hard = skin(noise=0.9)
     hard.save(tmp_path / "skin.npz")
     (tmp_path / "scene.toml").write_text('sets = ["skin.npz"]\nvaries = ["place"]\naccuracy = 0.99\nreduce = []\n')
-    parser = argparse.ArgumentParser()
-    choose.register(lambda *about: parser)
-    choose.run(parser.parse_args(["--scene", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "b"), "--jobs", "1",
-                                  "--cache", str(tmp_path / "c")]))  # fmt: skip
+    scene_file, out, cache = (str(tmp_path / name) for name in ("scene.toml", "b", "c"))
+    assert main(["choose", "--scene", scene_file, "--out", out, "--jobs", "1", "--cache", cache]) == 0
     assert "Not reached: .990 is wanted" in capsys.readouterr().out
     assert 'class="stop">Not reached' in (tmp_path / "b-why" / "index.html").read_text()
     assert bundle.load(tmp_path / "b").manifest.name == "scene"

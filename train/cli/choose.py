@@ -1,4 +1,4 @@
-"""The room of the command `palpate-train choose`. In: scene.toml. Out: a bundle, choice.json, and the page that says why."""
+"""The command choose. In: scene.toml. Out: a bundle, choice.json, and the page that says why."""
 
 from __future__ import annotations
 
