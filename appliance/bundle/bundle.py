@@ -42,6 +42,7 @@ from appliance.bundle.manifest import (
 from appliance.bundle.onnx_check import check
 from appliance.core.errors import BundleError
 from appliance.core.types import UNREADABLE, SweepFormat
+from appliance.signal import features
 
 try:  # not from hashlib: that loads OpenSSL, 4 MB for a function which Python has by itself
     from _sha2 import sha256  # type: ignore[import-not-found,unused-ignore]
@@ -166,7 +167,10 @@ def made(files: Mapping[str, bytes], where: str) -> Bundle:
     model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
     samples, logits = _golden(golden, manifest)
     classes = _classes(_checked(files, manifest, MEANS, where), manifest) if manifest.known else None
-    check.check(model, manifest)
+    f, kind = manifest.format, manifest.input
+    numbers = None if kind == "raw" else len(features.compute(kind, samples[0], f.rate_hz))
+    enrolled, rank = (int(np.count_nonzero(classes.sweeps)), classes.means.shape[1]) if classes else (0, None)
+    check.check(model, manifest, numbers, enrolled, rank)
     return Bundle(manifest, identity(files[MANIFEST]), model, samples, logits, classes)
 
 

@@ -18,7 +18,7 @@ from appliance.bundle.manifest import MEANS, Thresholds
 from appliance.core.errors import BundleError
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.novelty import Means
-from appliance.inference.session import check_signature, run, session
+from appliance.inference.session import run, session
 from appliance.signal import features
 from appliance.signal.contact import moved
 
@@ -104,7 +104,7 @@ class Classifier:
     must not undo what the object's other sweeps said.
 
     sure: 0 stands for the bundle's thresholds.unsure. most_sweeps: 0 for no limit.
-    Raises BundleError where onnxruntime refuses the model or its input and outputs are not the manifest's.
+    Raises BundleError where onnxruntime refuses the model; bundle.load has compared its input and outputs with the manifest.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Classifier:
         f = bundle.format
         self.tare: NDArray[np.float64] = np.zeros((f.rows, f.cols))
         self._session = session(bundle.model)
-        self._input = check_signature(self._session, bundle)
+        self._input: str = self._session.get_inputs()[0].name
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
         # onnxruntime computes them all, but makes arrays only of those that are asked for

@@ -1,6 +1,5 @@
-"""The room of onnxruntime, as the box runs it. In: a model's bytes, a bundle, digits. Out: a session, its outputs.
-
-Whatever onnxruntime raises comes out as a BundleError.
+"""Runs onnxruntime as the box does. In: the bytes of a model that onnx_check has accepted; arrays. Out: a session; its
+outputs. Whatever onnxruntime raises comes out as a BundleError.
 """
 
 from __future__ import annotations
@@ -9,9 +8,7 @@ from typing import Any
 
 import onnxruntime as ort
 
-from appliance.bundle.bundle import Bundle
 from appliance.core.errors import BundleError
-from appliance.signal import features
 
 
 def session(model: bytes) -> ort.InferenceSession:
@@ -36,44 +33,3 @@ def run(opened: ort.InferenceSession, outputs: list[str], given: dict[str, Any])
         why = str(e).strip()[:200]
         raise BundleError(f"onnxruntime {ort.__version__} cannot run the model: {why}; export the bundle again") from e
     return gives
-
-
-def check_signature(run: ort.InferenceSession, bundle: Bundle) -> str:
-    """The name of the one input, after all shapes and types were compared with the manifest."""
-    m, f = bundle.manifest, bundle.format
-    if m.input == "raw":
-        tensor = {
-            "uint8": "tensor(uint8)",
-            "int16": "tensor(int16)",
-            "uint16": "tensor(uint16)",
-            "float32": "tensor(float)",
-        }
-        want = [([1, f.window, f.rows, f.cols], tensor[f.dtype])]
-    else:
-        want = [([1, len(features.compute(m.input, bundle.golden[0], f.rate_hz))], "tensor(float)")]
-    have = [(i.shape, i.type) for i in run.get_inputs()]
-    if have != want:
-        raise BundleError(f"the model takes {have}; the manifest asks for {want}")
-    gives = {o.name: (o.shape, o.type) for o in run.get_outputs()}
-    trained = len(m.labels) - len(bundle.enrolled)
-    forms: dict[str, list[int | None]] = {  # None: any number
-        "logits": [1, trained],
-        "early": [1, len(m.early.least) if m.early else None, trained],
-        "embedding": [1, bundle.classes.means.shape[1] if bundle.classes else None],
-    }
-    needed = {"logits"} | ({"early"} if m.early else set()) | ({"embedding"} if m.known else set())
-    if not needed <= gives.keys() <= forms.keys() or not all(_fits(gives[name], forms[name]) for name in gives):
-        raise BundleError(
-            f"the model gives {gives}; the manifest asks for {', '.join(sorted(needed))} and allows "
-            f"{forms} of tensor(float): export the bundle again"
-        )
-    name: str = run.get_inputs()[0].name
-    return name
-
-
-def _fits(has: tuple[list[Any], str], form: list[int | None]) -> bool:
-    """Whether an output has this shape, None standing for any number."""
-    shape, kind = has
-    if kind != "tensor(float)" or len(shape) != len(form):
-        return False
-    return all(type(n) is int and n > 0 and want in (None, n) for n, want in zip(shape, form, strict=True))

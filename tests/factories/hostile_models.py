@@ -88,6 +88,19 @@ def endless() -> Models:
     )
     scan = node("Scan", ["x"], ["y"], body=body, num_scan_inputs=1)
     yield "scan", model([scan]), "graph in the graph"
+    counted = [
+        node("Reshape", ["x", "flat"], ["all"]), node("ReduceMax", ["all"], ["top"], axes=[1], keepdims=0),
+        node("Sub", ["top", "rest"], ["over"]), node("Relu", ["over"], ["times"]), node("Cast", ["times"], ["n"], to=7),
+        node("Mul", ["n", "many"], ["all times"]), node("Squeeze", ["all times"], ["trips"]),
+    ]  # fmt: skip
+    body = helper.make_graph(
+        [node("Identity", ["c"], ["d"]), node("Add", ["v", "v"], ["w"])], "body",
+        [info("i", 7, []), info("c", 9, []), info("v", 1, [1])], [info("d", 9, []), info("w", 1, [1])],
+    )  # fmt: skip
+    loop = node("Loop", ["trips", "", "top"], ["y"], body=body)
+    held = {"rest": np.float32([254]), "many": [2**60]}
+    # onnxruntime opens this one and runs golden sweeps; the first sweep with a count of 255 never ends
+    yield "loop that waits for a sweep", model([*counted, loop], held), "graph in the graph"
     yield "loop without a body", model([node("Loop", ["", "go"], ["y"])]), "no such operator"
 
 
@@ -156,6 +169,7 @@ def busy() -> Models:
     yield "10,000 nodes", model([node("Relu", ["x"], [f"y{i}"]) for i in range(10_000)], last="y0"), "(nodes|values)"
     many = {f"c{i}": np.float32(1) for i in range(3000)}
     yield "3,000 constants", model([node("Relu", ["x"], ["y"])], many), "constants"
+    yield "a million empty nodes", part(1, 8) + part(7, part(1, b"") * MILLION), "more than 50000 values"
     yield "100,000 inputs", model([node("Concat", ["x"] * 100_000, ["y"], axis=0)]), "values"
 
 

@@ -45,7 +45,7 @@ def own_models(names: tuple[str, ...] = ()) -> list[Own]:
     default, sweeps = bundle.load(bundle.DEFAULT), tones()
     found = [Own("default", default.model, default.manifest)]
     for name, method in methods.every(methods.Effort(0.02, 2)).items():
-        if name in (names or methods.every()):
+        if method.input in bundle.INPUTS and name in (names or methods.every()):
             given = methods.given(method.input, sweeps)
             model = method.train(sweeps, given, 1).graph().SerializeToString()
             manifest = Manifest(name, "1", sweeps.format, method.input, sweeps.materials, Thresholds(1, 255), {})

@@ -1,40 +1,38 @@
-"""The room of the graph: what the box demands of a model before onnxruntime may open it. In: the bytes of an ONNX file
-and the bundle's manifest. Out: nothing, or BundleError naming node, tensor and value.
-
-The file is parsed here and each node is followed by its shapes: allowed operators only, one input and the outputs of the
-manifest, every size a constant, and caps on each tensor, on all memory and on all work. So a model can be wrong, but it
-can neither read beside its arrays, nor fill the box's memory, nor keep it busy without end.
+"""Decides whether onnxruntime may open a model. In: the bytes of an ONNX file, and what its bundle has beside it.
+Out: nothing, or a BundleError that names node, tensor and value. What passes can neither read beside its arrays nor take
+more memory or time than the caps below: each node is followed by its shapes, and every size is a constant of the file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, prod
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from appliance.bundle.onnx_check import messages, operators, reader
+from appliance.bundle.onnx_check import operators, reader
 from appliance.bundle.onnx_check.operators import OPERATORS
-from appliance.bundle.onnx_check.shapes import KINDS, MOST_RANK, PLACE, Call, Out, Value, need
+from appliance.bundle.onnx_check.reader import Message
+from appliance.bundle.onnx_check.shapes import KINDS, MOST_RANK, PLACE, Call, Out, Shape, Value, need
 from appliance.core.errors import BundleError
 
 if TYPE_CHECKING:
     from appliance.bundle.manifest import Manifest
 
 VERSIONS = {"": range(17, 19), "ai.onnx.ml": range(3, 4), "com.microsoft": range(1, 2)}
-"""Of the operators of each domain: what train/ writes, and the next, by which the operators here differ little."""
+"""Of the operators of each domain: what train/ writes, and the next, in which the operators here hardly differ."""
 FORMATS = range(8, 10)
 """Of the file (IR version), likewise."""
 NOTES = ("onnx.infer", "onnx.quant.pre_process")
-"""What onnxruntime's quantization writes about a model."""
+"""Metadata that onnxruntime's quantization writes into a model."""
 MOST_NODES, MOST_CONSTANTS = 1000, 2000
 """Three times MiniRocket's, the longest of our own; onnxruntime takes a kilobyte or two for each."""
 MOST_TENSOR = 64 << 20
 """Bytes of one tensor. The largest of our own are the weights of the paper's CNN in int8, 63 MB once they are floats."""
 MOST_MEMORY = 160 << 20
-"""Bytes of all of a model by the account of `_Bill`. Our own largest: the paper's CNN in int8 151 MB, MiniRocket 93 MB.
+"""Bytes of all of a model by the account of `_Cost`. Our own largest: the paper's CNN in int8 151 MB, MiniRocket 93 MB.
 onnxruntime never took more than this account, and 9 MB for itself; so the box stays below 256 MB whatever it is given."""
 COPIES = 3
 """Of a constant in memory: in the parsed file, as a tensor, and laid out for the processor."""
@@ -45,54 +43,51 @@ TOUCH = 8
 """Products that take as long as reading or writing a number, in the slowest operators."""
 MOST_LETTERS = 400
 """Of what is wrong: names and lists come from the file."""
+Form = Sequence[int | None]
+"""A shape, None standing for any number."""
 CONSTANTS = ("float32", "uint8", "int8", "int32", "int64")
 """Types of constants; the others only come in by the sweep, or out of a comparison."""
-OUTPUTS = {"logits": 2, "early": 3, "embedding": 2}
-"""Dimensions of what a model may give."""
 
 
 @dataclass(slots=True)
-class _Bill:
+class _Cost:
     """What a model costs. bytes: of the file, COPIES of each constant and of what comes of constants alone, all that a
     sweep moves, as if nothing were ever given back, and the largest workspace of a node. work: see MOST_WORK."""
 
     bytes: int
     work: int = 0
-    room: int = 0
+    workspace: int = 0
 
     def add(self, name: str, call: Call, made: list[Value]) -> None:
-        """One node more."""
-        products, room = operators.work(name, call, made[0].shape)
+        """One node more. Raises BundleError beyond a cap."""
+        products, workspace = operators.work(name, call, made[0].shape)
         self.work += products + TOUCH * sum(prod(v.shape) for v in (*call.inputs, *made))
-        self.room = max(self.room, room)
+        self.workspace = max(self.workspace, workspace)
         self.bytes += sum(_bytes(v) * (1 if v.moved or name == "DequantizeLinear" else COPIES) for v in made)
-        total = self.bytes + self.room
+        total = self.bytes + self.workspace
         need(total <= MOST_MEMORY, f"up to here it needs {total} bytes of memory (limit {MOST_MEMORY})")
         need(self.work <= MOST_WORK, f"up to here it needs {self.work} products (limit {MOST_WORK})")
 
 
-def check(model: bytes, manifest: Manifest) -> None:
-    """Raises BundleError where `model` is not an ONNX file that the box may run as the model of a bundle like this."""
+def check(
+    model: bytes, manifest: Manifest, features: int | None = None, enrolled: int = 0, rank: int | None = None
+) -> None:
+    """Raises BundleError where `model` is not an ONNX file that the box may run as the model of a bundle like this. No
+    other place looks at inputs and outputs.
+
+    features: numbers of the input, where it is not raw counts. enrolled: how many of the labels the model does not know.
+    rank: numbers of the embedding. None stands for any number above 0.
+    """
     try:
         need(len(model) <= MOST_MEMORY, f"it has {len(model)} bytes (limit {MOST_MEMORY})")
         read = reader.read(model)
         _versions(read)
-        graph = read.graph or messages.Graph()
-        for what, have, most in ("nodes", graph.node, MOST_NODES), ("constants", graph.initializer, MOST_CONSTANTS):
-            need(len(have) <= most, f"it has {len(have)} {what} (limit {most})")
-        known = _given(graph, manifest)
-        bill = _Bill(len(model) + COPIES * sum(_bytes(v) for v in known.values()))
-        for number, node in enumerate(graph.node):
-            try:
-                _follow(node, known, bill)
-            except BundleError as e:
-                what = f"node {number} {node.name[:80]!r} ({node.op_type[:80]!r})"
-                raise BundleError(f"{what}: {e}") from e
-        for declared in graph.output:
-            need(declared.name in known, f"no node gives the output {declared.name[:80]!r}")
-        for declared in (*graph.value_info, *graph.output):
+        need(read.graph is not None, "it has no graph")
+        _takes(read.graph, manifest, features)
+        known = _followed(read.graph, len(model))
+        for declared in (*read.graph.value_info, *read.graph.output):
             _agree(declared, known)
-        _outputs([declared.name for declared in graph.output], known, manifest)
+        _gives([declared.name for declared in read.graph.output], known, manifest, enrolled, rank)
     except BundleError as e:
         raise BundleError(f"the model must not be opened: {str(e)[:MOST_LETTERS]}; export the bundle again") from e
 
@@ -101,7 +96,7 @@ def _bytes(value: Value) -> int:
     return prod(value.shape) * np.dtype(value.kind).itemsize
 
 
-def _versions(read: messages.Model) -> None:
+def _versions(read: Message) -> None:
     """The versions of file and operators, and nothing of another domain."""
     need(read.ir_version in FORMATS, f"IR version {read.ir_version} is none of {list(FORMATS)}")
     domains = [opset.domain for opset in read.opset_import]
@@ -113,56 +108,72 @@ def _versions(read: messages.Model) -> None:
         need(note.key in NOTES, f"metadata {note.key[:80]!r} is none of {', '.join(NOTES)}")
 
 
-def _given(graph: messages.Graph, manifest: Manifest) -> dict[str, Value]:
-    """What is there before the first node, by name: the input and the constants."""
+def _takes(graph: Message, manifest: Manifest, features: int | None) -> None:
+    """The one input is what the manifest has."""
     need(len(graph.input) == 1, f"it has {len(graph.input)} inputs instead of one")
-    (declared,) = graph.input
-    kind, shape = _declared(declared)
+    kind, shape = _declared(graph.input[0])
     f = manifest.format
-    raw = manifest.input == "raw"
-    want = (f.dtype, (1, f.window, f.rows, f.cols)) if raw else ("float32", (1, shape[-1] if shape else 0))
-    need((kind, shape) == want, f"it takes {kind} {list(shape)}, the manifest has {want[0]} {list(want[1])}")
-    known = {declared.name: _bounded(declared.name, Value(kind, shape, moved=True))}
+    want, form = (f.dtype, (1, f.window, f.rows, f.cols)) if manifest.input == "raw" else ("float32", (1, features))
+    fits = kind == want and _fits(shape, form)
+    need(fits, f"it takes {kind} {list(shape)}, the manifest has {want} {list(form)}")
+
+
+def _followed(graph: Message, size: int) -> dict[str, Value]:
+    """All values of the graph by name: the input, the constants, what each node gives. size: bytes of the file."""
+    for what, have, most in ("nodes", graph.node, MOST_NODES), ("constants", graph.initializer, MOST_CONSTANTS):
+        need(len(have) <= most, f"it has {len(have)} {what} (limit {most})")
+    (declared,) = graph.input
+    known = {declared.name: _bounded(declared.name, Value(*_declared(declared), moved=True))}
     for tensor in graph.initializer:
         need(tensor.name not in known, f"{tensor.name[:80]!r} is there twice")
         known[tensor.name] = _constant(tensor, tensor.name[:80])
+    cost = _Cost(size + COPIES * sum(_bytes(v) for v in known.values()))
+    for number, node in enumerate(graph.node):
+        try:
+            _follow(node, known, cost)
+        except BundleError as e:
+            raise BundleError(f"node {number} {node.name[:80]!r} ({node.op_type[:80]!r}): {e}") from e
     return known
 
 
-def _constant(tensor: messages.Tensor, name: str) -> Value:
+def _fits(shape: Shape, form: Form) -> bool:
+    return len(shape) == len(form) and all(want in (None, n) for n, want in zip(shape, form, strict=True))
+
+
+def _constant(tensor: Message, name: str) -> Value:
     """A constant, whose numbers stay in the file."""
     kind = KINDS.get(tensor.data_type, "")
     need(kind in CONSTANTS, f"constant {name!r} is of type {kind or tensor.data_type}, none of {', '.join(CONSTANTS)}")
     value = _bounded(name, Value(kind, tuple(tensor.dims)))
-    fields: dict[str, Any] = {"float32": tensor.floats, "int64": tensor.int64s}
-    typed = fields.get(kind, tensor.int32s)
-    others = [f for f in (tensor.floats, tensor.int32s, tensor.int64s) if f is not typed]
-    need(not any(f is not None and len(f) for f in others), f"constant {name!r} has numbers of another type")
-    here = typed is not None and len(typed) > 0
-    need(not (here and tensor.raw), f"constant {name!r} has its numbers twice")
-    if not here:
-        need(len(tensor.raw) == _bytes(value), f"constant {name!r} has {len(tensor.raw)} bytes, not {_bytes(value)}")
-        return replace(value, numbers=np.frombuffer(tensor.raw, np.dtype(kind).newbyteorder("<")).reshape(value.shape))
+    field = {"float32": "float_data", "int64": "int64_data"}.get(kind, "int32_data")
+    numbers = {"float_data": tensor.float_data, "int32_data": tensor.int32_data, "int64_data": tensor.int64_data}
+    filled = [f for f, held in numbers.items() if held is not None and len(held)]
+    need(set(filled) <= {field}, f"constant {name!r} has numbers of another type")
+    need(not (filled and tensor.raw_data), f"constant {name!r} has its numbers twice")
+    if not filled:
+        raw = tensor.raw_data or b""
+        need(len(raw) == _bytes(value), f"constant {name!r} has {len(raw)} bytes, not {_bytes(value)}")
+        return replace(value, numbers=np.frombuffer(raw, np.dtype(kind).newbyteorder("<")).reshape(value.shape))
+    typed: Any = numbers[field]
     need(len(typed) == prod(value.shape), f"constant {name!r} has {len(typed)} numbers, not {prod(value.shape)}")
     if kind != "float32":
-        ends = np.iinfo(kind)
-        need(ends.min <= min(typed) and max(typed) <= ends.max, f"constant {name!r} has a number that is no {kind}")
+        limits = np.iinfo(kind)
+        fits = limits.min <= min(typed) and max(typed) <= limits.max
+        need(fits, f"constant {name!r} has a number that is no {kind}")
     return replace(value, numbers=np.asarray(typed, kind).reshape(value.shape))
 
 
 def _bounded(name: str, value: Value) -> Value:
-    """A tensor of a size that may be."""
+    """A tensor with a name, and of a size that may be."""
     need(name != "" and len(value.shape) <= MOST_RANK, f"{name[:80]!r} has {len(value.shape)} dimensions or no name")
     need(all(n > 0 for n in value.shape), f"{name[:80]!r} has the shape {list(value.shape)}, which holds nothing")
-    need(
-        _bytes(value) <= MOST_TENSOR,
-        f"{name[:80]!r} of {list(value.shape)} has {_bytes(value)} bytes (limit {MOST_TENSOR})",
-    )
+    size = _bytes(value)
+    need(size <= MOST_TENSOR, f"{name[:80]!r} of {list(value.shape)} has {size} bytes (limit {MOST_TENSOR})")
     return value
 
 
-def _follow(node: messages.Node, known: dict[str, Value], bill: _Bill) -> None:
-    """What a node gives is known then, and paid."""
+def _follow(node: Message, known: dict[str, Value], cost: _Cost) -> None:
+    """Adds what a node gives to `known`, and what it takes to `cost`."""
     operator = OPERATORS.get((node.domain, node.op_type))
     if operator is None:
         raise BundleError(f"there is no such operator of domain {node.domain[:80]!r} for a bundle")
@@ -182,40 +193,39 @@ def _follow(node: messages.Node, known: dict[str, Value], bill: _Bill) -> None:
     for name, value in zip(node.output, made, strict=True):
         need(name not in known, f"{name[:80]!r} is made twice")
         known[name] = _bounded(name, value)
-    bill.add(node.op_type, call, made)
+    cost.add(node.op_type, call, made)
 
 
-def _settings(node: messages.Node, allowed: Mapping[str, int]) -> dict[str, Any]:
+def _settings(node: Message, allowed: Mapping[str, int]) -> dict[str, Any]:
     """A node's settings by name, each of the type that it must have."""
     found: dict[str, Any] = {}
     for a in node.attribute:
         name, code = a.name[:80], a.type
         need(a.name not in found, f"{name!r} is set twice")
         need(code == allowed.get(a.name), f"setting {name!r} of type {code} is none that it may have")
-        there: dict[int, Any] = {operators.FLOAT: a.f, operators.INT: a.i, operators.TEXT: a.s, operators.TENSOR: a.t,
-                                 operators.FLOATS: a.floats, operators.INTS: a.ints or None}  # fmt: skip
+        there = {operators.FLOAT: a.f, operators.INT: a.i, operators.TEXT: a.s, operators.TENSOR: a.t,
+                 operators.FLOATS: a.floats, operators.INTS: a.ints or None}  # fmt: skip
         need([c for c, value in there.items() if value is not None] == [code], f"{name!r} is not as its type has it")
-        need(code != operators.FLOAT or isfinite(a.f or 0), f"{name} = {a.f}")
+        need(code != operators.FLOAT or isfinite(a.f), f"{name} = {a.f}")
         found[a.name] = there[code]
         if code == operators.TEXT:
-            found[a.name] = bytes(there[code])
+            found[a.name] = bytes(a.s)
         if code == operators.TENSOR:
-            found[a.name] = _constant(there[code], name)
+            found[a.name] = _constant(a.t, name)
     return found
 
 
-def _declared(declared: messages.Declared) -> tuple[str, tuple[int, ...]]:
+def _declared(declared: Message) -> tuple[str, Shape]:
     """Type and shape of a value as the file names them."""
     held = declared.type.tensor_type if declared.type else None
     if held is None or held.shape is None or held.elem_type not in KINDS:
         raise BundleError(f"{declared.name[:80]!r} has no type and shape of a tensor")
     sizes = [d.dim_value for d in held.shape.dim]
-    if None in sizes:
-        raise BundleError(f"{declared.name[:80]!r} has the shape {sizes}; every size must be a number")
-    return KINDS[held.elem_type], tuple(n for n in sizes if n is not None)
+    need(None not in sizes, f"{declared.name[:80]!r} has the shape {sizes}; every size must be a number")
+    return KINDS[held.elem_type], tuple(sizes)
 
 
-def _agree(declared: messages.Declared, known: dict[str, Value]) -> None:
+def _agree(declared: Message, known: dict[str, Value]) -> None:
     """What the file says of a value is what comes of its nodes; quantization leaves notes on values that are gone."""
     if declared.name in known:
         (kind, shape), have = _declared(declared), known[declared.name]
@@ -223,18 +233,24 @@ def _agree(declared: messages.Declared, known: dict[str, Value]) -> None:
         need((kind, shape) == (have.kind, have.shape), what)
 
 
-def _outputs(names: list[str], known: dict[str, Value], manifest: Manifest) -> None:
-    """The outputs that the manifest needs, and no other than may be."""
-    needed = {"logits"} | ({"early"} if manifest.early else set()) | ({"embedding"} if manifest.known else set())
-    asked = f"the manifest needs {', '.join(sorted(needed))} and allows {', '.join(OUTPUTS)}"
-    need(len(names) == len(set(names)) and needed <= set(names) <= OUTPUTS.keys(), f"it gives {names[:9]}; {asked}")
+def _gives(names: list[str], known: dict[str, Value], manifest: Manifest, enrolled: int, rank: int | None) -> None:
+    """The outputs are those that the manifest needs, and no other than may be, each of its form."""
+    early, labels = manifest.early, len(manifest.labels)
+    trained = labels - enrolled
+    forms: dict[str, Form] = {
+        "logits": (1, trained), "early": (1, len(early.least) if early else None, trained), "embedding": (1, rank),
+    }  # fmt: skip
+    needed = {"logits"} | ({"early"} if early else set()) | ({"embedding"} if manifest.known else set())
+    asked = f"the manifest needs {', '.join(sorted(needed))} and allows {', '.join(forms)}"
+    need(len(names) == len(set(names)) and needed <= set(names) <= forms.keys(), f"it gives {names[:9]}; {asked}")
     for name in names:
-        have, form = known[name], OUTPUTS[name]
-        need(have.kind == "float32" and have.moved and have.shape[:1] == (1,) and len(have.shape) == form,
-             f"{name} is {have.kind} {list(have.shape)}, not float32 with {form} dimensions, the first 1")  # fmt: skip
-    classes, labels = known["logits"].shape[1], len(manifest.labels)
-    need(1 < classes <= labels, f"it tells {classes} materials apart, the manifest has {labels} labels")
-    if "early" in names:
-        steps = len(manifest.early.least) if manifest.early else known["early"].shape[1]
-        said, want = known["early"].shape, (1, steps, classes)
-        need(said == want, f"early is {list(said)} instead of {list(want)}")
+        need(name in known, f"no node gives the output {name!r}")
+        have, axes = known[name], len(forms[name])
+        need(have.kind == "float32" and have.moved and have.shape[:1] == (1,) and len(have.shape) == axes,
+             f"{name} is {have.kind} {list(have.shape)}, not float32 with {axes} dimensions, the first 1")  # fmt: skip
+    classes = known["logits"].shape[1]
+    new = f", {enrolled} of them enrolled" if enrolled else ""
+    need(1 < classes == trained, f"it tells {classes} materials apart, the manifest has {labels} labels{new}")
+    for name in names:
+        shape, form = known[name].shape, forms[name]
+        need(_fits(shape, form), f"{name} is {list(shape)} instead of {list(form)}")

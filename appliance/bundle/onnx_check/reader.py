@@ -1,41 +1,83 @@
-"""The room of the ONNX file. In: its bytes. Out: what stands in it, as a Model; nothing is computed or believed.
-
-What onnxruntime reads must be what is read here: a field that is not known, or there twice, a number in more bytes than it
-needs, an end that is cut off are refused. Tensors stay where they are in the file.
+"""Reads the bytes of an ONNX file. In: bytes. Out: the model as a Message, with the fields that a bundle's model may have.
+Anything that two readers could take for two things is refused with a BundleError. Constants stay where they are in the file.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import fields
+import struct
 from functools import cache
-from typing import Any, TypeVar
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle.onnx_check.messages import REFUSED, Kind, Model
 from appliance.core.errors import BundleError
 
 MOST_VALUES = 50_000
-"""Fields and single numbers of a file, read one by one, at most: six times those of MiniRocket, which has most of our own.
-Weights do not count: they are read as one."""
+"""Fields and single numbers that are read one by one, counted before anything is made of them: protobuf's own library makes
+1 GB of 20 MB of empty nodes. MiniRocket, the longest of our own, has a sixth. An array of weights counts as one."""
 VARINT, BYTES, FOUR_BYTES = 0, 2, 5
 """Wire types of protobuf that are in use; 1 had eight bytes, 3 and 4 were groups."""
+REFUSED = "refused"
+"""In FIELDS: a field that deserves a name in the message of its refusal. One that is not in FIELDS is refused, too."""
+FIELDS: dict[str, dict[int, tuple[str, str]]] = {
+    "model": {
+        1: ("ir_version", "code"), 2: ("producer_name", "text"), 3: ("producer_version", "text"), 7: ("graph", "graph"),
+        8: ("opset_import", "opset*"), 14: ("metadata_props", "entry*"), 20: ("training_info", REFUSED),
+        25: ("functions", REFUSED),
+    },
+    "opset": {1: ("domain", "text"), 2: ("version", "code")},
+    "entry": {1: ("key", "text"), 2: ("value", "text")},
+    "graph": {
+        1: ("node", "node*"), 2: ("name", "text"), 5: ("initializer", "tensor*"), 11: ("input", "declared*"),
+        12: ("output", "declared*"), 13: ("value_info", "declared*"), 15: ("sparse_initializer", REFUSED),
+    },
+    "node": {
+        1: ("input", "text*"), 2: ("output", "text*"), 3: ("name", "text"), 4: ("op_type", "text"),
+        5: ("attribute", "attribute*"), 7: ("domain", "text"),
+    },
+    "attribute": {
+        1: ("name", "text"), 2: ("f", "float"), 3: ("i", "signed"), 4: ("s", "bytes"), 5: ("t", "tensor"),
+        6: ("a graph in the graph", REFUSED), 7: ("floats", "floats"), 8: ("ints", "signed*"), 9: ("texts", REFUSED),
+        10: ("tensors", REFUSED), 11: ("graphs in the graph", REFUSED), 20: ("type", "code"),
+        22: ("a sparse tensor", REFUSED),
+    },
+    "tensor": {
+        1: ("dims", "signed*"), 2: ("data_type", "code"), 4: ("float_data", "floats"), 5: ("int32_data", "signed*"),
+        6: ("texts", REFUSED), 7: ("int64_data", "signed*"), 8: ("name", "text"), 9: ("raw_data", "bytes"),
+        10: ("numbers of 64 bits", REFUSED), 13: ("external_data", REFUSED), 14: ("data_location", REFUSED),
+    },
+    "declared": {1: ("name", "text"), 2: ("type", "type")},
+    "type": {
+        1: ("tensor_type", "tensortype"), 4: ("a sequence", REFUSED), 5: ("a map", REFUSED),
+        8: ("a sparse tensor", REFUSED), 9: ("an optional type", REFUSED),
+    },
+    "tensortype": {1: ("elem_type", "code"), 2: ("shape", "shape")},
+    "shape": {1: ("dim", "dimension*")},
+    "dimension": {1: ("dim_value", "signed"), 2: ("a name instead of a number", REFUSED)},
+}  # fmt: skip
+"""By message and number: the field's name and what it holds, with * where it may come again. No message holds one of its
+own kind, so nothing nests without end."""
 
-T = TypeVar("T")
+
+class Message(SimpleNamespace):
+    """One message: an attribute for each of its FIELDS that is not REFUSED. A field that the file leaves out is 0 (code),
+    "" (text), () (with *) or else None; floats are float32 [n], bytes a memoryview."""
 
 
-def read(data: bytes) -> Model:
-    """What stands in the bytes of an ONNX file. Raises BundleError naming the message, the field and the place."""
-    return _Reader(data).message(Model, 0, len(data))
+def read(data: bytes) -> Message:
+    """The model in the bytes of an ONNX file. Raises BundleError naming the message, the field and the place."""
+    return _Reader(data).message("model", 0, len(data))
 
 
 @cache
-def _table(kind: type) -> dict[int, tuple[str, Kind]]:
-    """The fields of a message by number: name, and what it holds."""
-    return {f.metadata["number"]: (f.name, f.metadata["kind"]) for f in fields(kind)}
+def _absent(kind: str) -> dict[str, Any]:
+    """What a message has for each field that is not there."""
+    usual: dict[str, Any] = {"code": 0, "text": ""}
+    fields = FIELDS[kind].values()
+    return {name: () if holds[-1] == "*" else usual.get(holds) for name, holds in fields if holds != REFUSED}
 
 
 class _Reader:
@@ -44,51 +86,77 @@ class _Reader:
     def __init__(self, data: bytes) -> None:
         self._data, self._view, self._left = data, memoryview(data), MOST_VALUES
 
-    def message(self, message: type[T], at: int, end: int) -> T:
+    def message(self, kind: str, at: int, end: int) -> Message:
         """The message between two places."""
         found: dict[str, Any] = {}
-        table = _table(message)  # type: ignore[arg-type]  # types can be hashed
+        fields = FIELDS[kind]
         while at < end:
             begin = at
             tag, at = self._varint(at, end)
-            name, kind = table.get(tag >> 3, ("", ""))
-            if not name:
-                what = REFUSED.get((message, tag >> 3), f"field {tag >> 3}")
-                raise _wrong(begin, f"{message.__name__.lower()}: {what}, which no model of a bundle may have")
-            many = kind in ("ints", "texts") or isinstance(kind, list)
-            if not many and name in found:
-                raise _wrong(begin, f"{message.__name__.lower()}: {name} is there twice")
-            value, at = self._value(kind[0] if isinstance(kind, list) else kind, tag, at, end)
-            if not many:
-                found[name] = value
-            elif kind == "ints":
-                found.setdefault(name, []).extend(value)
+            name, holds = fields.get(tag >> 3, (f"field {tag >> 3}", REFUSED))
+            if holds == REFUSED:
+                raise _wrong(begin, f"{kind}: {name}, which no model of a bundle may have")
+            if holds[-1] == "*":
+                values, at = self._values(holds[:-1], tag, at, end)
+                found.setdefault(name, []).extend(values)
+            elif name in found:
+                raise _wrong(begin, f"{kind}: {name} is there twice")
             else:
-                found.setdefault(name, []).append(value)
-        return message(**found)
+                found[name], at = self._value(holds, tag, at, end)
+        return Message(**(_absent(kind) | found))
 
-    def _value(self, kind: str | type, tag: int, at: int, end: int) -> tuple[Any, int]:
-        """What a field holds, and where the next one begins. tag: the field's number and wire type."""
-        wire = tag & 7
-        if wire == FOUR_BYTES and kind in ("float", "floats"):
-            return self._four_bytes(kind == "floats", tag, at, end)
-        if wire == VARINT and kind in _INTEGERS:
+    def _values(self, holds: str, tag: int, at: int, end: int) -> tuple[list[Any], int]:
+        """One of a field that may come again, or all of them packed, and where the next field begins."""
+        if holds != "signed" or tag & 7 == VARINT:
+            value, at = self._value(holds, tag, at, end)
+            return [value], at
+        found = []
+        at, end = self._block(tag, at, end)
+        while at < end:
             number, at = self._varint(at, end)
-            return _INTEGERS[kind](number, at), at
-        if wire != BYTES or kind in ("code", "signed", "float"):
-            raise _wrong(at, f"wire type {wire} does not fit the field")
+            found.append(_signed(number))
+        return found, end
+
+    def _value(self, holds: str, tag: int, at: int, end: int) -> tuple[Any, int]:
+        """What a field holds, and where the next one begins. tag: the field's number and wire type."""
+        if holds in ("code", "signed") and tag & 7 == VARINT:
+            number, at = self._varint(at, end)
+            if holds == "code" and number >> 31:  # onnxruntime would cut off what is beyond 31 bits
+                raise _wrong(at, f"{_signed(number)} is no code or version")
+            return _signed(number), at
+        if holds in ("float", "floats") and tag & 7 == FOUR_BYTES:
+            return self._four_bytes(holds == "floats", tag, at, end)
+        if holds in ("code", "signed", "float"):
+            raise _wrong(at, f"wire type {tag & 7} does not fit the field")
+        at, end = self._block(tag, at, end)
+        if holds == "floats":
+            if (end - at) % 4:
+                raise _wrong(at, f"{end - at} bytes are no floats")
+            return np.frombuffer(self._view[at:end], "<f4"), end
+        if holds == "bytes":
+            return self._view[at:end], end
+        if holds != "text":
+            return self.message(holds, at, end), end
+        try:
+            return self._data[at:end].decode(), end
+        except UnicodeDecodeError as e:
+            raise _wrong(at, "a name is not UTF-8") from e
+
+    def _block(self, tag: int, at: int, end: int) -> tuple[int, int]:
+        """Where a block of bytes behind its length begins and ends."""
+        if tag & 7 != BYTES:
+            raise _wrong(at, f"wire type {tag & 7} does not fit the field")
         size, at = self._varint(at, end)
         if size > end - at:
             raise _wrong(at, f"{size} bytes are announced and {end - at} are there")
-        end = at + size
-        return (_READ[kind](self, at, end) if isinstance(kind, str) else self.message(kind, at, end)), end
+        return at, at + size
 
-    def _four_bytes(self, many: bool, tag: int, at: int, end: int) -> tuple[Any, int]:
+    def _four_bytes(self, many: bool, tag: int, at: int, end: int) -> tuple[float | NDArray[Any], int]:
         """One float; or all that stand one after another, each behind its tag, as one array."""
         if end - at < 4:
             raise _wrong(at, "a number is cut off")
         if not many:
-            return float(np.frombuffer(self._data, "<f4", 1, at)[0]), at + 4
+            return struct.unpack_from("<f", self._data, at)[0], at + 4
         run = _runs(tag).match(self._data, at - 1, end)
         stop = run.end() if run else at - 1
         each = np.dtype([("tag", "u1"), ("value", "<f4")])
@@ -112,37 +180,6 @@ class _Reader:
                 return value, at
         raise _wrong(begin, "a number in more bytes than it needs")
 
-    def _text(self, at: int, end: int) -> str:
-        try:
-            return self._data[at:end].decode()
-        except UnicodeDecodeError as e:
-            raise _wrong(at, "a name is not UTF-8") from e
-
-    def _bytes(self, at: int, end: int) -> memoryview:
-        return self._view[at:end]
-
-    def _ints(self, at: int, end: int) -> list[int]:
-        found = []
-        while at < end:
-            number, at = self._varint(at, end)
-            found.append(_signed(number))
-        return found
-
-    def _floats(self, at: int, end: int) -> NDArray[Any]:
-        if (end - at) % 4:
-            raise _wrong(at, f"{end - at} bytes are no floats")
-        return np.frombuffer(self._view[at:end], "<f4")
-
-
-_READ: dict[str, Callable[[_Reader, int, int], Any]] = {
-    "text": _Reader._text,
-    "texts": _Reader._text,
-    "bytes": _Reader._bytes,
-    "raw": _Reader._bytes,
-    "ints": _Reader._ints,
-    "floats": _Reader._floats,
-}
-
 
 @cache
 def _runs(tag: int) -> re.Pattern[bytes]:
@@ -150,22 +187,8 @@ def _runs(tag: int) -> re.Pattern[bytes]:
     return re.compile(b"(?:" + re.escape(bytes([tag])) + b".{4})++", re.DOTALL)
 
 
-def _signed(number: int, at: int = 0) -> int:
+def _signed(number: int) -> int:
     return number - (number >> 63 << 64)
-
-
-def _code(number: int, at: int) -> int:
-    """Of a type, or a version: onnxruntime would cut off what is beyond 31 bits."""
-    if number >> 31:
-        raise _wrong(at, f"{_signed(number)} is no code or version")
-    return number
-
-
-_INTEGERS: dict[str | type, Callable[[int, int], Any]] = {
-    "code": _code,
-    "signed": _signed,
-    "ints": lambda number, at: [_signed(number)],
-}
 
 
 def _wrong(at: int, what: str) -> BundleError:

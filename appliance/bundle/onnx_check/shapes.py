@@ -1,8 +1,6 @@
-"""The room of shapes. In: a node's inputs and settings. Out: type and shape of what it gives.
-
-These are the rules of the operators that work number by number or along an axis, and what all rules share; moves.py and
-operators.py have the others. They are those of the ONNX operator documents, with the bounds under which onnxruntime neither
-reads beside an array nor divides by zero. What decides a size must be a constant of the file.
+"""The rules of the operators. In: a node's inputs and settings. Out: type and shape of each output; BundleError where they
+do not fit. The rules are those of the ONNX operator documents (https://onnx.ai/onnx/operators/), within bounds under which
+onnxruntime neither reads beside an array nor divides by zero. Whatever decides a size must be a constant of the file.
 """
 
 from __future__ import annotations
@@ -10,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from math import prod
 from typing import Any
 
 from numpy.typing import NDArray
@@ -19,11 +18,13 @@ from appliance.core.errors import BundleError
 KINDS = {1: "float32", 2: "uint8", 3: "int8", 4: "uint16", 5: "int16", 6: "int32", 7: "int64", 9: "bool"}
 """Types of tensors by ONNX's code; there are no others in a bundle's model."""
 MOST_RANK = 8
-"""Dimensions of a tensor. Our own have up to five; onnxruntime reserves room for few."""
+"""Dimensions of a tensor; our own have up to five."""
+MOST_WINDOW_RANK = 3
+"""Dimensions of a convolution or a pool, besides samples and channels."""
 MOST_STEP = 1 << 16
 """Largest stride, dilation and kernel."""
 PLACE = "place"
-"""Of an int64 that numbers a place, and so is never negative: onnxruntime does not check that everywhere."""
+"""Type of an output that is an int64 and numbers a place, so is never negative: onnxruntime does not check it everywhere."""
 
 Shape = tuple[int, ...]
 Out = tuple[str, Shape]
@@ -31,10 +32,8 @@ Out = tuple[str, Shape]
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A tensor: its type, its shape, its numbers where they stand in the file. moved: whether a sweep changes it.
-
-    place: an int64 that is never negative.
-    """
+    """A tensor: its type (of KINDS) and shape; its numbers, where it is a constant of the file. moved: whether it depends
+    on the sweep. place: an int64 that is never negative."""
 
     kind: str
     shape: Shape
@@ -45,13 +44,13 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A node's inputs and settings, as the table allows them."""
+    """A node's inputs and settings, of the types that operators.OPERATORS allows."""
 
     inputs: Sequence[Value]
     given: Mapping[str, Any]
 
-    def numbers(self, at: int, rank: int | None = None) -> list[int]:
-        """The numbers of an input that must be a constant, and of so many dimensions."""
+    def numbers(self, at: int, rank: int | None = 1) -> list[int]:
+        """The numbers of an input that must be a constant of `rank` dimensions (None: any). Raises BundleError."""
         value = self.inputs[at]
         if value.numbers is None:
             raise BundleError(f"input {at + 1} decides a size, but is no constant of the file")
@@ -59,10 +58,6 @@ class Call:
         need(rank in (None, len(value.shape)), f"input {at + 1} has {len(value.shape)} dimensions instead of {rank}")
         found: list[int] = value.numbers.ravel().tolist()
         return found
-
-    def constant(self, at: int) -> list[int]:
-        """The numbers of an input that must be a constant in a row."""
-        return self.numbers(at, 1)
 
     def axis(self, rank: int, usual: int | None = None) -> int:
         """The setting `axis` as a number from 0 on."""
@@ -98,7 +93,7 @@ def axes(given: Iterable[Any], rank: int) -> list[int]:
 
 
 def together(*shapes: Shape) -> Shape:
-    """The shape of tensors that are spread over each other."""
+    """The shape once they are broadcast over each other."""
     found = []
     for sizes in zip_longest(*(reversed(s) for s in shapes), fillvalue=1):
         need(len(set(sizes) - {1}) < 2, f"shapes {[list(s) for s in shapes]} do not go together")
@@ -112,7 +107,7 @@ def same(call: Call) -> Out:
 
 
 def spread(call: Call) -> Out:
-    """Add, Div, Max, Mul, Sub: number by number of tensors that are spread over each other."""
+    """Add, Div, Max, Mul, Sub: number by number of tensors that are broadcast over each other."""
     kinds = {x.kind for x in call.inputs}
     need(len(kinds) == 1, f"types {sorted(kinds)} do not go together")
     return kinds.pop(), together(*(x.shape for x in call.inputs))
@@ -130,7 +125,7 @@ def choose(call: Call) -> Out:
 
 def rest(call: Call) -> Out:
     """Mod: on some processors a division by zero, or of the least number by -1, ends the program."""
-    need(all(n > 0 for n in call.numbers(1)), "divisors must be above 0")
+    need(all(n > 0 for n in call.numbers(1, None)), "divisors must be above 0")
     return spread(call)
 
 
@@ -157,7 +152,7 @@ def reduce(call: Call) -> Out:
     """ReduceMax and its like; up to opset 17 most have the axes as a setting."""
     x = call.inputs[0]
     need(len(call.inputs) == 1 or "axes" not in call.given, "axes are given twice")
-    named = call.constant(1) if len(call.inputs) == 2 else call.given.get("axes", range(len(x.shape)))
+    named = call.numbers(1) if len(call.inputs) == 2 else call.given.get("axes", range(len(x.shape)))
     return x.kind, _without(x.shape, axes(named, len(x.shape)), call.flag("keepdims", 1))
 
 
@@ -173,9 +168,248 @@ def highest(call: Call) -> Out:
 
 def top(call: Call) -> list[Out]:
     """TopK."""
-    shape, k = list(call.inputs[0].shape), call.constant(1)
+    shape, k = list(call.inputs[0].shape), call.numbers(1)
     axis = call.axis(len(shape), -1)
     call.flag("largest", 1), call.flag("sorted", 1)
     need(len(k) == 1 and 1 <= k[0] <= shape[axis], f"{k} of {shape[axis]} cannot be chosen")
     shape[axis] = k[0]
     return [("float32", tuple(shape)), (PLACE, tuple(shape))]
+
+
+def concat(call: Call) -> Out:
+    """Concat."""
+    first, shapes = call.inputs[0], [list(x.shape) for x in call.inputs]
+    axis = call.axis(len(first.shape))
+    alike = {(x.kind, len(x.shape), x.shape[:axis], x.shape[axis + 1 :]) for x in call.inputs}
+    need(len(alike) == 1, f"{sorted({x.kind for x in call.inputs})} of {shapes} cannot be joined along axis {axis}")
+    return first.kind, (*first.shape[:axis], sum(s[axis] for s in shapes), *first.shape[axis + 1 :])
+
+
+def cut(call: Call) -> Out:
+    """Slice."""
+    x, n = call.inputs[0], len(call.inputs)
+    starts, ends = call.numbers(1), call.numbers(2)
+    along = axes(call.numbers(3) if n > 3 else range(len(starts)), len(x.shape))
+    steps = call.numbers(4) if n > 4 else [1] * len(starts)
+    need(len(starts) == len(ends) == len(along) == len(steps), "starts, ends, axes and steps differ in number")
+    need(all(s >= 1 for s in steps), f"steps {steps} must be above 0")
+    shape = list(x.shape)
+    for axis, start, end, step in zip(along, starts, ends, steps, strict=True):
+        shape[axis] = len(range(*slice(start, end, step).indices(shape[axis])))
+    return x.kind, tuple(shape)
+
+
+def gather(call: Call) -> Out:
+    """Gather."""
+    x, at = call.inputs
+    axis = call.axis(len(x.shape), 0)
+    _within(at, x.shape[axis])
+    return x.kind, x.shape[:axis] + at.shape + x.shape[axis + 1 :]
+
+
+def _within(at: Value, size: int) -> None:
+    """Where the places are constants: each is there. Else onnxruntime looks, sweep by sweep."""
+    if at.numbers is not None:
+        need(bool(-size <= at.numbers.min() and at.numbers.max() < size), f"a place is out of {size}")
+
+
+def gather_each(call: Call) -> Out:
+    """GatherElements."""
+    x, at = call.inputs
+    _beside(call, x, at)
+    return x.kind, at.shape
+
+
+def scatter(call: Call) -> Out:
+    """ScatterElements."""
+    x, at, new = call.inputs
+    _beside(call, x, at)
+    need(new.shape == at.shape and new.kind == x.kind, "places and what is put there differ in shape or type")
+    need(call.given.get("reduction", b"none") in (b"none", b"add"), "reduction must be none or add")
+    return x.kind, x.shape
+
+
+def _beside(call: Call, x: Value, at: Value) -> None:
+    """Places lie in the tensor: as many dimensions, and none larger but along the axis."""
+    axis = call.axis(len(x.shape), 0)
+    fits = len(x.shape) == len(at.shape) and all(
+        i == axis or a <= n for i, (a, n) in enumerate(zip(at.shape, x.shape, strict=True))
+    )
+    need(fits, f"places of {list(at.shape)} do not fit {list(x.shape)}")
+    _within(at, x.shape[axis])
+
+
+def extract(call: Call) -> Out:
+    """ArrayFeatureExtractor: onnxruntime reads before the array where a place is negative."""
+    x, at = call.inputs
+    need(at.place, "places must come from TopK or ArgMax")
+    need(x.shape != (), "nothing to choose from")
+    return x.kind, (*(x.shape[:-1] or (1,)), prod(at.shape))
+
+
+def reshape(call: Call) -> Out:
+    """Reshape."""
+    x, wanted = call.inputs[0], call.numbers(1)
+    need(call.given.get("allowzero", 0) == 0, "allowzero must be 0")
+    need(all(n > 0 or n == -1 or (n == 0 and i < len(x.shape)) for i, n in enumerate(wanted)), f"{wanted} is no shape")
+    shape = [n or x.shape[i] for i, n in enumerate(wanted)]
+    if -1 in shape:
+        others = prod(n for n in shape if n > 0)
+        shape[shape.index(-1)] = prod(x.shape) // others
+    need(-1 not in shape and prod(shape) == prod(x.shape), f"{list(x.shape)} cannot become {wanted}")
+    return _as(x), tuple(shape)
+
+
+def flatten(call: Call) -> Out:
+    """Flatten."""
+    x, axis = call.inputs[0], call.given.get("axis", 1)
+    need(0 <= axis <= len(x.shape), f"axis {axis} of {len(x.shape)} dimensions")
+    return _as(x), (prod(x.shape[:axis]), prod(x.shape[axis:]))
+
+
+def _as(x: Value) -> str:
+    return PLACE if x.place else x.kind
+
+
+def unsqueeze(call: Call) -> Out:
+    """Unsqueeze."""
+    x, new = call.inputs[0], call.numbers(1)
+    left = iter(x.shape)
+    rank = len(x.shape) + len(new)
+    at = axes(new, rank)
+    return x.kind, tuple(1 if i in at else next(left) for i in range(rank))
+
+
+def transpose(call: Call) -> Out:
+    """Transpose."""
+    x = call.inputs[0]
+    order = call.given.get("perm", list(range(len(x.shape)))[::-1])
+    need(sorted(order) == list(range(len(x.shape))), f"perm {order} is no order of {len(x.shape)} dimensions")
+    return x.kind, tuple(x.shape[i] for i in order)
+
+
+def expand(call: Call) -> Out:
+    """Expand."""
+    wanted = call.numbers(1)
+    need(all(n > 0 for n in wanted), f"{wanted} is no shape")
+    return call.inputs[0].kind, together(call.inputs[0].shape, tuple(wanted))
+
+
+def filled(call: Call) -> Out:
+    """ConstantOfShape."""
+    value = call.given.get("value", Value("float32", (1,)))
+    need(value.shape == (1,) and value.kind == "float32", "value must be one float")
+    return "float32", tuple(call.numbers(0))
+
+
+def count(call: Call) -> Out:
+    """Range."""
+    (start,), (end,), (step,) = (call.numbers(i, 0) for i in range(3))
+    need(all(abs(n) < 1 << 31 for n in (start, end, step)) and step != 0, f"{start} to {end} in steps of {step}")
+    return spread(call)[0], (max(0, -((start - end) // step)),)
+
+
+def windows(call: Call, kernel: Shape) -> Shape:
+    """How often a kernel fits along each of the last dimensions."""
+    size, n = call.inputs[0].shape[2:], len(kernel)
+    need(0 < n == len(size) <= MOST_WINDOW_RANK, f"a kernel of {list(kernel)} on {list(size)}")
+    strides, dilations = call.steps("strides", n, 1, 1), call.steps("dilations", n, 1, 1)
+    pads, reach = call.steps("pads", 2 * n, 0, 0), [d * (k - 1) + 1 for d, k in zip(dilations, kernel, strict=True)]
+    need(all(p < r for p, r in zip(pads, reach * 2, strict=True)), f"pads {pads} beyond a kernel that reaches {reach}")
+    free = [s + p + q - r for s, p, q, r in zip(size, pads, pads[n:], reach, strict=False)]
+    need(all(f >= 0 for f in free), f"a kernel that reaches {reach} is larger than {list(size)} with pads {pads}")
+    return tuple(f // s + 1 for f, s in zip(free, strides, strict=True))
+
+
+def conv(call: Call) -> Out:
+    """Conv, of one group."""
+    x, w = (value.shape for value in call.inputs[:2])
+    need(len(x) == len(w) > 2 and x[1] == w[1], f"weights of {list(w)} on {list(x)}")
+    need(len(call.inputs) == 2 or call.inputs[2].shape == w[:1], "one bias for each filter is wanted")
+    return "float32", (x[0], w[0], *windows(call, w[2:]))
+
+
+def pool(call: Call) -> Out:
+    """MaxPool."""
+    x, kernel = call.inputs[0].shape, call.given.get("kernel_shape", [])
+    call.steps("kernel_shape", len(kernel), 1, 1)
+    need(len(x) > 2, f"nothing to pool in {list(x)}")
+    return "float32", (*x[:2], *windows(call, tuple(kernel)))
+
+
+def product(call: Call) -> Out:
+    """MatMul, MatMulInteger."""
+    a, b = (value.shape for value in call.inputs)
+    need(len(a) > 1 and len(b) > 1 and a[-1] == b[-2], f"{list(a)} times {list(b)}")
+    kind = "float32" if call.inputs[0].kind == "float32" else "int32"
+    return kind, (*together(a[:-2], b[:-2]), a[-2], b[-1])
+
+
+def gemm(call: Call) -> Out:
+    """Gemm."""
+    a, b = (value.shape[::-1] if call.flag(name, 0) else value.shape
+            for value, name in zip(call.inputs, ("transA", "transB"), strict=False))  # fmt: skip
+    need(len(a) == len(b) == 2 and a[1] == b[0], f"{list(a)} times {list(b)}")
+    out = (a[0], b[1])
+    need(len(call.inputs) == 2 or together(call.inputs[2].shape, out) == out, "what is added is too large")
+    return "float32", out
+
+
+def recurrent(call: Call) -> Out:
+    """GRU, forward: [steps, samples, inputs] -> [steps, 1, samples, state]."""
+    x, *weights = (value.shape for value in call.inputs)
+    size = call.given.get("hidden_size", 0)
+    call.flag("linear_before_reset", 0)
+    need(len(x) == 3 and 0 < size <= MOST_STEP, f"a state of {size} on {list(x)}")
+    need(weights == [(1, 3 * size, x[2]), (1, 3 * size, size), (1, 6 * size)], f"weights of {weights}")
+    return "float32", (x[0], 1, x[1], size)
+
+
+def quantize(call: Call) -> Out:
+    """QuantizeLinear, with one step."""
+    need(all(prod(x.shape) == 1 and len(x.shape) < 2 for x in call.inputs[1:]), "step and zero must be single numbers")
+    return "uint8", call.inputs[0].shape
+
+
+def dequantize(call: Call) -> Out:
+    """DequantizeLinear, with one step or one for each place along an axis."""
+    x, step, zero = call.inputs
+    each = (1,) if prod(step.shape) == 1 else (x.shape[call.axis(len(x.shape), 1)],)
+    fits = step.shape in ((), each) and zero.shape == step.shape
+    need(fits, "as many steps and zeros are wanted as there are places")
+    need(zero.kind == x.kind, f"zeros of {zero.kind} for {x.kind}")
+    return "float32", x.shape
+
+
+def scale(call: Call) -> Out:
+    """Scaler."""
+    x = call.inputs[0].shape
+    for name in ("offset", "scale"):
+        need(len(x) == 2 and len(call.given.get(name, ())) == x[1], f"{name} must have a number for each of {list(x)}")
+    return "float32", x
+
+
+def distances(call: Call) -> Out:
+    """CDist."""
+    a, b = (value.shape for value in call.inputs)
+    need(call.given.get("metric") == b"euclidean", "metric must be euclidean")
+    need(len(a) == len(b) == 2 and a[1] == b[1], f"distances of {list(a)} to {list(b)}")
+    return "float32", (a[0], b[0])
+
+
+def machine(call: Call) -> list[Out]:
+    """SVMClassifier: onnxruntime takes the lengths of its tables for granted."""
+    x, given = call.inputs[0].shape, call.given
+    need(len(x) == 2 and x[0] == 1, f"one row of features is wanted, not {list(x)}")
+    classes, each = list(given.get("classlabels_ints", ())), list(given.get("vectors_per_class", ()))
+    pairs, vectors = len(classes) * (len(classes) - 1) // 2, sum(each)
+    need(len(classes) > 1 and len(set(classes)) == len(classes) == len(each), "classes and their vectors do not fit")
+    need(all(0 < n <= MOST_STEP for n in each), f"vectors_per_class = {each}")
+    lengths = {"support_vectors": vectors * x[1], "coefficients": vectors * (len(classes) - 1), "rho": pairs,
+               "kernel_params": 3}  # fmt: skip
+    for name, length in lengths.items():
+        have = len(given.get(name, ()))
+        need(have == length, f"{name} has {have} numbers instead of {length}")
+    need(given.get("kernel_type") in (b"RBF", b"LINEAR"), "kernel_type must be RBF or LINEAR")
+    need(given.get("post_transform") == b"NONE", "post_transform must be NONE")
+    return [("int64", (1,)), ("float32", (1, max(pairs, 2)))]

@@ -196,6 +196,27 @@ def test_the_manifest_decides_what_goes_in_and_comes_out():
         check.check(sound, replace(MANIFEST, early=bundle.Early((0.9,), 1)))
 
 
+def test_enrolled_labels_and_means_decide_as_well():
+    """The model knows all labels but the enrolled ones, and its embedding is that of means.npz."""
+    toy, manifest = toy_bundle.model(), replace(MANIFEST, format=toy_bundle.FORMAT, labels=("a", "b", "c", "d"))
+    check.check(toy, manifest, enrolled=1, rank=2)
+    with pytest.raises(BundleError, match="3 materials apart, the manifest has 4 labels;"):
+        check.check(toy, manifest)
+    with pytest.raises(BundleError, match="4 labels, 2 of them enrolled"):
+        check.check(toy, manifest, enrolled=2)
+    with pytest.raises(BundleError, match=r"embedding is \[1, 2\] instead of \[1, 5\]"):
+        check.check(toy, manifest, enrolled=1, rank=5)
+
+
+@pytest.mark.parametrize("field", [b"\x0a\x00", b"\x2a\x00"], ids=["nodes", "constants"])
+def test_a_parse_takes_no_memory_before_it_is_counted(field: bytes):
+    """20 MB of empty messages, of which protobuf makes 1 GB: refused after MOST_VALUES of them."""
+    model = hostile.part(1, 8) + hostile.part(7, field * 10_000_000) + hostile.part(8, hostile.part(2, 17))
+    raised, most_mb = in_child(lambda: check.check(model, MANIFEST), 1 << 30)
+    assert "more than 50000 values" in raised
+    assert most_mb < 16
+
+
 def test_grown_models_pass_and_run():
     """Random operators in any order, as far as the rules let them: most of them onnxruntime opens and runs."""
     ran = 0
