@@ -31,7 +31,11 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
     with ExitStack() as stack:
 
         def make(
-            world: devices.SimWorld | None = None, sets: tuple[str, ...] = (), model=default_bundle, keepers=(), **more
+            world: devices.SimDevices | None = None,
+            sets: tuple[str, ...] = (),
+            model=default_bundle,
+            keepers=(),
+            **more,
         ) -> Rigged:
             world = world or devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
             settings = config.load(None, sets, site=NO_SITE)

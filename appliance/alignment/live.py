@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import SensorConfig
-from appliance.core.devices import World
+from appliance.core.devices import Devices
 from appliance.core.types import Frames
 from appliance.io.usb_sensor import UsbSensor
-from appliance.signal.contact import IN_PLACE, Place, Point, advice, centre
+from appliance.signal.contact import IN_PLACE, ContactPositions, Point, advice, centre
 
 LOOK_NS = 200_000_000
 """From one View to the next."""
@@ -51,7 +51,7 @@ class View:
     full: float = 1.0
     centre: Point | None = None
     nearest: Point | None = None
-    place: Place | None = None
+    place: ContactPositions | None = None
 
     def json(self) -> dict[str, Any]:
         """The View as a page reads it."""
@@ -62,7 +62,7 @@ class Placing:
     """Looks at the skin. The unloaded skin is the lowest that each taxel has been since the skin came: so nobody has to
     press a key for it, and a finger that lay on the skin at the start is noticed when it is lifted."""
 
-    def __init__(self, settings: SensorConfig, model: Bundle, world: World) -> None:
+    def __init__(self, settings: SensorConfig, model: Bundle, world: Devices) -> None:
         self._sensor = UsbSensor(settings, model.format, world.clock, world.backend)
         self._model, self._source = model, world.source
         self._shape = model.format.rows, model.format.cols
@@ -131,7 +131,7 @@ class Placing:
 
 
 def run(
-    settings: SensorConfig, model: Bundle, world: World, out: TextIO, stopped: Callable[[], bool],
+    settings: SensorConfig, model: Bundle, world: Devices, out: TextIO, stopped: Callable[[], bool],
     port: int | None = None,
 ) -> None:  # fmt: skip
     """Show on `out`, and on a page at `port` where one is given, how the skin is placed, until `stopped()`.

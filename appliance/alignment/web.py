@@ -52,7 +52,7 @@ def policy(page: str) -> str:
     )
 
 
-class Handler(BaseHTTPRequestHandler):
+class PageHandler(BaseHTTPRequestHandler):
     """One request. The library reads its head, this answers from what the server holds."""
 
     server: Server
@@ -128,7 +128,7 @@ class Server(ThreadingHTTPServer):
         self.clock, self.policy = clock, policy(page)
         self.held = {"/": ("text/html; charset=utf-8", page.encode()), "/state": ("application/json", b"null")}
         self._room = threading.Semaphore(MOST_OPEN)
-        super().__init__((HERE, port), Handler)
+        super().__init__((HERE, port), PageHandler)
 
     def server_bind(self) -> None:
         """As of a plain server: the library's own would ask a name server for this machine's name, and wait for it."""

@@ -16,7 +16,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.schema import typed
 from appliance.core.types import SweepFormat
 from appliance.signal import features
-from appliance.signal.contact import Place
+from appliance.signal.contact import ContactPositions
 
 SCHEMA = 3
 """What is written. Schema 1 has no `early` and no `known`, schema 2 no `runtime`, `counter` and `place`; both are read."""
@@ -105,7 +105,7 @@ class Manifest:
     made: dict[str, Any] = field(default_factory=dict)
     early: Early | None = None
     known: Known | None = None
-    place: Place | None = None
+    place: ContactPositions | None = None
     runtime: str = "0.0.0"
     counter: int = 0
     schema: int = SCHEMA
@@ -146,7 +146,7 @@ class Manifest:
                 ("thresholds", Thresholds),
                 ("early", Early),
                 ("known", Known),
-                ("place", Place),
+                ("place", ContactPositions),
             ):
                 if raw.get(name) is not None:
                     raw[name] = typed(kind, raw[name])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from appliance.bundle import bundle
 from appliance.core.errors import BundleError
 from appliance.deployment.shelf import SHA
-from appliance.deployment.state import MOST_STARTS, PACKAGED, Ledger
+from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
 
 if TYPE_CHECKING:
     from appliance.core.config import StoreConfig
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ListedBundle:
     """One bundle of the store; sha "" for the packaged one, which nobody signed.
 
     role: current, on trial, previous (what `palpate rollback` goes back to), candidate, left, kept, or damaged.
@@ -34,7 +34,7 @@ class Entry:
     detail: str
 
 
-def entries(store: Store) -> list[Entry]:
+def entries(store: Store) -> list[ListedBundle]:
     """The store's bundles, those that matter most first."""
     current, ledger = store.current, store.ledger
     there = sorted(p.name for p in store.shelf.folder.iterdir()) if store.shelf.folder.is_dir() else []
@@ -43,7 +43,7 @@ def entries(store: Store) -> list[Entry]:
     return sorted(told, key=lambda e: order.index(e.role))
 
 
-def lines(told: Iterable[Entry]) -> list[str]:
+def lines(told: Iterable[ListedBundle]) -> list[str]:
     """A table for a person."""
     rows = [(e.role, e.id, f"{e.name} {e.version}", str(e.counter), e.signer, e.detail) for e in told]
     rows = [("role", "id", "bundle", "counter", "signed by", ""), *rows]
@@ -51,7 +51,7 @@ def lines(told: Iterable[Entry]) -> list[str]:
     return ["  ".join([*(t.ljust(w) for t, w in zip(row, wide, strict=False)), row[-1]]).rstrip() for row in rows]
 
 
-def _entry(store: Store, sha: str, current: str, ledger: Ledger) -> Entry:
+def _entry(store: Store, sha: str, current: str, ledger: StoreState) -> ListedBundle:
     role, detail = _role(sha, current, ledger, store.how)
     try:
         if sha == PACKAGED:
@@ -60,12 +60,12 @@ def _entry(store: Store, sha: str, current: str, ledger: Ledger) -> Entry:
             held = store.shelf.get(sha)
             found, signer = held.bundle, held.signer
     except BundleError as e:
-        return Entry(sha, sha[:8], "?", "?", 0, "?", "damaged", " ".join(filter(None, (role, detail, str(e)))))
+        return ListedBundle(sha, sha[:8], "?", "?", 0, "?", "damaged", " ".join(filter(None, (role, detail, str(e)))))
     m = found.manifest
-    return Entry(sha, found.id, m.name, m.version, m.counter, signer, role, detail)
+    return ListedBundle(sha, found.id, m.name, m.version, m.counter, signer, role, detail)
 
 
-def _role(sha: str, current: str, ledger: Ledger, how: StoreConfig) -> tuple[str, str]:
+def _role(sha: str, current: str, ledger: StoreState, how: StoreConfig) -> tuple[str, str]:
     standing = ledger.of(sha)
     if sha == current and standing.committed:
         return "current", ""

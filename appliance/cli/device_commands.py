@@ -20,21 +20,21 @@ from appliance.bundle.bundle import Bundle
 from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
-from appliance.core.devices import World
+from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError
-from appliance.core.health import Pulse
+from appliance.core.health import HealthObserver
 from appliance.core.types import SweepFormat
 from appliance.io.robot_link import Port, ResultSink
 from appliance.recording.capture import CaptureWriter
 from appliance.runtime import assembly
 from appliance.runtime.assembly import log
-from appliance.runtime.loop import Box, Keeper
+from appliance.runtime.loop import Box, SweepObserver
 from appliance.runtime.selftest import check
 from appliance.service import journal
 from appliance.service.notify import Manager
 from appliance.service.status import StatusFile
 
-Devices = Callable[[Callable[[], SweepFormat]], World]
+OpenDevices = Callable[[Callable[[], SweepFormat]], Devices]
 """Gives the world; asked with what tells the format that a simulated skin has to send."""
 
 
@@ -63,20 +63,20 @@ def stop_flag() -> Callable[[], bool]:
     return lambda: bool(got)
 
 
-def run(args: argparse.Namespace, devices: Devices) -> int:
+def run(args: argparse.Namespace, devices: OpenDevices) -> int:
     """`palpate run`: until SIGTERM, or with --sim until the script has ended and everything was answered."""
     return _serve(args, devices, lambda *_: None)
 
 
-def run_record(args: argparse.Namespace, devices: Devices) -> int:
+def run_record(args: argparse.Namespace, devices: OpenDevices) -> int:
     """`palpate record`: the same, and each sweep is kept with its label; whole windows are wanted, so nothing is early."""
-    from appliance.recording.recording import Labels, Recording
+    from appliance.recording.recording import Labels, RecordingSession
 
     labels = Labels(args.material, args.position, args.session)
 
-    def add(crew: Crew, how: Config, fmt: SweepFormat, world: World, stack: ExitStack) -> None:
+    def add(crew: Crew, how: Config, fmt: SweepFormat, world: Devices, stack: ExitStack) -> None:
         folder = args.out or Path(how.store.folder) / "sweeps"
-        recording = Recording(
+        recording = RecordingSession(
             folder, fmt, labels, world.clock, circumstances=crew.circumstances, say=crew.say, log=log
         )  # fmt: skip
         stack.callback(recording.close)
@@ -91,8 +91,8 @@ class Crew:
     """Who works beside the box: what `build.box` is to be given. box: there once it was built."""
 
     also: list[ResultSink] = field(default_factory=list)
-    keepers: list[Keeper] = field(default_factory=list)
-    pulses: list[Pulse] = field(default_factory=list)
+    keepers: list[SweepObserver] = field(default_factory=list)
+    pulses: list[HealthObserver] = field(default_factory=list)
     obey: dict[str, Callable[[str], list[object]]] = field(default_factory=dict)
     port: Port | None = None
     box: Box | None = None
@@ -108,7 +108,7 @@ class Crew:
 
 
 def _serve(
-    args: argparse.Namespace, devices: Devices, add: Callable[[Crew, Config, SweepFormat, World, ExitStack], None], *,
+    args: argparse.Namespace, devices: OpenDevices, add: Callable[[Crew, Config, SweepFormat, Devices, ExitStack], None], *,
     whole: bool = False,
 ) -> int:  # fmt: skip
     """Run the box. add: puts further ones into its crew. whole: no early answers."""
@@ -165,7 +165,7 @@ def _watch(crew: Crew, how: Config, held: Bundle, stack: ExitStack, facts: Mappi
         crew.pulses.append(told)
 
 
-def _shadow(crew: Crew, how: Config, held: Bundle, world: World, named: str | None) -> Callable[[], str]:
+def _shadow(crew: Crew, how: Config, held: Bundle, world: Devices, named: str | None) -> Callable[[], str]:
     """Have a candidate classify beside, where one is wanted and there is one; how it does, in words."""
     try:
         candidate = None
@@ -187,7 +187,7 @@ def _shadow(crew: Crew, how: Config, held: Bundle, world: World, named: str | No
     return lambda: shadow.agreement.text
 
 
-def run_check(args: argparse.Namespace, devices: Devices) -> int:
+def run_check(args: argparse.Namespace, devices: OpenDevices) -> int:
     """`palpate check`: each part by itself, one line each; 1 where any fails."""
     how = settings(args)
     world = devices(lambda: model(how).format)
@@ -198,7 +198,7 @@ def run_check(args: argparse.Namespace, devices: Devices) -> int:
     return 1 if failed else 0
 
 
-def run_enrol(args: argparse.Namespace, devices: Devices) -> int:
+def run_enrol(args: argparse.Namespace, devices: OpenDevices) -> int:
     """`palpate enrol`: the box takes sweeps as always; of the good ones it makes a bundle with one label more."""
     from appliance.inference import enrolment
 
@@ -222,7 +222,7 @@ def run_enrol(args: argparse.Namespace, devices: Devices) -> int:
     return 0
 
 
-def run_place(args: argparse.Namespace, devices: Devices) -> int:
+def run_place(args: argparse.Namespace, devices: OpenDevices) -> int:
     """`palpate place`: where the contact lies, until Ctrl-C."""
     from appliance.alignment import live
 

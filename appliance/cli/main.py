@@ -20,15 +20,15 @@ from appliance.cli import commands, device_commands
 from appliance.cli.device_commands import model, settings, stop_flag
 from appliance.cli.parser import parser
 from appliance.core.clock import SystemClock
-from appliance.core.devices import World
+from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.types import SweepFormat
 from appliance.io.robot_link import ResultSink, SerialSink
 from appliance.runtime import assembly
-from appliance.runtime.loop import Box, Keeper
+from appliance.runtime.loop import Box, SweepObserver
 
 if TYPE_CHECKING:
-    from appliance.sim.devices import SimWorld
+    from appliance.sim.devices import SimDevices
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -52,11 +52,13 @@ def main(argv: list[str] | None = None) -> int:
         return 1
 
 
-def _with_devices(run: Callable[[argparse.Namespace, device_commands.Devices], int], args: argparse.Namespace) -> int:
+def _with_devices(
+    run: Callable[[argparse.Namespace, device_commands.OpenDevices], int], args: argparse.Namespace
+) -> int:
     return run(args, partial(_world, args))
 
 
-def _world(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> World:
+def _world(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> Devices:
     """The real devices, or the rig where `--sim` names it; `fmt` tells what the simulated skin has to send."""
     if args.sim:
         return _simulated(args.sim, fmt(), args, remember=False)
@@ -64,10 +66,10 @@ def _world(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> World:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
     import gpiod
 
-    return World(SystemClock(), gpiod)
+    return Devices(SystemClock(), gpiod)
 
 
-def _simulated(name: str, fmt: SweepFormat, args: argparse.Namespace, *, remember: bool = True) -> SimWorld:
+def _simulated(name: str, fmt: SweepFormat, args: argparse.Namespace, *, remember: bool = True) -> SimDevices:
     from appliance.sim import devices, rig, script
 
     acts, source = script.named(name, fmt, args.seed)
@@ -101,10 +103,10 @@ def run_bench(args: argparse.Namespace) -> int:
     held = model(how)
 
     def staged(
-        world: SimWorld,
+        world: SimDevices,
         stack: ExitStack,
         also: Iterable[ResultSink] = (),
-        keepers: Iterable[Keeper] = (),
+        keepers: Iterable[SweepObserver] = (),
     ) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(how.serial, port=name), world.clock, world.source)

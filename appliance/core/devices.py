@@ -10,7 +10,7 @@ from appliance.core.config import Config
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class Devices:
     """What the drivers stand on. These are the real devices; the rig's world says otherwise.
 
     gpio: the module gpiod or its double. backend: a pyusb backend, None for libusb. source: as sentences name it.

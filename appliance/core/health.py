@@ -35,7 +35,7 @@ class Health:
         return f"{skin}. Sweeps answered: {self.answered}"
 
 
-class Pulse(Protocol):
+class HealthObserver(Protocol):
     """Whoever watches over the program: a turn that does not end is noticed by its silence."""
 
     def turn(self, health: Health) -> None:

@@ -38,7 +38,7 @@ class Standing:
 
 
 @dataclass(frozen=True, slots=True)
-class Ledger:
+class StoreState:
     """counter, highest: the highest counter that was ever committed, and its bundle. candidate: who is shadowing."""
 
     counter: int = 0
@@ -50,11 +50,11 @@ class Ledger:
         """How a bundle stands; one that is not in the ledger was put there by hand, and goes back to the packaged one."""
         return self.standings.get(sha, Standing())
 
-    def changed(self, sha: str, **changes: Any) -> Ledger:
+    def changed(self, sha: str, **changes: Any) -> StoreState:
         """The ledger with these fields of one bundle's standing changed."""
         return replace(self, standings=self.standings | {sha: replace(self.of(sha), **changes)})
 
-    def activated(self, sha: str, counter: int, now: str) -> Ledger:
+    def activated(self, sha: str, counter: int, now: str) -> StoreState:
         """As it must be before `sha` becomes the current one in place of `now`: on trial, and back to what is committed."""
         back = now if self.of(now).committed else self.of(now).previous
         fresh = self if sha != self.candidate else replace(self, candidate=PACKAGED)
@@ -63,18 +63,18 @@ class Ledger:
         standings = fresh.standings | {sha: Standing(back, counter, committed=False)}
         return replace(fresh, standings=standings)
 
-    def committed(self, sha: str) -> Ledger:
+    def committed(self, sha: str) -> StoreState:
         """With the trial of `sha` over: what counts less than it is refused from now on."""
         made = self.changed(sha, committed=True, starts=0, why="")
         counter = self.of(sha).counter
         return replace(made, counter=counter, highest=sha) if counter >= self.counter else made
 
-    def left(self, sha: str, why: str) -> Ledger:
+    def left(self, sha: str, why: str) -> StoreState:
         """With the trial of `sha` over for this reason; its starts are used up, should it be current for a moment more."""
         text = "".join(c if c.isprintable() else " " for c in why)
         return self.changed(sha, starts=MOST_STARTS, why=text[:MOST_WHY])
 
-    def exchanged(self, sha: str) -> Ledger:
+    def exchanged(self, sha: str) -> StoreState:
         """As it must be before what `sha` goes back to becomes current: a second time goes forward again."""
         return self.changed(self.of(sha).previous, previous=sha)
 
@@ -83,7 +83,7 @@ class Ledger:
         back = self.of(sha).previous
         return (sha, back) if self.of(sha).committed else (sha, back, self.of(back).previous)
 
-    def only(self, *kept: str) -> Ledger:
+    def only(self, *kept: str) -> StoreState:
         """With the standings of these bundles alone."""
         return replace(self, standings={sha: held for sha, held in self.standings.items() if sha in kept})
 
@@ -100,7 +100,7 @@ class Ledger:
         return (json.dumps(asdict(self), indent=1, sort_keys=True) + "\n").encode()
 
     @classmethod
-    def parse(cls, text: bytes) -> Ledger:
+    def parse(cls, text: bytes) -> StoreState:
         """Read it. Raises ValueError or TypeError naming what is wrong."""
         raw = json.loads(text)
         raw["standings"] = {sha: typed(Standing, held) for sha, held in raw["standings"].items()}

@@ -30,7 +30,7 @@ from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, BundleError, ConfigError
 from appliance.deployment.sandbox import apart
 from appliance.deployment.shelf import SHA, Shelf, Signed
-from appliance.deployment.state import MOST_STARTS, PACKAGED, Ledger
+from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
 from appliance.deployment.trial import Trial
 from appliance.service.journal import WARNING
 
@@ -74,12 +74,12 @@ class Store:
         return sha
 
     @property
-    def ledger(self) -> Ledger:
+    def ledger(self) -> StoreState:
         """What is known of the bundles; empty where nothing was ever deployed."""
         try:
-            return Ledger.parse(self._book.read_bytes())
+            return StoreState.parse(self._book.read_bytes())
         except FileNotFoundError:
-            return Ledger()
+            return StoreState()
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
             raise BundleError(
                 f"{self._book} cannot be read: {e}; without this file the current bundle counts as committed, and any "
@@ -218,11 +218,11 @@ class Store:
                 self._put(ledger.left(sha, why))
                 self._point(ledger.of(sha).previous)
 
-    def _activate(self, held: Signed, ledger: Ledger) -> None:
+    def _activate(self, held: Signed, ledger: StoreState) -> None:
         self._put(ledger.activated(held.sha, held.bundle.manifest.counter, self.current))
         self._point(held.sha)
 
-    def _put(self, ledger: Ledger) -> None:
+    def _put(self, ledger: StoreState) -> None:
         storage.put(self._book, ledger.json())
 
     def _point(self, sha: str) -> None:
@@ -234,7 +234,7 @@ class Store:
             storage.sync(self.folder)
 
     @contextmanager
-    def _held(self, wait_s: float = LOCK_S) -> Iterator[Ledger]:
+    def _held(self, wait_s: float = LOCK_S) -> Iterator[StoreState]:
         """The ledger, while nobody else changes it."""
         door = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
         try:

@@ -31,7 +31,7 @@ _IDENTITY = struct.Struct("<BBBB16s16s")
 _FORMAT = struct.Struct("<BBBxIII")
 
 
-class Kind(IntEnum):
+class PacketKind(IntEnum):
     """Byte 3 of a packet."""
 
     FRAMES = 0
@@ -105,7 +105,7 @@ class SkinFormat:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class StreamPosition:
     """Where in the stream we are: number of the enumeration, and the unwrapped number of the next frame if any came."""
 
     epoch: int
@@ -126,14 +126,14 @@ def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
             f"{n} frames of {rows} x {cols} taxels do not fit a packet of {MAX_PAYLOAD} bytes; send fewer"
         )
     head = HEADER.pack(
-        MAGIC, VERSION, Kind.FRAMES, len(payload), flags, n, rows, cols, digit, seq % (1 << 32), t_us % (1 << 32)
+        MAGIC, VERSION, PacketKind.FRAMES, len(payload), flags, n, rows, cols, digit, seq % (1 << 32), t_us % (1 << 32)
     )
     return _seal(head, payload)
 
 
 def pack_reply(request: Request, payload: bytes, version: int = VERSION) -> bytes:
     """A reply packet, as a CDC-ACM board answers a request byte."""
-    return _seal(HEADER.pack(MAGIC, version, Kind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0), payload)
+    return _seal(HEADER.pack(MAGIC, version, PacketKind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0), payload)
 
 
 def unpack(data: bytes) -> Unpacked:
@@ -166,10 +166,10 @@ def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
     if len(data) - at < HEADER.size:
         return None, 0
     _, version, kind, length, flags, count, rows, cols, digit, seq, t_us = HEADER.unpack_from(data, at)
-    frames = kind == Kind.FRAMES and version == VERSION and digit < len(_DTYPES) and count > 0 and rows * cols > 0
+    frames = kind == PacketKind.FRAMES and version == VERSION and digit < len(_DTYPES) and count > 0 and rows * cols > 0
     if frames:
         frames = length == count * rows * cols * _DTYPES[digit].itemsize
-    if length > MAX_PAYLOAD or not (frames or kind == Kind.REPLY):
+    if length > MAX_PAYLOAD or not (frames or kind == PacketKind.REPLY):
         return None, 1
     end = at + HEADER.size + length
     if len(data) < end + CRC.size:
@@ -177,13 +177,13 @@ def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
     if zlib.crc32(data[at:end]) != CRC.unpack_from(data, end)[0]:
         return None, 1
     size = end + CRC.size - at
-    if kind == Kind.REPLY:
+    if kind == PacketKind.REPLY:
         return Reply(count, data[at + HEADER.size : end]), size
     taxels = np.frombuffer(data, _DTYPES[digit], count * rows * cols, at + HEADER.size).reshape(count, rows, cols)
     return Packet(seq, t_us, flags, taxels), size
 
 
-def follow(packets: list[Packet], place: Place) -> tuple[list[tuple[int, Packet]], Place, int, int]:
+def follow(packets: list[Packet], place: StreamPosition) -> tuple[list[tuple[int, Packet]], StreamPosition, int, int]:
     """Unwrap sequence numbers: ([(unwrapped number of the first frame, packet)], new place, lost frames, stale frames).
 
     A packet that lies behind is stale (repeated or late) and left out; one that lies far behind starts a new epoch,
@@ -198,14 +198,14 @@ def follow(packets: list[Packet], place: Place) -> tuple[list[tuple[int, Packet]
             stale += n
             continue
         if ahead < 0:
-            place = Place(place.epoch + 1)
+            place = StreamPosition(place.epoch + 1)
         if place.next is None:
             first = (place.epoch << EPOCH_BITS) + p.seq
         else:
             first = place.next + ahead
             lost += ahead
         fresh.append((first, p))
-        place = Place(place.epoch, first + n)
+        place = StreamPosition(place.epoch, first + n)
     return fresh, place, lost, stale
 
 

@@ -27,7 +27,7 @@ _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 
 
 @dataclass(slots=True)
-class Tally:
+class SensorCounters:
     """What was counted since the program started, in the unit of each name."""
 
     frames: int = 0
@@ -63,7 +63,7 @@ class Sensor(Protocol):
         ...
 
     @property
-    def tally(self) -> Tally:
+    def tally(self) -> SensorCounters:
         """What was counted since the start."""
         ...
 
@@ -72,7 +72,7 @@ class Sensor(Protocol):
         ...
 
 
-class Tap(Protocol):
+class TransferObserver(Protocol):
     """Takes note of what comes in, for captures."""
 
     def transfer(self, t_ns: int, data: bytes) -> None:
@@ -87,11 +87,11 @@ class Tap(Protocol):
 class Stream:
     """Bytes of one board -> Frames with unwrapped numbers and host times; no I/O. What is not intact is counted."""
 
-    def __init__(self, fmt: SweepFormat, tally: Tally) -> None:
+    def __init__(self, fmt: SweepFormat, tally: SensorCounters) -> None:
         self._format, self._tally = fmt, tally
         self._grid, self._digits = (fmt.rows, fmt.cols), fmt.digits
         self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(np.int64)
-        self._place = packets.Place(-1)
+        self._place = packets.StreamPosition(-1)
         self._device = DeviceClock()
         self._leftover = b""
         self._mark: tuple[int, int] | None = None  # (number, device ns) of a frame at most a second ago
@@ -99,7 +99,7 @@ class Stream:
     def restart(self) -> None:
         """A new enumeration, the first one too: numbers get the next epoch, the device's clock starts anew."""
         self._tally.enumerations += 1
-        self._place = packets.Place(self._place.epoch + 1)
+        self._place = packets.StreamPosition(self._place.epoch + 1)
         self._device, self._mark = DeviceClock(), None
         self._leftover = b""
 
@@ -172,12 +172,17 @@ class UsbSensor:
     """
 
     def __init__(
-        self, config: SensorConfig, fmt: SweepFormat, clock: Clock, backend: Any = None, tap: Tap | None = None
+        self,
+        config: SensorConfig,
+        fmt: SweepFormat,
+        clock: Clock,
+        backend: Any = None,
+        tap: TransferObserver | None = None,
     ) -> None:
         self.state = "absent"
         self.trouble: SensorError | None = None
         self.identity: packets.Identity | None = None
-        self.tally = Tally()
+        self.tally = SensorCounters()
         self._config, self._format, self._clock, self._backend, self._tap = config, fmt, clock, backend, tap
         self._stream = Stream(fmt, self.tally)
         self._link: usb_link.VendorLink | None = None

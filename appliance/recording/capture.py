@@ -21,7 +21,7 @@ from appliance.core.types import Frames, SweepFormat
 from appliance.io.packets import Identity
 from appliance.io.robot_link import Command, command
 from appliance.io.trigger import Edge, EdgeKind
-from appliance.io.usb_sensor import Stream, Tally
+from appliance.io.usb_sensor import SensorCounters, Stream
 
 MAGIC = b"PPLPCAP1"
 _RECORD = struct.Struct("<BQI")
@@ -31,7 +31,7 @@ _MOST_NS = 1 << 63
 """Times are int64."""
 
 
-class Kind(IntEnum):
+class RecordKind(IntEnum):
     """What a record holds."""
 
     TRANSFER = 0
@@ -58,25 +58,25 @@ class CaptureWriter:
 
     def transfer(self, t_ns: int, data: bytes) -> None:
         """Note a bulk transfer that ended at `t_ns`."""
-        self._write(Kind.TRANSFER, t_ns, data)
+        self._write(RecordKind.TRANSFER, t_ns, data)
 
     def state(self, t_ns: int, state: str) -> None:
         """Note the sensor's new state."""
-        self._write(Kind.STATE, t_ns, state.encode())
+        self._write(RecordKind.STATE, t_ns, state.encode())
 
     def edges(self, t_ns: int, edges: list[Edge]) -> None:
         """Note edges that the trigger gave out at `t_ns`."""
-        self._write(Kind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
+        self._write(RecordKind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
 
     def command(self, t_ns: int, line: str) -> None:
         """Note a command that was carried out, as it stands in a sentence."""
-        self._write(Kind.COMMAND, t_ns, line.encode())
+        self._write(RecordKind.COMMAND, t_ns, line.encode())
 
     def close(self) -> None:
         """Finish the file."""
         self._put(self._file.close)
 
-    def _write(self, kind: Kind, t_ns: int, data: bytes) -> None:
+    def _write(self, kind: RecordKind, t_ns: int, data: bytes) -> None:
         if not self._ended:
             self._put(lambda: self._file.write(_RECORD.pack(kind, t_ns, len(data)) + data))
 
@@ -112,7 +112,7 @@ class Playback:
         self.state = "absent"
         self.trouble: SensorError | None = None
         self.identity: Identity | None = None
-        self.tally = Tally()
+        self.tally = SensorCounters()
         self._stream = Stream(self.format, self.tally)
         self._records = deque(_records(path, data, begin))
         self._now_ns = self._records[0][1] if self._records else 0
@@ -144,12 +144,12 @@ class Playback:
         frames = Frames.empty(self.format)
         if self._records:
             kind, self._now_ns, data = self._records[0]
-            if kind in (Kind.TRANSFER, Kind.STATE):
+            if kind in (RecordKind.TRANSFER, RecordKind.STATE):
                 self._records.popleft()
-            if kind == Kind.TRANSFER:
+            if kind == RecordKind.TRANSFER:
                 with suppress(SensorMismatch):  # what the sensor made of it then is the next record
                     frames = self._stream.feed(data, self._now_ns)
-            elif kind == Kind.STATE:
+            elif kind == RecordKind.STATE:
                 self.state = data.decode()
                 if self.state == "streaming":
                     self._stream.restart()
@@ -158,38 +158,38 @@ class Playback:
     def edges(self, now_ns: int) -> list[Edge]:
         """Trigger: the edges that the box was given at this moment."""
         edges = []
-        while self._records and self._records[0][0] == Kind.EDGES and self._records[0][1] <= now_ns:
+        while self._records and self._records[0][0] == RecordKind.EDGES and self._records[0][1] <= now_ns:
             edges += [Edge(_KINDS[k], t) for t, k in _EDGE.iter_unpack(self._records.popleft()[2])]
         return edges
 
     def commands(self) -> list[Command]:
         """Port: the commands that were carried out at this moment."""
         found = []
-        while self._records and self._records[0][0] == Kind.COMMAND and self._records[0][1] <= self._now_ns:
+        while self._records and self._records[0][0] == RecordKind.COMMAND and self._records[0][1] <= self._now_ns:
             found.append(_command(self._records.popleft()[2]))
         return found
 
 
-def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[Kind, int, bytes]]:
+def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int, bytes]]:
     """(kind, host ns, content) one after another."""
     while at + _RECORD.size <= len(data):
         kind, t_ns, size = _RECORD.unpack_from(data, at)
         body = data[at + _RECORD.size : at + _RECORD.size + size]
         whole = len(body) == size
-        if kind >= len(Kind) or (whole and not _written(kind, t_ns, body)):
+        if kind >= len(RecordKind) or (whole and not _written(kind, t_ns, body)):
             raise FormatError(f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture again")
         if whole:
-            yield Kind(kind), t_ns, body
+            yield RecordKind(kind), t_ns, body
         at += _RECORD.size + size
 
 
 def _written(kind: int, t_ns: int, body: bytes) -> bool:
     """Whether a record is one that CaptureWriter writes."""
-    if kind == Kind.EDGES:
+    if kind == RecordKind.EDGES:
         return not len(body) % _EDGE.size and all(k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body))
-    if kind == Kind.COMMAND:
+    if kind == RecordKind.COMMAND:
         return not _command(body).error
-    return t_ns < _MOST_NS and (kind == Kind.TRANSFER or body.isalpha())
+    return t_ns < _MOST_NS and (kind == RecordKind.TRANSFER or body.isalpha())
 
 
 def _command(line: bytes) -> Command:

@@ -122,7 +122,7 @@ class Labels:
                 )
 
 
-class Recording:
+class RecordingSession:
     """Keeper of a running box: writes each sweep that has a window, with the labels that held at its start edge.
 
     circumstances: what stands in the sidecars beside sweep and verdict. say: takes REC sentences. log: told where

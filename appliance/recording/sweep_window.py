@@ -37,7 +37,7 @@ class _Open:
     step: int = 0
 
 
-class Recorder:
+class SweepCutter:
     """Holds the last `longest_s` (and a little more) of frames, and the sweeps that have not been answered yet."""
 
     def __init__(self, fmt: SweepFormat, config: SweepConfig) -> None:

@@ -9,9 +9,9 @@ from contextlib import ExitStack, suppress
 from appliance.bundle.bundle import Bundle
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import Config
-from appliance.core.devices import World
+from appliance.core.devices import Devices
 from appliance.core.errors import ConfigError
-from appliance.core.health import Pulse
+from appliance.core.health import HealthObserver
 from appliance.deployment.store import Store
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
@@ -21,8 +21,8 @@ from appliance.io.trigger import GpioTrigger
 from appliance.io.usb_sensor import UsbSensor
 from appliance.io.verdict_lines import LineSink, check_bits
 from appliance.recording.capture import CaptureWriter
-from appliance.recording.sweep_window import Recorder
-from appliance.runtime.loop import Box, Keeper
+from appliance.recording.sweep_window import SweepCutter
+from appliance.runtime.loop import Box, SweepObserver
 from appliance.service import journal
 
 
@@ -33,8 +33,8 @@ def log(line: str) -> None:
 
 
 def box(
-    settings: Config, model: Bundle, world: World, port: Port | None, stack: ExitStack, *,
-    capture: CaptureWriter | None = None, keepers: Iterable[Keeper] = (), pulses: Iterable[Pulse] = (),
+    settings: Config, model: Bundle, world: Devices, port: Port | None, stack: ExitStack, *,
+    capture: CaptureWriter | None = None, keepers: Iterable[SweepObserver] = (), pulses: Iterable[HealthObserver] = (),
     log: Callable[[str], None] = lambda line: None, also: Iterable[ResultSink] = (), labels: tuple[str, ...] = (),
     obey: Mapping[str, Callable[[str], list[object]]] | None = None,
 ) -> Box:  # fmt: skip
@@ -57,7 +57,7 @@ def box(
     if settings.output.class_bits:
         sinks.append(LineSink(lines, (*model.manifest.labels, *labels)))
     return Box(
-        sensor, trigger, Recorder(model.format, settings.sweep), run, world.clock,
+        sensor, trigger, SweepCutter(model.format, settings.sweep), run, world.clock,
         early=early(settings, run), sinks=sinks,
         port=port, panel=lines, state_s=settings.serial.state_s, source=world.source, log=log,
         tap=capture, keepers=[*keepers], pulses=[*pulses], obey=obey or {},
@@ -89,7 +89,7 @@ def store(settings: Config) -> Store:
     return Store(settings.store, lambda model: prove(settings, model))
 
 
-def port(settings: Config, world: World) -> Port | None:
+def port(settings: Config, world: Devices) -> Port | None:
     """The serial line, or standard output where none is configured; not into the journal, which a person reads."""
     if settings.serial.port:
         return SerialSink(settings.serial, world.clock, world.source)

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError
-from appliance.core.health import Health, Pulse
+from appliance.core.health import Health, HealthObserver
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.io.robot_link import Command, Port, ResultSink, sentence
 from appliance.io.trigger import Edge, Trigger
-from appliance.io.usb_sensor import Sensor, Tally
-from appliance.recording.sweep_window import Recorder
+from appliance.io.usb_sensor import Sensor, SensorCounters
+from appliance.recording.sweep_window import SweepCutter
 from appliance.service.journal import WARNING
 
 TARE_S = 0.5
@@ -37,7 +37,7 @@ class Panel(Protocol):
         ...
 
 
-class Tap(Protocol):
+class InputObserver(Protocol):
     """Takes note of what comes in beside frames, for captures."""
 
     def edges(self, t_ns: int, edges: list[Edge]) -> None:
@@ -49,7 +49,7 @@ class Tap(Protocol):
         ...
 
 
-Keeper = Callable[[Sweep, Verdict], None]
+SweepObserver = Callable[[Sweep, Verdict], None]
 """Takes a sweep with its verdict, after all answers of the turn are out. Must not raise: a full disk costs the record,
 never the classifying."""
 
@@ -65,11 +65,11 @@ class Box:
     """
 
     def __init__(
-        self, sensor: Sensor, trigger: Trigger, recorder: Recorder, classifier: Classifier, clock: Clock, *,
+        self, sensor: Sensor, trigger: Trigger, recorder: SweepCutter, classifier: Classifier, clock: Clock, *,
         early: Decider | None = None,
         sinks: Sequence[ResultSink] = (), port: Port | None = None, panel: Panel | None = None,
         state_s: float = 1.0, source: str = "usb", log: Callable[[str], None] = lambda line: None,
-        tap: Tap | None = None, keepers: Sequence[Keeper] = (), pulses: Sequence[Pulse] = (),
+        tap: InputObserver | None = None, keepers: Sequence[SweepObserver] = (), pulses: Sequence[HealthObserver] = (),
         obey: Mapping[str, Callable[[str], list[object]]] = MappingProxyType({}),
     ) -> None:  # fmt: skip
         self.answered = 0
@@ -82,7 +82,7 @@ class Box:
         self._troubles: dict[str, str] = {}
 
     @property
-    def tally(self) -> Tally:
+    def tally(self) -> SensorCounters:
         """What the sensor has counted since the start."""
         return self._sensor.tally
 

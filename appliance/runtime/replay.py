@@ -25,7 +25,7 @@ from appliance.inference.early_exit import Decider
 from appliance.io.robot_link import StdoutPort, result
 from appliance.recording.capture import Playback
 from appliance.recording.recording import told
-from appliance.recording.sweep_window import Recorder
+from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime import assembly
 from appliance.runtime.loop import Box
 
@@ -55,7 +55,7 @@ def replay(path: Path, settings: Config, model: Bundle, out: Callable[[str], obj
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class ReplayRule:
     """How a classifier makes answers of probabilities: what it was made with."""
 
     how: str
@@ -78,7 +78,7 @@ class Kept:
     sweep: Sweep
     format: SweepFormat
     object: tuple[Path, int, int]
-    rule: Rule | None
+    rule: ReplayRule | None
     tare: NDArray[np.float64]
     bundle: str
     verdict: dict[str, Any]
@@ -90,7 +90,7 @@ class Kept:
         about = sidecar(path)
         try:
             tare = np.broadcast_to(np.asarray(about.get("tare", 0.0), np.float64), (fmt.rows, fmt.cols))
-            rule = typed(Rule, about["rule"]) if "rule" in about else None
+            rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
             whose = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))
             if any(type(verdict.get(name, 0)) is not int for name in ("fused", "time_ns")):
@@ -240,6 +240,6 @@ def _capture(path: Path, settings: Config, model: Bundle) -> None:
     _check(str(path), play.format, model)
     classifier = assembly.classifier(settings, model, play)
     port = StdoutPort("replay", play.commands)
-    recorder, early = Recorder(model.format, settings.sweep), assembly.early(settings, classifier)
+    recorder, early = SweepCutter(model.format, settings.sweep), assembly.early(settings, classifier)
     box = Box(play, play, recorder, classifier, play, early=early, sinks=[port], port=port, source="replay")
     box.run(lambda: play.finished)

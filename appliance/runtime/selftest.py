@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import Config
-from appliance.core.devices import World
+from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, PortError, SensorError
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
@@ -24,7 +24,7 @@ LISTEN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     """What became of one part: ok with a detail, or not ok with what to do."""
 
     part: str
@@ -32,7 +32,7 @@ class Finding:
     detail: str
 
 
-def check(settings: Config, load: Callable[[], Bundle], world: World) -> Iterator[Finding]:
+def check(settings: Config, load: Callable[[], Bundle], world: Devices) -> Iterator[CheckResult]:
     """Look at one part after another; a part that fails does not keep the others from being looked at."""
     loaded: list[Bundle] = []
 
@@ -56,19 +56,19 @@ def check(settings: Config, load: Callable[[], Bundle], world: World) -> Iterato
     if settings.trigger.start:
         yield _try("gpio lines", lambda: _lines(settings, world))
     else:
-        yield Finding("gpio lines", False, "trigger.start names no line; choose a board with --board")
+        yield CheckResult("gpio lines", False, "trigger.start names no line; choose a board with --board")
     if settings.serial.port:
         yield _try("serial port", lambda: _port(settings, world))
 
 
-def _try(part: str, look: Callable[[], str]) -> Finding:
+def _try(part: str, look: Callable[[], str]) -> CheckResult:
     try:
-        return Finding(part, True, look())
+        return CheckResult(part, True, look())
     except ApplianceError as e:
-        return Finding(part, False, str(e))
+        return CheckResult(part, False, str(e))
 
 
-def _skin(settings: Config, bundle: Bundle, world: World) -> str:
+def _skin(settings: Config, bundle: Bundle, world: Devices) -> str:
     sensor = UsbSensor(settings.sensor, bundle.format, world.clock, world.backend)
     until_ns = world.clock.now_ns() + round(LISTEN_S * 1e9)
     try:
@@ -84,14 +84,14 @@ def _skin(settings: Config, bundle: Bundle, world: World) -> str:
         sensor.close()
 
 
-def _lines(settings: Config, world: World) -> str:
+def _lines(settings: Config, world: Devices) -> str:
     with GpioTrigger(settings.trigger, world.gpio), Lines(settings.output, world.gpio, world.clock) as lines:
         codes = lines.capacity
     inputs = [n for n in (settings.trigger.start, settings.trigger.stop, settings.trigger.new_object) if n]
     return f"inputs {' '.join(inputs)}, outputs for {codes} codes"
 
 
-def _port(settings: Config, world: World) -> str:
+def _port(settings: Config, world: Devices) -> str:
     port = SerialSink(settings.serial, world.clock, world.source)
     port.commands()
     trouble = port.trouble

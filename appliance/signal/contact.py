@@ -25,7 +25,7 @@ Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ContactPositions:
     """Where the contact's centre lay in training. Raises BundleError where a number makes no sense.
 
     pitch_mm: from taxel to taxel. rows_mm, cols_mm: one entry for each position, mm from the centre of taxel 1.1 (row
@@ -116,7 +116,7 @@ def advice(offset: Point, shape: tuple[int, int]) -> str:
     return f"{most:.1f} mm too far towards {where}" + "".join(f" and {mm:.1f} mm towards {to}" for mm, to in others)
 
 
-def moved(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, place: Place) -> str:
+def moved(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, place: ContactPositions) -> str:
     """ "" where the contact of a sweep [T, R, C] lies where some lay in training, else "moved 2.1 mm too far towards
     row 4". tare, contact: as for `centre`."""
     found = centre(taxels, tare, contact)

@@ -1,4 +1,4 @@
-"""Puts the rig together: a world under the real drivers. In: what the robot does. Out: a SimWorld."""
+"""Puts the rig together: a world under the real drivers. In: what the robot does. Out: a SimDevices."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from appliance.core.clock import Clock
 from appliance.core.config import Config
-from appliance.core.devices import World
+from appliance.core.devices import Devices
 from appliance.core.types import SweepFormat
 from appliance.sim import gpio, rig, usb
 
@@ -17,7 +17,7 @@ BITS = tuple(f"CLASS-{i}" for i in range(8))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SimWorld(World):
+class SimDevices(Devices):
     """The rig: its own lines and its own skin, and a robot that knows what it did."""
 
     gpio: gpio.SimGpio
@@ -45,7 +45,7 @@ class SimWorld(World):
 def build(
     fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False, stops: bool = True,
     remember: bool = True,
-) -> SimWorld:  # fmt: skip
+) -> SimDevices:  # fmt: skip
     """A world that plays `acts`: the same drivers above, nothing real below. stops: the robot heeds DECIDED.
 
     remember: keep all acts and all that was driven, for who looks at them later; without it memory stays as it is.
@@ -57,4 +57,4 @@ def build(
         lines.watchers[DECIDED] = robot.react
     board = rig.Board(fmt, robot, clock)
     backend = usb.RigBackend(board, clock, acm=acm)
-    return SimWorld(clock=clock, gpio=lines, backend=backend, source=source, robot=robot)
+    return SimDevices(clock=clock, gpio=lines, backend=backend, source=source, robot=robot)

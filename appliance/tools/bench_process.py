@@ -18,7 +18,7 @@ import numpy as np
 from appliance.core.clock import SystemClock
 from appliance.core.types import SweepFormat
 from appliance.io.robot_link import ResultSink
-from appliance.runtime.loop import Box, Keeper
+from appliance.runtime.loop import Box, SweepObserver
 from appliance.sim import devices, rig
 
 MEMORY_SWEEPS, STREAM_S = 1000, 15.0
@@ -30,10 +30,10 @@ class Build(Protocol):
 
     def __call__(
         self,
-        world: devices.SimWorld,
+        world: devices.SimDevices,
         stack: ExitStack,
         also: Iterable[ResultSink] = (),
-        keepers: Iterable[Keeper] = (),
+        keepers: Iterable[SweepObserver] = (),
     ) -> tuple[Box, int]:
         """Build it."""
         ...

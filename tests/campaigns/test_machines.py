@@ -40,7 +40,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(bundle.DEFAULT, folder / "default")
     np.save(folder / "default" / "sweeps.npy", sets.load("sim:T-REAL:1001:1").samples[::3])
     for dtype in TENSOR:
-        fitted = fit.fit(easy(dtype=dtype), 1, fit.Recipe(steps=40))
+        fitted = fit.fit(easy(dtype=dtype), 1, fit.FitRecipe(steps=40))
         export.export(fitted, folder / dtype, dtype, "1", "")
         np.save(folder / dtype / "sweeps.npy", fitted.held.samples)
     for name in INSIDE:

@@ -19,7 +19,7 @@ from appliance.core import storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load
-from appliance.recording.recording import Labels, Recording
+from appliance.recording.recording import Labels, RecordingSession
 from tests.cuts.scene import Found, Scene, Step
 
 FORMAT = SweepFormat(4, 4, 750, 40, "uint8")
@@ -46,10 +46,10 @@ def record(way: str, folder: Path, session: str) -> None:
     running.close()
 
 
-def recording(folder: Path, session: str, say: Callable[[bytes], None]) -> Recording:
+def recording(folder: Path, session: str, say: Callable[[bytes], None]) -> RecordingSession:
     """The box's keeper of sweeps."""
     labels = Labels("plastic rough", "1", session)
-    return Recording(folder, FORMAT, labels, SystemClock(), circumstances=dict, say=say, log=lambda line: None)
+    return RecordingSession(folder, FORMAT, labels, SystemClock(), circumstances=dict, say=say, log=lambda line: None)
 
 
 def taken(number: int) -> tuple[Sweep, Verdict]:

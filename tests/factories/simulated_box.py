@@ -24,7 +24,7 @@ def numbered(n: int, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarr
     return ((np.arange(first, first + n) % 97)[:, None, None] + grid).astype(fmt.digits)
 
 
-def idle_world(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -> devices.SimWorld:
+def idle_world(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -> devices.SimDevices:
     """A world whose skin sends numbered frames and whose robot does nothing."""
     n = min(round(seconds * fmt.rate_hz), 60_000)
     acts = [rig.Act(numbered(n, fmt), 10**9, 10**9 + 1, "")]
@@ -38,7 +38,7 @@ class Rigged:
     """A box on the rig, and the robot's end of its serial line."""
 
     box: Box
-    world: devices.SimWorld
+    world: devices.SimDevices
     far_end: int
     port: SerialSink
     heard: list[str] = field(default_factory=list)

@@ -4,14 +4,14 @@ import numpy as np
 import onnx
 
 from appliance.core.types import SweepFormat
-from train.onnx_tools.graph_builder import TENSOR, Graph
+from train.onnx_tools.graph_builder import TENSOR, GraphBuilder
 
 FORM = SweepFormat(2, 2, 100.0, 163, "int16")
 
 
 def trunk(form: SweepFormat, tenths: bool = False) -> onnx.ModelProto:
     """`sweep` -> the taxels' means over the window, `features` [1, F], or over its first tenths, `tenths` [1, 10, F]."""
-    g, taxels, length = Graph(), form.rows * form.cols, form.window // 10
+    g, taxels, length = GraphBuilder(), form.rows * form.cols, form.window // 10
     x = g("Cast", g("Reshape", "sweep", g.constant([form.window, taxels], "int64")), to=1)
     x = g("Slice", x, g.constant([0], "int64"), g.constant([10 * length], "int64"))
     x = g("ReduceMean", g("Reshape", x, g.constant([10, length, taxels], "int64")), axes=[1], keepdims=0)

@@ -24,7 +24,7 @@ from tests.factories.paths import ROOT
 from tests.fuzz.files import NPY
 
 ENDLESS = packets.HEADER.pack(
-    packets.MAGIC, packets.VERSION, packets.Kind.REPLY, packets.MAX_PAYLOAD, 0, 1, 0, 0, 0, 0, 0
+    packets.MAGIC, packets.VERSION, packets.PacketKind.REPLY, packets.MAX_PAYLOAD, 0, 1, 0, 0, 0, 0, 0
 )
 """The header of the largest packet there can be; what follows waits for its end."""
 
@@ -123,7 +123,7 @@ SEEDS: dict[str, Callable[[], list[bytes]]] = {
 def words(target: str) -> Sequence[bytes]:
     """What the target's format is made of."""
     if target == "unpack":
-        return [packets.MAGIC, ENDLESS, *(b"%c%c" % (packets.VERSION, kind) for kind in packets.Kind)]
+        return [packets.MAGIC, ENDLESS, *(b"%c%c" % (packets.VERSION, kind) for kind in packets.PacketKind)]
     if target == "command":
         return [b"$PPLP,", b"*", b"\r\n", b"\xff", *(name.encode() for name in robot_link.COMMANDS)]
     if target == "settings":

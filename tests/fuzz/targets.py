@@ -100,7 +100,7 @@ def unpack(data: bytes, folder: Path) -> None:
 
 def _stream(data: bytes, cut: int, sent: int) -> None:
     """Frames that a sensor makes of it: numbers rise, and each frame that came is out, stale or lost."""
-    tally = usb_sensor.Tally()
+    tally = usb_sensor.SensorCounters()
     stream = usb_sensor.Stream(SKIN, tally)
     stream.restart()
     numbers = [-1]
@@ -119,7 +119,7 @@ def _stream(data: bytes, cut: int, sent: int) -> None:
 
 def _follow(packets: list[wire.Packet]) -> None:
     """Each frame is fresh or stale, and fresh ones rise."""
-    fresh, place, lost, stale = wire.follow(packets, wire.Place(0))
+    fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     sizes = [len(p.taxels) for p in packets]
     assert sum(len(p.taxels) for _, p in fresh) + stale == sum(sizes)
     ends = [0, *(start + len(p.taxels) for start, p in fresh)]

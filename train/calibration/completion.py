@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from train.calibration.posthoc import Copies, Finish, finish
-from train.models.compact.augment import Scene
+from train.models.compact.augment import Augmentation
 from train.models.compact.fit import COPIES, Fit, copies, varied
 from train.onnx_tools.graph_builder import run
 
@@ -33,7 +33,7 @@ def seen(made: Fit) -> Seen:
         raise FormatError(f"{train.source}: too few groups to hold some out; record more positions")
     tenths = run(made.trunk(tenths=True), np.concatenate([train.samples, held.samples]))
     labels, groups = np.append(train.labels, held.labels), np.append(train.group(by), held.group(by))
-    change = partial(varied, rows=train.format.rows, scene=Scene(**made.about["recipe"]["scene"]))
+    change = partial(varied, rows=train.format.rows, scene=Augmentation(**made.about["recipe"]["scene"]))
     trunk, seed = made.trunk(), made.about["seed"]
     changed = np.concatenate([run(trunk, copy.samples) for copy in copies(made.network(), train, change, seed)])
     also = Copies(changed, np.tile(train.labels, COPIES), np.tile(train.group(by), COPIES))

@@ -51,7 +51,7 @@ class Heads:
 
 
 @dataclass(frozen=True)
-class Rule:
+class EarlyRule:
     """What was found. early: for the manifest, None where there is no rule, and `why`. share: mean share of the sweep
     that it needs; lost: share of sweeps that it turns from right to wrong, both where it was found; n: sweeps there."""
 
@@ -122,7 +122,7 @@ def decide(probabilities: Array, early: Early) -> tuple[Array, Array]:
     return named[np.arange(n), step], (step + 1) / steps
 
 
-def rule(probabilities: Array, labels: Array) -> Rule:
+def rule(probabilities: Array, labels: Array) -> EarlyRule:
     """The rule that needs the least of the sweep, found on probabilities [n, D + 1, K] that the heads did not see.
 
     For each number of steps that must agree, levels are tried from the strictest on, and none after the first that
@@ -130,9 +130,9 @@ def rule(probabilities: Array, labels: Array) -> Rule:
     sequence testing; Maurer et al. 1995).
     """
     if (n := len(labels)) < FEWEST:
-        return Rule(None, f"{n} sweeps were held out, and a rule is found on {FEWEST} at least; record more", n=n)
+        return EarlyRule(None, f"{n} sweeps were held out, and a rule is found on {FEWEST} at least; record more", n=n)
     right = probabilities[:, -1].argmax(1) == labels
-    best = Rule(None, f"no rule needs less than {WORTH:.0%} of the sweep and turns at most {LOSS:.1%} of {n} held-out "
+    best = EarlyRule(None, f"no rule needs less than {WORTH:.0%} of the sweep and turns at most {LOSS:.1%} of {n} held-out "
                 "sweeps wrong", n=n)  # fmt: skip
     for agree in AGREE:
         for level in LEVELS:
@@ -141,5 +141,5 @@ def rule(probabilities: Array, labels: Array) -> Rule:
             if (lost := float(np.mean(right & (named != labels)))) > LOSS:
                 break
             if share.mean() < min(best.share, WORTH):
-                best = Rule(early, "", float(share.mean()), lost, n)
+                best = EarlyRule(early, "", float(share.mean()), lost, n)
     return best

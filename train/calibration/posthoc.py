@@ -19,7 +19,7 @@ from onnx import TensorProto, helper, numpy_helper
 from appliance.bundle.bundle import Known
 from appliance.inference.classifier import softmax
 from train.calibration import early_exit, novelty
-from train.calibration.early_exit import Heads, Rule
+from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.novelty import Embedding
 from train.models.heads import temperature
 
@@ -37,7 +37,7 @@ class Finish:
     temperature: float
     warmth: float
     steps: Heads
-    rule: Rule
+    rule: EarlyRule
     limit: float
 
     def logits(self, features: Array) -> Array:

@@ -39,7 +39,7 @@ def register(add: Add) -> None:
 
 
 def _add_fit(add: Add) -> None:
-    recipe = fit.Recipe()
+    recipe = fit.FitRecipe()
     one = add("fit", run_fit, "train a network on sweep sets")
     options.add_set(one)
     one.add_argument("--seed", type=int, required=True, help="of the training, and of simulated sets that name none")
@@ -97,7 +97,7 @@ def run_fit(args: argparse.Namespace) -> None:
     shape = LADDER.get(args.size, USUAL)
     asked = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
     scene = replace(fit.usual(sweeps.format, shape), **asked)
-    recipe = fit.Recipe(steps=args.steps, scene=scene, keep_means=args.keep_means)
+    recipe = fit.FitRecipe(steps=args.steps, scene=scene, keep_means=args.keep_means)
     made = fit.fit(sweeps, args.seed, recipe, options.Log(), shape)
     made.save(args.out)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; held-out {made.about['held_out_by']}: "

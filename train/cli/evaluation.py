@@ -17,7 +17,7 @@ from train.cli import options
 from train.cli.options import Add
 from train.data import sets
 from train.evaluation import evaluate, robustness, sim_calibration, uncertainty_cases
-from train.evaluation.robustness_data import Trial
+from train.evaluation.robustness_data import EvaluationSweeps
 from train.export import contact_positions
 from train.metrics import score
 from train.models import methods
@@ -128,7 +128,11 @@ def run_stress(args: argparse.Namespace) -> None:
     """Curves as JSON and as a picture, and the table."""
     train = options.load(args)
     simulated = args.test.startswith("sim:")
-    test = Trial.simulated(args.test) if simulated else Trial.of(sets.load(args.test).select(args.only))
+    test = (
+        EvaluationSweeps.simulated(args.test)
+        if simulated
+        else EvaluationSweeps.of(sets.load(args.test).select(args.only))
+    )
     told = robustness.run(
         options.names(args),
         train,

@@ -44,7 +44,7 @@ def add_where(command: argparse.ArgumentParser) -> None:
                          help=f"where finished folds are kept, so that an interrupted run goes on ({evaluate.CACHE})")  # fmt: skip
 
 
-def load(args: argparse.Namespace, seed: int = 1) -> sets.SweepSet:
+def load(args: argparse.Namespace, seed: int = 1) -> sets.LabelledSweeps:
     """The sets named, joined and narrowed. seed: of simulated ones that name none."""
     return sets.join([sets.load(spec, seed) for spec in args.sets]).select(args.only)
 

@@ -54,8 +54,8 @@ def run_view(args: argparse.Namespace) -> None:
 def run_pull(args: argparse.Namespace) -> None:
     """Say what was fetched and what was not."""
     chosen = [part for option in args.ssh_option for part in ("-o", option)]
-    box = pull.Box(args.host, args.folder, [*chosen, *(["-p", str(args.port)] if args.port else [])])
-    tally = pull.Tally()
+    box = pull.RecordingHost(args.host, args.folder, [*chosen, *(["-p", str(args.port)] if args.port else [])])
+    tally = pull.PullReport()
     try:
         pull.pull(box, args.out, tally, options.Log())
     finally:
@@ -67,7 +67,7 @@ def run_pull(args: argparse.Namespace) -> None:
         raise FormatError(f"{bad} recordings of {args.host} were not taken; the lines above say why")
 
 
-def _tell(tally: pull.Tally, out: Path) -> None:
+def _tell(tally: pull.PullReport, out: Path) -> None:
     """A line for each kind of recording that needs somebody's eyes."""
     for names, what in (
         (tally.halves, "without its .json or .npy on the box; left there"),

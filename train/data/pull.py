@@ -46,7 +46,7 @@ SHOWN = 5
 
 
 @dataclass(frozen=True)
-class Box:
+class RecordingHost:
     """Where the recordings are. options: of ssh, which go before ours. Raises ApplianceError where it cannot be asked."""
 
     host: str
@@ -90,7 +90,7 @@ class Box:
 
 
 @dataclass
-class Tally:
+class PullReport:
     """What became of the recordings, by their names without ending."""
 
     fetched: list[str] = field(default_factory=list)
@@ -101,7 +101,7 @@ class Tally:
     refused: list[str] = field(default_factory=list)
 
 
-def pull(box: Box, out: Path, tally: Tally, log: Callable[[str], None]) -> None:
+def pull(box: RecordingHost, out: Path, tally: PullReport, log: Callable[[str], None]) -> None:
     """Fetch into `out` what is not there yet; what becomes of each recording is put into `tally` as it happens.
 
     Raises ApplianceError where the box cannot be reached or read or the connection ends, FormatError where it sends what
@@ -123,7 +123,7 @@ def pull(box: Box, out: Path, tally: Tally, log: Callable[[str], None]) -> None:
         raise ApplianceError(f"{box.host}: only {came} of {len(wanted)} recordings came; run the same command again")
 
 
-def listing(box: Box) -> dict[str, str]:
+def listing(box: RecordingHost) -> dict[str, str]:
     """The box's files and their SHA-256. Raises FormatError where it sends something else."""
     with box.reading(LIST) as stream:
         lines = stream.read().split(b"\0")
@@ -137,7 +137,7 @@ def listing(box: Box) -> dict[str, str]:
     return listed
 
 
-def _wanted(listed: Mapping[str, str], out: Path, tally: Tally) -> Iterator[str]:
+def _wanted(listed: Mapping[str, str], out: Path, tally: PullReport) -> Iterator[str]:
     """Names without ending of the recordings that are not here; all others are put to the tally."""
     for name in sorted({file.rpartition(".")[0] for file in listed}):
         if not name.isprintable() or name.startswith("/") or ".." in name.split("/"):
@@ -191,7 +191,7 @@ def _pairs(stream: IO[bytes], names: Sequence[str]) -> Iterator[tuple[str, dict[
         return
 
 
-def _take(name: str, pair: Mapping[str, bytes], sha256: Mapping[str, str], out: Path, tally: Tally) -> None:
+def _take(name: str, pair: Mapping[str, bytes], sha256: Mapping[str, str], out: Path, tally: PullReport) -> None:
     """Keep one recording, if it is what the box listed and can be read as one."""
     try:
         for suffix, data in pair.items():

@@ -35,7 +35,7 @@ NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class RecordedSweep:
     """One sweep as the box recorded it, where, and what else its sidecar says."""
 
     path: Path
@@ -44,7 +44,7 @@ class Recording:
     about: Mapping[str, Any]
 
     @classmethod
-    def load(cls, path: Path) -> Recording:
+    def load(cls, path: Path) -> RecordedSweep:
         """Read an .npy with its sidecar. Raises FormatError where it is broken."""
         return cls(path, *load_recording(path), sidecar(path))
 
@@ -140,15 +140,15 @@ def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
             file.create_dataset(name, data=values, compression="gzip" if name == "samples" else None)
 
 
-def recorded(folder: Path) -> list[Recording]:
+def recorded(folder: Path) -> list[RecordedSweep]:
     """All sweeps that the box recorded in `folder` (.npy with .json) and below, in the order of their names.
 
     Raises FormatError naming the file that is broken.
     """
-    return [Recording.load(path) for path in sorted(folder.rglob("*.npy"))]
+    return [RecordedSweep.load(path) for path in sorted(folder.rglob("*.npy"))]
 
 
-def ok(held: Sequence[Recording]) -> list[Recording]:
+def ok(held: Sequence[RecordedSweep]) -> list[RecordedSweep]:
     """Those that are trained on."""
     return [one for one in held if not one.why_not]
 
@@ -164,7 +164,7 @@ def recordings(folder: Path, kind: type[Set]) -> Set:
     return joined(recorded(folder), folder, kind)
 
 
-def joined(held: Sequence[Recording], folder: Path, kind: type[Set]) -> Set:
+def joined(held: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
     """What `recordings` gives, of sweeps that were read already."""
     kept = ok(held)
     left = Counter(one.why_not for one in held if one.why_not)
@@ -198,7 +198,7 @@ def counted(those: Counter[str]) -> str:
     return ", ".join(f"{n} {what}" for what, n in sorted(those.items()))
 
 
-def _check(one: Recording, wanted: SweepFormat) -> None:
+def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
     """Raises FormatError where it is not what the first one is, or nobody said what was touched."""
     path, n = one.path, len(one.sweep.frames)
     if one.format != wanted or n != wanted.window:

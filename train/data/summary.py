@@ -16,8 +16,8 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
 from train.data import readers, sets
-from train.data.readers import Recording
-from train.data.sets import SweepSet, shortened
+from train.data.readers import RecordedSweep
+from train.data.sets import LabelledSweeps, shortened
 
 Names = Mapping[str, Mapping[int, str]]
 """Of a group, and in it of a number: what it is called."""
@@ -33,24 +33,24 @@ def describe(spec: str) -> str:
         return "\n".join(described(sets.load(spec, 1), {}))
     held = readers.recorded(folder)
     named, names = _named(held)
-    lines = described(readers.joined(named, folder, SweepSet), names)
+    lines = described(readers.joined(named, folder, LabelledSweeps), names)
     kept = [one.sweep for one in readers.ok(held)]
     if lost := [sweep.lost for sweep in kept if sweep.lost]:
         frames = sum(len(sweep.frames) for sweep in kept)
         lines.append(f"  frames lost: {sum(lost)} of {frames}, in {len(lost)} sweeps, filled in from their neighbours")
     try:
-        readers.joined(held, folder, SweepSet).of_several()
+        readers.joined(held, folder, LabelledSweeps).of_several()
     except FormatError as e:
         lines.append(f"  cannot be trained on yet: {e}")
     return "\n".join(lines)
 
 
-def _named(held: Sequence[Recording]) -> tuple[list[Recording], Names]:
+def _named(held: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Names]:
     """The recordings with NAMELESS where some have a name and others none, and what the groups' numbers are called."""
     kept, names = [one.sweep for one in readers.ok(held)], {}
     filled = {"material": NAMELESS} | {by: NAMELESS for by in readers.NAMED if any(getattr(s, by) for s in kept)}
 
-    def name(one: Recording) -> Recording:
+    def name(one: RecordedSweep) -> RecordedSweep:
         lacking = {by: text for by, text in filled.items() if not getattr(one.sweep, by)}
         return replace(one, sweep=replace(one.sweep, **lacking))
 
@@ -61,7 +61,7 @@ def _named(held: Sequence[Recording]) -> tuple[list[Recording], Names]:
     return named, names
 
 
-def described(sweeps: SweepSet, names: Names) -> list[str]:
+def described(sweeps: LabelledSweeps, names: Names) -> list[str]:
     """What a set holds: sweeps and their form, materials, recordings, groups and what is confounded."""
     fmt = sweeps.format
     _, _, held = sweeps.tally("recording")

@@ -21,7 +21,7 @@ from appliance.core.errors import FormatError
 from appliance.core.types import Frames
 from appliance.recording import sweep_window
 from appliance.sim import skin
-from train.evaluation.robustness_data import Trial
+from train.evaluation.robustness_data import EvaluationSweeps
 
 Array = NDArray[Any]
 HUM_HZ = 50.0
@@ -31,11 +31,11 @@ GAIN_LAW = 0.25
 """Of the shifted grid: gains are spread evenly by this much, on a logarithmic scale, at the severest shift."""
 
 
-Change = Callable[[Array, float, Generator, Trial], Array]
+Change = Callable[[Array, float, Generator, EvaluationSweeps], Array]
 
 
 @dataclass(frozen=True)
-class Stress:
+class Corruption:
     """One thing that goes wrong.
 
     unit: of `severities`, which rise from 0 = none. change: (float32 [N, T, R, C], severity, rng, trial) -> the same
@@ -49,7 +49,7 @@ class Stress:
     change: Change
     only: str = ""
 
-    def apply(self, trial: Trial, severity: float, seed: int) -> Array:
+    def apply(self, trial: EvaluationSweeps, severity: float, seed: int) -> Array:
         """The trial's digits [N, T, R, C] under stress, of the same type; at severity 0 as they are.
 
         The same seed draws the same taxels, signs and noise for every severity.
@@ -76,15 +76,15 @@ def _digitized(x: Array, kind: np.dtype[Any]) -> Array:
     return np.clip(np.rint(x), limits.min, limits.max).astype(kind)
 
 
-def _shift(x: Array, rows: float, rng: Generator, trial: Trial) -> Array:
+def _shift(x: Array, rows: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return trial.scene.draw(lambda p: replace(p, dx_mm=p.dx_mm + rows * skin.PITCH_MM))
 
 
-def _turn(x: Array, degrees: float, rng: Generator, trial: Trial) -> Array:
+def _turn(x: Array, degrees: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return trial.scene.draw(lambda p: replace(p, turn_deg=p.turn_deg + degrees))
 
 
-def _force(sign: int, x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+def _force(sign: int, x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return trial.scene.draw(world=replace(skin.WORLD, force_n=skin.WORLD.force_n * (1 + sign * share)))
 
 
@@ -92,11 +92,11 @@ def _error_ms(x: Array, ms: float, rng: Generator) -> Array:
     return ms * rng.choice([-1, 1], len(x))
 
 
-def _window(x: Array, ms: float, rng: Generator, trial: Trial) -> Array:
+def _window(x: Array, ms: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return trial.scene.draw(late_ms=_error_ms(x, ms, rng))
 
 
-def _window_held(x: Array, ms: float, rng: Generator, trial: Trial) -> Array:
+def _window_held(x: Array, ms: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     late = np.rint(_error_ms(x, ms, rng) * trial.sweeps.rate_hz / 1000).astype(int)
     at = np.clip(np.arange(x.shape[1]) + late[:, None], 0, x.shape[1] - 1)
     return np.take_along_axis(x, at[:, :, None, None], axis=1)
@@ -114,11 +114,11 @@ def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator)
     return (x.reshape(*x.shape[:2], -1) @ weights.astype(np.float32)).reshape(x.shape) * gain
 
 
-def _shift_grid(x: Array, rows: float, rng: Generator, trial: Trial) -> Array:
+def _shift_grid(x: Array, rows: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return _regrid(x, rows, 0.0, rows / SHIFTS[-1], rng)
 
 
-def _turn_grid(x: Array, degrees: float, rng: Generator, trial: Trial) -> Array:
+def _turn_grid(x: Array, degrees: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return _regrid(x, 0.0, degrees, degrees / TURNS[-1], rng)
 
 
@@ -128,31 +128,31 @@ def _some(x: Array, n: float, rng: Generator) -> Array:
     return (order < n).reshape(len(x), 1, *x.shape[2:])
 
 
-def _dead(x: Array, n: float, rng: Generator, trial: Trial) -> Array:
+def _dead(x: Array, n: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return np.where(_some(x, n, rng), 0, x)
 
 
-def _stuck(x: Array, n: float, rng: Generator, trial: Trial) -> Array:
+def _stuck(x: Array, n: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return np.where(_some(x, n, rng), rng.uniform(x.min(), x.max(), (len(x), 1, *x.shape[2:])), x)
 
 
-def _noisy(x: Array, n: float, rng: Generator, trial: Trial) -> Array:
+def _noisy(x: Array, n: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return x + _some(x, n, rng) * np.float32(NOISY * trial.rms) * rng.standard_normal(x.shape, np.float32)
 
 
-def _gain_spread(x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+def _gain_spread(x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return x * (1 + share * rng.uniform(-1, 1, (len(x), 1, *x.shape[2:])))
 
 
-def _gain(sign: int, x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+def _gain(sign: int, x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return x * (1 + sign * share)
 
 
-def _speed(sign: int, x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+def _speed(sign: int, x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return trial.scene.draw(world=replace(skin.WORLD, speed=1 + sign * share))
 
 
-def _stretch(sign: int, x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+def _stretch(sign: int, x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     """All that happens is stretched in time about the window's middle; beyond its ends a sweep runs back."""
     frames = x.shape[1]
     spectrum = np.fft.rfft(np.concatenate([x[:, ::-1], x, x[:, ::-1]], axis=1), axis=1)
@@ -161,18 +161,18 @@ def _stretch(sign: int, x: Array, share: float, rng: Generator, trial: Trial) ->
     return stretched[:, (n - frames) // 2 :][:, :frames]
 
 
-def _drift(x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+def _drift(x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     start, end = share * trial.load * rng.uniform(-1, 1, (2, len(x), 1, *x.shape[2:]))
     return x + start + (end - start) * np.linspace(0, 1, x.shape[1])[:, None, None]
 
 
-def _bits(x: Array, fewer: float, rng: Generator, trial: Trial) -> Array:
+def _bits(x: Array, fewer: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     low, high = float(x.min()), float(x.max())
     step = max((high - low) / (2 ** (8 - fewer) - 1), np.finfo(np.float32).tiny)
     return low + np.rint((x - low) / step) * step
 
 
-def _lost(x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+def _lost(x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     lost = rng.random(x.shape[:2]) < share
     lost[:, [0, -1]] = False  # on the box the frames around the window are there too
     for t in range(sweep_window.MAX_GAP, x.shape[1]):  # what lacks more in a row is refused there
@@ -184,57 +184,57 @@ def _lost(x: Array, share: float, rng: Generator, trial: Trial) -> Array:
     return x
 
 
-def _saturation(x: Array, share: float, rng: Generator, trial: Trial) -> Array:
+def _saturation(x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     top = (1 - share) * trial.load
     return np.clip(x, -top, top)
 
 
-def _hum(x: Array, ratio: float, rng: Generator, trial: Trial) -> Array:
+def _hum(x: Array, ratio: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     turns = HUM_HZ * np.arange(x.shape[1]) / trial.sweeps.rate_hz + rng.random((len(x), 1))
     return x + ratio * trial.rms * np.sin(2 * np.pi * turns)[:, :, None, None]
 
 
-def _noise(x: Array, ratio: float, rng: Generator, trial: Trial) -> Array:
+def _noise(x: Array, ratio: float, rng: Generator, trial: EvaluationSweeps) -> Array:
     return x + (ratio * trial.deviation).astype(np.float32) * rng.standard_normal(x.shape, np.float32)
 
 
 SHIFTS, TURNS, ERRORS_MS = (0, 0.25, 0.5, 1, 1.5), (0, 5, 10, 20, 30), (0, 10, 25, 50, 100)
 HALVES, TAXELS = (0, 0.1, 0.2, 0.35, 0.5), (0, 1, 2, 3, 4)
 STRESSES = (
-    Stress("shift-rows", "rows", SHIFTS, "skin further along the sliding, drawn anew", _shift, "simulated"),
-    Stress("turn", "degrees", TURNS, "skin turned on the finger, drawn anew", _turn, "simulated"),
-    Stress("force-down", "share", HALVES, "pressed less, drawn anew", partial(_force, -1), "simulated"),
-    Stress("force-up", "share", HALVES, "pressed more, drawn anew", partial(_force, 1), "simulated"),
-    Stress("speed-down", "share", HALVES, "slid slower, drawn anew", partial(_speed, -1), "simulated"),
-    Stress("speed-up", "share", HALVES, "slid faster, drawn anew", partial(_speed, 1), "simulated"),
-    Stress("window", "ms", ERRORS_MS, "window too early or late, into the rest, drawn anew", _window, "simulated"),
-    Stress("shift-grid", "rows", SHIFTS, "taxels read further on, edge mirrored, new gains", _shift_grid, "files"),
-    Stress("turn-grid", "degrees", TURNS, "taxels read on a turned grid, edge mirrored, new gains", _turn_grid, "files"),
-    Stress("window-held", "ms", ERRORS_MS, "window too early or late, first or last frame held", _window_held, "files"),
-    Stress("dead", "taxels", TAXELS, "read 0", _dead),
-    Stress("stuck", "taxels", TAXELS, "each at some digit of the set's range", _stuck),
-    Stress("noisy", "taxels", TAXELS, f"white noise of {NOISY:g} of the set's deviations", _noisy),
-    Stress("gain-spread", "share", HALVES, "each taxel's gain off by up to this share", _gain_spread),
-    Stress("gain-down", "share", HALVES, "all gains lower", partial(_gain, -1)),
-    Stress("gain-up", "share", HALVES, "all gains higher", partial(_gain, 1)),
-    Stress("stretch", "share", HALVES, "slower: all is stretched in time", partial(_stretch, -1), "files"),
-    Stress("shorten", "share", HALVES, "faster: all is shortened in time", partial(_stretch, 1), "files"),
-    Stress("drift", "of full load", (0, 0.02, 0.05, 0.1, 0.2), "offset of each taxel, from one to another", _drift),
-    Stress("bits", "fewer than 8", (0, 1, 2, 3, 4), "steps of the set's range: 7, 6, 5, 4 bits", _bits),
-    Stress("lost", "share", (0, 0.02, 0.05, 0.1, 0.2), "frames lost, at most two in a row, filled as the box does", _lost),
-    Stress("saturation", "share", HALVES, "clipped so far below full load", _saturation),
-    Stress("hum", "deviations", (0, 0.25, 0.5, 1, 2), "50 Hz on all taxels, amplitude", _hum),
-    Stress("noise", "deviations", (0, 0.1, 0.2, 0.3, 0.5), "white, of each taxel's deviation", _noise),
+    Corruption("shift-rows", "rows", SHIFTS, "skin further along the sliding, drawn anew", _shift, "simulated"),
+    Corruption("turn", "degrees", TURNS, "skin turned on the finger, drawn anew", _turn, "simulated"),
+    Corruption("force-down", "share", HALVES, "pressed less, drawn anew", partial(_force, -1), "simulated"),
+    Corruption("force-up", "share", HALVES, "pressed more, drawn anew", partial(_force, 1), "simulated"),
+    Corruption("speed-down", "share", HALVES, "slid slower, drawn anew", partial(_speed, -1), "simulated"),
+    Corruption("speed-up", "share", HALVES, "slid faster, drawn anew", partial(_speed, 1), "simulated"),
+    Corruption("window", "ms", ERRORS_MS, "window too early or late, into the rest, drawn anew", _window, "simulated"),
+    Corruption("shift-grid", "rows", SHIFTS, "taxels read further on, edge mirrored, new gains", _shift_grid, "files"),
+    Corruption("turn-grid", "degrees", TURNS, "taxels read on a turned grid, edge mirrored, new gains", _turn_grid, "files"),
+    Corruption("window-held", "ms", ERRORS_MS, "window too early or late, first or last frame held", _window_held, "files"),
+    Corruption("dead", "taxels", TAXELS, "read 0", _dead),
+    Corruption("stuck", "taxels", TAXELS, "each at some digit of the set's range", _stuck),
+    Corruption("noisy", "taxels", TAXELS, f"white noise of {NOISY:g} of the set's deviations", _noisy),
+    Corruption("gain-spread", "share", HALVES, "each taxel's gain off by up to this share", _gain_spread),
+    Corruption("gain-down", "share", HALVES, "all gains lower", partial(_gain, -1)),
+    Corruption("gain-up", "share", HALVES, "all gains higher", partial(_gain, 1)),
+    Corruption("stretch", "share", HALVES, "slower: all is stretched in time", partial(_stretch, -1), "files"),
+    Corruption("shorten", "share", HALVES, "faster: all is shortened in time", partial(_stretch, 1), "files"),
+    Corruption("drift", "of full load", (0, 0.02, 0.05, 0.1, 0.2), "offset of each taxel, from one to another", _drift),
+    Corruption("bits", "fewer than 8", (0, 1, 2, 3, 4), "steps of the set's range: 7, 6, 5, 4 bits", _bits),
+    Corruption("lost", "share", (0, 0.02, 0.05, 0.1, 0.2), "frames lost, at most two in a row, filled as the box does", _lost),
+    Corruption("saturation", "share", HALVES, "clipped so far below full load", _saturation),
+    Corruption("hum", "deviations", (0, 0.25, 0.5, 1, 2), "50 Hz on all taxels, amplitude", _hum),
+    Corruption("noise", "deviations", (0, 0.1, 0.2, 0.3, 0.5), "white, of each taxel's deviation", _noise),
 )  # fmt: skip
 
 
-def usual(trial: Trial) -> tuple[Stress, ...]:
+def usual(trial: EvaluationSweeps) -> tuple[Corruption, ...]:
     """All stresses that make sense for `trial`: drawn anew where it has a scene, in the digits where it has none."""
     without = "files" if trial.scene else "simulated"
     return tuple(stress for stress in STRESSES if stress.only != without)
 
 
-def find(names: Sequence[str]) -> tuple[Stress, ...]:
+def find(names: Sequence[str]) -> tuple[Corruption, ...]:
     """The stresses of these names. Raises FormatError naming one that is unknown."""
     known = {stress.name: stress for stress in STRESSES}
     for name in names:

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from train.data.sets import SweepSet, digest
+from train.data.sets import LabelledSweeps, digest
 from train.data.splitters import Protocol
 from train.evaluation import parallel
-from train.evaluation.fold import Fold, Task, key, run
-from train.metrics.score import Tally, fused, interval, provenance
+from train.evaluation.fold import Fold, FoldTask, key, run
+from train.metrics.score import Score, fused, interval, provenance
 from train.models import methods
 from train.onnx_tools import parity
 
@@ -35,7 +35,7 @@ class Result:
     protocol: str
     means_removed: bool
     seed: int
-    sweeps: SweepSet = field(repr=False)
+    sweeps: LabelledSweeps = field(repr=False)
     folds: list[Fold] = field(repr=False)
     origin: dict[str, str] = field(default_factory=dict)
 
@@ -79,11 +79,11 @@ class Result:
         clusters = Protocol(self.protocol).clusters(self.sweeps)
         clusters = None if clusters is None else clusters[self.test]
         right = logits.argmax(1) == labels
-        told: dict[str, Any] = {"window": Tally.of(right).json(), "interval": interval(right, clusters)}
+        told: dict[str, Any] = {"window": Score.of(right).json(), "interval": interval(right, clusters)}
         if "recording" in self.sweeps.groups:
             whole, first = fused(logits, recording)
             right = whole.argmax(1) == labels[first]
-            told["recording"] = Tally.of(right).json()
+            told["recording"] = Score.of(right).json()
             told["recording_interval"] = interval(right, None if clusters is None else clusters[first])
         return told
 
@@ -137,7 +137,7 @@ class Where:
 
 
 def evaluate(
-    sweeps: SweepSet, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
+    sweeps: LabelledSweeps, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
 ) -> Iterator[Result]:
     """Results as they are complete. Raises FormatError where a method or protocol is unknown or does not fit the set."""
     known = methods.find(plan.methods, plan.effort)
@@ -148,7 +148,7 @@ def evaluate(
     for kind in dict.fromkeys(method.input for method in known):
         same = [method.name for method in known if method.input == kind]
         tasks = {
-            (name, *split, i): Task(name, plan.effort, split[1], *fold)
+            (name, *split, i): FoldTask(name, plan.effort, split[1], *fold)
             for name in same for split, parts in splits.items() for i, fold in enumerate(parts)
         }  # fmt: skip
         done: dict[Any, Fold] = {}
@@ -160,7 +160,9 @@ def evaluate(
                 yield Result(name, protocol, plan.means_removed, seed, sweeps, whole, origin)  # type: ignore[arg-type]
 
 
-def folds(tasks: dict[Any, Task], sweeps: SweepSet, data: str, kind: str, where: Where) -> Iterator[tuple[Any, Fold]]:
+def folds(
+    tasks: dict[Any, FoldTask], sweeps: LabelledSweeps, data: str, kind: str, where: Where
+) -> Iterator[tuple[Any, Fold]]:
     """Every task's Fold: those in the cache first, then the others as they finish.
 
     data: digest of `sweeps`. kind: what the tasks' methods are given of them.
@@ -176,5 +178,5 @@ def folds(tasks: dict[Any, Task], sweeps: SweepSet, data: str, kind: str, where:
         yield name, fold
 
 
-def _run(named: tuple[Any, Task], sweeps: SweepSet, given: Array) -> Fold:
+def _run(named: tuple[Any, FoldTask], sweeps: LabelledSweeps, given: Array) -> Fold:
     return run(named[1], sweeps, given)

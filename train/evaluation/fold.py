@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.inference.session import session
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.features import kinds
 from train.models import methods
 
@@ -47,7 +47,7 @@ COUNTED = ("train", "appliance.signal")
 
 
 @dataclass(frozen=True)
-class Task:
+class FoldTask:
     """One fold. train, test: numbers of sweeps."""
 
     method: str
@@ -101,7 +101,7 @@ FORM = "form "
 PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
 
 
-def run(task: Task, sweeps: SweepSet, given: Array) -> Fold:
+def run(task: FoldTask, sweeps: LabelledSweeps, given: Array) -> Fold:
     """Train on one side, answer on the other. `given`: what the method's input asks for of all `sweeps`."""
     (method,) = methods.find([task.method], task.effort)
     start = time.perf_counter()
@@ -122,7 +122,9 @@ def run(task: Task, sweeps: SweepSet, given: Array) -> Fold:
     return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers)
 
 
-def _as_the_box(method: methods.Method, model: methods.Model, sweeps: SweepSet, some: Array) -> tuple[float, Array]:
+def _as_the_box(
+    method: methods.Method, model: methods.Model, sweeps: LabelledSweeps, some: Array
+) -> tuple[float, Array]:
     """Median time in ms of one sweep through features and session, and the labels [n] that come out."""
     graph = session(model.graph().SerializeToString())
     name, times, labels = graph.get_inputs()[0].name, [], []
@@ -134,7 +136,7 @@ def _as_the_box(method: methods.Method, model: methods.Model, sweeps: SweepSet, 
     return 1e3 * float(np.median(times)), np.array(labels)
 
 
-def key(task: Task, data: str) -> str:
+def key(task: FoldTask, data: str) -> str:
     """A name for all that the fold depends on; data: the set's digest."""
     (method,) = methods.find([task.method], task.effort)
     about = [data, method.name, method.effort, task.seed, task.train.tolist(), task.test.tolist()]

@@ -1,4 +1,4 @@
-"""The room of stress tests: where does each method fail? In: methods, a training set, a Trial. Out: curves and tables.
+"""The room of stress tests: where does each method fail? In: methods, a training set, a EvaluationSweeps. Out: curves and tables.
 
 One task is one method and one seed: `one` trains it and puts it under every stress, `merge` makes a result of many
 tasks, wherever they ran. What a task returns, and the result, are plain numbers and text that JSON can hold.
@@ -23,14 +23,14 @@ from appliance.core.storage import put
 from appliance.core.types import Frames, SweepFormat, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.io.trigger import Edge, EdgeKind
-from appliance.recording.sweep_window import Recorder
+from appliance.recording.sweep_window import SweepCutter
 from appliance.sim.rig import VirtualClock
-from train.data.sets import SweepSet, digest
+from train.data.sets import LabelledSweeps, digest
 from train.evaluation import parallel
-from train.evaluation.corruptions import Stress, usual
+from train.evaluation.corruptions import Corruption, usual
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
-from train.evaluation.robustness_data import Trial
+from train.evaluation.robustness_data import EvaluationSweeps
 from train.models import methods
 from train.models.methods import USUAL, Effort, Method, Model, given
 
@@ -40,7 +40,9 @@ POINTS = 0.05
 """A method has fallen where it lost so much of its own accuracy."""
 
 
-def one(method: Method, train: SweepSet, trial: Trial, stresses: Sequence[Stress] | None, seed: int) -> Json:
+def one(
+    method: Method, train: LabelledSweeps, trial: EvaluationSweeps, stresses: Sequence[Corruption] | None, seed: int
+) -> Json:
     """A task: train `method` and put it under stress; None stands for all stresses that make sense.
 
     Where the method cannot work with this set, the reason stands under `refused`. Raises FormatError where train and
@@ -57,7 +59,9 @@ def one(method: Method, train: SweepSet, trial: Trial, stresses: Sequence[Stress
     return score(method, model, trial, stresses, seed)
 
 
-def score(method: Method, model: Model, trial: Trial, stresses: Sequence[Stress] | None, seed: int) -> Json:
+def score(
+    method: Method, model: Model, trial: EvaluationSweeps, stresses: Sequence[Corruption] | None, seed: int
+) -> Json:
     """What `one` gives, of a model that is trained. The sweeps depend on trial, stress, severity and seed alone."""
     curves = {}
     clean = _right(method, model, trial.sweeps, trial.sweeps.samples)
@@ -76,8 +80,8 @@ def score(method: Method, model: Model, trial: Trial, stresses: Sequence[Stress]
 
 def run(
     names: Sequence[str],
-    train: SweepSet,
-    trial: Trial,
+    train: LabelledSweeps,
+    trial: EvaluationSweeps,
     where: Where,
     *,
     seeds: Sequence[int] = (1,),
@@ -103,7 +107,7 @@ def run(
     return merge(done.values())
 
 
-def _one(task: tuple[str, int], train: SweepSet, trial: Trial, effort: Effort) -> Json:
+def _one(task: tuple[str, int], train: LabelledSweeps, trial: EvaluationSweeps, effort: Effort) -> Json:
     (method,) = methods.find([task[0]], effort)
     return one(method, train, trial, None, task[1])
 
@@ -166,7 +170,7 @@ def table(result: Json) -> str:
     return "\n".join(lines) + "\n"
 
 
-def trouble(method: Method, model: Model, trial: Trial) -> dict[str, str]:
+def trouble(method: Method, model: Model, trial: EvaluationSweeps) -> dict[str, str]:
     """What becomes of sweeps that are none, on the desktop: "finite", "refused: why", "not finite" or "crashed: why".
 
     They go the way that all sweeps go: into a checked set, then to the method's input, then to the model.
@@ -174,7 +178,9 @@ def trouble(method: Method, model: Model, trial: Trial) -> dict[str, str]:
     found = {}
     for name, taxels in _spoiled(trial.sweeps.format, trial.load).items():
         try:
-            spoiled = SweepSet(taxels[None], np.zeros(1, int), trial.sweeps.materials, trial.sweeps.rate_hz, {}, name)
+            spoiled = LabelledSweeps(
+                taxels[None], np.zeros(1, int), trial.sweeps.materials, trial.sweeps.rate_hz, {}, name
+            )
             if spoiled.format != trial.sweeps.format:
                 raise FormatError(f"{spoiled.format} instead of {trial.sweeps.format}")
             logits = model.logits(given(method.input, spoiled))
@@ -201,7 +207,7 @@ def answer(bundle: Bundle, taxels: Array) -> Verdict:
     """The box's verdict on frames [n, R, C] that come while the trigger says that a sweep is going on, and no longer."""
     form, n, clock = bundle.format, np.arange(len(taxels)), VirtualClock()
     first_ns = clock.now_ns()
-    recorder = Recorder(form, SweepConfig())
+    recorder = SweepCutter(form, SweepConfig())
     t_ns = first_ns + np.rint(n * form.period_ns).astype(np.int64)
     end_ns = first_ns + round(len(taxels) * form.period_ns) + 1
     clock.sleep_until(end_ns + 10 * SweepConfig().late_ms * 1_000_000)
@@ -211,7 +217,7 @@ def answer(bundle: Bundle, taxels: Array) -> Verdict:
     return Classifier(bundle, clock)(sweep)
 
 
-def _right(method: Method, model: Model, sweeps: SweepSet, samples: Array) -> tuple[int, int]:
+def _right(method: Method, model: Model, sweeps: LabelledSweeps, samples: Array) -> tuple[int, int]:
     """How many of `samples` are named rightly, and how many answers are no numbers (those are wrong)."""
     logits = np.asarray(model.logits(given(method.input, replace(sweeps, samples=samples))))
     sane = np.isfinite(logits).all(axis=1)

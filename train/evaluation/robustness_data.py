@@ -1,6 +1,6 @@
-"""The room of trials: what is put under stress. In: test sweeps, or the name of a simulated set. Out: a Trial.
+"""The room of trials: what is put under stress. In: test sweeps, or the name of a simulated set. Out: a EvaluationSweeps.
 
-A Trial knows how strong its signals are and, where it is simulated, can draw its sweeps anew with one thing changed.
+A EvaluationSweeps knows how strong its signals are and, where it is simulated, can draw its sweeps anew with one thing changed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.sim import skin
 from train.data import sets
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 
 Array = NDArray[Any]
 USUAL_SWEEPS = 120
@@ -26,7 +26,7 @@ REST_S = 0.1
 
 
 @dataclass(frozen=True)
-class Scene:
+class SimulatedScene:
     """Simulated sweeps that can be drawn anew, each from the random stream that it had.
 
     materials: text [N]. places: where the skin sat in each. worlds: seed of the set that each is of.
@@ -55,14 +55,14 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Trial:
+class EvaluationSweeps:
     """What is put under stress: test sweeps and, where they are simulated, the scene that draws them anew."""
 
-    sweeps: SweepSet
-    scene: Scene | None = None
+    sweeps: LabelledSweeps
+    scene: SimulatedScene | None = None
 
     @classmethod
-    def of(cls, sweeps: SweepSet, most: int = USUAL_SWEEPS, seed: int = 0) -> Trial:
+    def of(cls, sweeps: LabelledSweeps, most: int = USUAL_SWEEPS, seed: int = 0) -> EvaluationSweeps:
         """About `most` of the `sweeps`, as many of each material as there are."""
         order = np.random.default_rng(seed).permutation(len(sweeps))
         rank = np.empty(len(sweeps), int)
@@ -72,7 +72,7 @@ class Trial:
         return cls(sweeps.take(np.sort(order[np.argsort(rank[order], kind="stable")[:most]])))
 
     @classmethod
-    def simulated(cls, spec: str, seed: int = 0) -> Trial:
+    def simulated(cls, spec: str, seed: int = 0) -> EvaluationSweeps:
         """The sweeps of the scene "sim:NAME[:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest before and after each.
 
         They are others than those of the set of that name, at the same places. Raises FormatError as `sets.load`.
@@ -80,12 +80,12 @@ class Trial:
         base = sets.load(spec, seed)
         found = sets.SIMULATED.fullmatch(spec)
         if not found:
-            raise FormatError(f"set {spec!r} is no simulated one; use sim:NAME, or Trial.of for a file")
+            raise FormatError(f"set {spec!r} is no simulated one; use sim:NAME, or EvaluationSweeps.of for a file")
         first = int(found["seed"] or seed)
         worlds = range(first, int(found["last"] or first) + 1)
         all_places = [(world, place) for world in worlds for place in skin.placements(found["name"], world)]
         own, places = zip(*(all_places[i] for i in base.group("position")), strict=True)
-        scene = Scene(tuple(base.materials[k] for k in base.labels), places, own)
+        scene = SimulatedScene(tuple(base.materials[k] for k in base.labels), places, own)
         return cls(replace(base, samples=scene.draw()), scene)
 
     @cached_property

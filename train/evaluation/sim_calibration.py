@@ -49,7 +49,7 @@ PRINTED = np.array([figure.printed for figure in FIGURES])
 """[figures, methods]"""
 
 
-def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = None) -> sets.SweepSet:
+def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = None) -> sets.LabelledSweeps:
     """T-LAB, T-REAL and ATTACHMENTS times T-HARD of one seed, joined in this order.
 
     Equal seeds draw the same places, attachments and noise in every world, so that worlds can be compared.
@@ -60,11 +60,13 @@ def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = N
     for name, its_seed in [("T-LAB", seed), ("T-REAL", seed), *hard]:
         samples, labels, position = skin.sweep_set(name, its_seed, per_material, world)
         groups = {"position": position}
-        parts.append(sets.SweepSet(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, f"{name}:{its_seed}"))
+        parts.append(
+            sets.LabelledSweeps(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, f"{name}:{its_seed}")
+        )
     return sets.join(parts)
 
 
-def accuracies(sweeps: sets.SweepSet, seed: int) -> Array:
+def accuracies(sweeps: sets.LabelledSweeps, seed: int) -> Array:
     """The share of right answers, float64 [figures, methods], on what `draw` drew. seed: of the random folds."""
     given = {kind: methods.given(kind, sweeps) for kind in ("L", "H")}
     shares = np.zeros(PRINTED.shape)

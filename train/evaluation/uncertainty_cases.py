@@ -21,7 +21,7 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.calibration.completion import seen
 from train.calibration.posthoc import Copies, Finish, finish
-from train.data.sets import SweepSet, digest, join
+from train.data.sets import LabelledSweeps, digest, join
 from train.data.splitters import Protocol
 from train.evaluation import parallel, uncertainty
 from train.evaluation.evaluate import Where
@@ -39,7 +39,7 @@ NOBODY = -1
 
 
 @dataclass(frozen=True)
-class Task:
+class CaseTask:
     """One training. train, test: numbers of sweeps; left_out: a material, or NOBODY."""
 
     method: str
@@ -91,7 +91,7 @@ class Case:
         return self.labels - (self.labels > self.left_out)
 
 
-def learn(task: Task, sweeps: SweepSet) -> Case:
+def learn(task: CaseTask, sweeps: LabelledSweeps) -> Case:
     """Train, and look at every sweep with the trunk that came out.
 
     Raises FormatError where the method is none of the compact family, or cannot work with this set.
@@ -113,13 +113,15 @@ def learn(task: Task, sweeps: SweepSet) -> Case:
     )  # fmt: skip
 
 
-def tasks(sweeps: SweepSet, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int) -> list[Task]:
+def tasks(
+    sweeps: LabelledSweeps, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int
+) -> list[CaseTask]:
     """Every fold with all materials, and without each of them in turn where at least two remain."""
     out = [NOBODY, *(range(len(sweeps.materials)) if len(sweeps.materials) > 2 else [])]
-    return [Task(method, effort, seed, i, *fold, left) for left in out for i, fold in enumerate(folds)]
+    return [CaseTask(method, effort, seed, i, *fold, left) for left in out for i, fold in enumerate(folds)]
 
 
-def cases(wanted: Sequence[Task], sweeps: SweepSet, where: Where, log: Log) -> list[Case]:
+def cases(wanted: Sequence[CaseTask], sweeps: LabelledSweeps, where: Where, log: Log) -> list[Case]:
     """The Case of each task in their order: kept ones from the cache, the others trained. log: is told how far it is."""
     data, held = digest(sweeps), {}
     keys = [fingerprint([data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
@@ -141,7 +143,7 @@ def cases(wanted: Sequence[Task], sweeps: SweepSet, where: Where, log: Log) -> l
 
 
 def run(
-    sweeps: SweepSet, test: SweepSet | None, protocol: str, method: str, where: Where, log: Log,
+    sweeps: LabelledSweeps, test: LabelledSweeps | None, protocol: str, method: str, where: Where, log: Log,
     effort: Effort = methods.USUAL, seed: int = 1,
 ) -> dict[str, Any]:  # fmt: skip
     """All figures, as results.json holds them. test: tested on this set; else `protocol` says what is left out.
@@ -168,7 +170,7 @@ def run(
     return about | provenance() | told
 
 
-def _learn(numbered: tuple[int, Task], sweeps: SweepSet) -> Case:
+def _learn(numbered: tuple[int, CaseTask], sweeps: LabelledSweeps) -> Case:
     return learn(numbered[1], sweeps)
 
 

@@ -1,6 +1,6 @@
-"""The room of where the skin sat. In: a training set; a bundle and simulated sweeps. Out: a Place, and what moving costs.
+"""The room of where the skin sat. In: a training set; a bundle and simulated sweeps. Out: a ContactPositions, and what moving costs.
 
-A Place goes into the bundle, so that the box can say how far a contact lies from those of training. How well that goes
+A ContactPositions goes into the bundle, so that the box can say how far a contact lies from those of training. How well that goes
 with accuracy is measured by `palpate-train placing`: the same sweeps again and again, with the skin ever further off.
 """
 
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
-from appliance.signal.contact import MOST_POSITIONS, Place, centre
+from appliance.signal.contact import MOST_POSITIONS, ContactPositions, centre
 from appliance.sim import skin
 from train.calibration import novelty
-from train.data.sets import SweepSet
-from train.evaluation.robustness_data import Trial
+from train.data.sets import LabelledSweeps
+from train.evaluation.robustness_data import EvaluationSweeps
 from train.metrics.score import interval, provenance
 
 Array = NDArray[Any]
@@ -37,7 +37,7 @@ FALL = 0.05
 """Accuracy counts as lost where it is so far below that of a skin in its place."""
 
 
-def place_of(sweeps: SweepSet, contact: float, pitch_mm: float | None = None) -> Place | None:
+def place_of(sweeps: LabelledSweeps, contact: float, pitch_mm: float | None = None) -> ContactPositions | None:
     """Where the contact lay at each position of a training set (else at each recording); None where nothing says how
     far apart the taxels are, or nothing touched them.
 
@@ -60,7 +60,7 @@ def place_of(sweeps: SweepSet, contact: float, pitch_mm: float | None = None) ->
     centres = np.stack([points[member == one].mean(axis=0) for one in range(member.max() + 1)])
     limit = max(pitch_mm * LEAST, novelty.limit(farthest(points, member, centres)) if len(centres) > 1 else 0.0)
     kept = centres[np.linspace(0, len(centres) - 1, min(len(centres), MOST_POSITIONS)).round().astype(int)].round(3)
-    return Place(float(pitch_mm), tuple(kept[:, 0].tolist()), tuple(kept[:, 1].tolist()), round(limit, 3))
+    return ContactPositions(float(pitch_mm), tuple(kept[:, 0].tolist()), tuple(kept[:, 1].tolist()), round(limit, 3))
 
 
 def farthest(points: Array, member: Array, centres: Array) -> Array:
@@ -82,9 +82,9 @@ def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[s
     if place is None:
         raise FormatError(f"bundle {box.bundle.id} has no positions to compare with; export it again")
     told: Json = {"bundle": box.bundle.id, "limit_mm": place.limit_mm, "positions": len(place.rows_mm)}
-    told |= {name: _point(box, Trial.simulated(spec)) | {"set": spec} for name, spec in
+    told |= {name: _point(box, EvaluationSweeps.simulated(spec)) | {"set": spec} for name, spec in
              (("trained positions, other sweeps", seen), ("other positions", unseen), ("T-HARD", hard))}  # fmt: skip
-    trial, told["moved"] = Trial.simulated(unseen), {}
+    trial, told["moved"] = EvaluationSweeps.simulated(unseen), {}
     for way, name in WAYS.items():
         points = []
         for mm in (*(-off for off in reversed(OFF_MM)), 0.0, *OFF_MM):
@@ -99,7 +99,9 @@ def _shifted(placement: skin.Placement, name: str, mm: float) -> skin.Placement:
     return replace(placement, **{name: getattr(placement, name) + mm})
 
 
-def _point(box: Classifier, trial: Trial, where: Callable[[skin.Placement], skin.Placement] = lambda p: p) -> Json:
+def _point(
+    box: Classifier, trial: EvaluationSweeps, where: Callable[[skin.Placement], skin.Placement] = lambda p: p
+) -> Json:
     """The box's answers to the trial's sweeps, with the skin moved. Sweeps of one taping count as together."""
     assert trial.scene
     sweeps, place, limits = trial.sweeps, box.bundle.manifest.place, box.bundle.manifest.thresholds

@@ -19,7 +19,7 @@ from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.sim import skin
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
 from train.models import networks
@@ -123,7 +123,7 @@ def check(found: Parity) -> None:
         )
 
 
-def compared(source: Path, sweeps: SweepSet, file: Path | None = None) -> str:
+def compared(source: Path, sweeps: LabelledSweeps, file: Path | None = None) -> str:
     """The table of float against int8 on `sweeps`; source: a fit, or a bundle, which has no float form. file: JSON.
 
     Raises FormatError where formats or materials differ, or nothing is in int8.

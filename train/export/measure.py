@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from appliance.bundle import bundle
 from appliance.core.errors import BundleError
 from appliance.core.provenance import commit
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.export import measure_process, pack
 from train.models import minirocket
 from train.models.heads import hold_out
@@ -70,7 +70,7 @@ class Packed:
         )
 
 
-def packed(method: Method, sweeps: SweepSet, seed: int, folder: Path) -> list[Packed]:
+def packed(method: Method, sweeps: LabelledSweeps, seed: int, folder: Path) -> list[Packed]:
     """Train `method` on four fifths of `sweeps` and pack all its forms; what lies in `folder` is not made again.
 
     Raises FormatError where the method cannot work with the set, ExportRefused where it would be no model on the box.
@@ -87,7 +87,7 @@ def packed(method: Method, sweeps: SweepSet, seed: int, folder: Path) -> list[Pa
     return [Packed(**one | {"method": method.name, "folder": folder / one["folder"]}) for one in told]
 
 
-def _made(method: Method, sweeps: SweepSet, seed: int, work: Path) -> Iterator[dict[str, Any]]:
+def _made(method: Method, sweeps: LabelledSweeps, seed: int, work: Path) -> Iterator[dict[str, Any]]:
     """Each form packed in a folder of its own; then the method as its own library runs it, where it has one."""
     train, held, by = hold_out(sweeps, seed)
     model = method.train(train, given(method.input, train), seed)
@@ -114,21 +114,21 @@ def _made(method: Method, sweeps: SweepSet, seed: int, work: Path) -> Iterator[d
         yield counted[""] | {"runtime": runtime, "folder": runtime}
 
 
-def _torch(model: Any, train: SweepSet, seed: int, folder: Path) -> None:
+def _torch(model: Any, train: LabelledSweeps, seed: int, folder: Path) -> None:
     """The network as TorchScript, which needs none of our code to be read."""
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.jit.trace(model.network.eval(), torch.from_numpy(train.samples[:1])).save(folder / measure_process.TORCH)
 
 
-def _aeon(model: Any, train: SweepSet, seed: int, folder: Path) -> None:
+def _aeon(model: Any, train: LabelledSweeps, seed: int, folder: Path) -> None:
     """aeon's parameters, fitted to the same sweeps once more, and the head that was trained on its features."""
     named = {f"p{i}": p for i, p in enumerate(minirocket.fitted(train.samples, seed))}
     silence = np.zeros((1, train.format.rows * train.format.cols, train.format.window), np.float32)
     np.savez_compressed(folder / measure_process.AEON, silence=silence, weight=model.weight, bias=model.bias, **named)
 
 
-GUESTS: Mapping[str, tuple[str, Callable[[Any, SweepSet, int, Path], None]]] = {
+GUESTS: Mapping[str, tuple[str, Callable[[Any, LabelledSweeps, int, Path], None]]] = {
     "paper-cnn-centred": ("torch", _torch),
     "minirocket": ("aeon", _aeon),
 }

@@ -27,7 +27,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier, softmax
 from train.calibration.completion import complete
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.export.contact_positions import place_of
 from train.metrics.score import figure
 from train.models.compact.fit import Fit
@@ -61,8 +61,8 @@ class Content:
 
     model: onnx.ModelProto
     input: str
-    train: SweepSet
-    held: SweepSet
+    train: LabelledSweeps
+    held: LabelledSweeps
     held_by: str
     about: dict[str, Any]
     figures: dict[str, Any] = field(default_factory=dict)
@@ -107,7 +107,7 @@ def pack(
     return manifest
 
 
-def trained(method: Method, sweeps: SweepSet, seed: int) -> Content:
+def trained(method: Method, sweeps: LabelledSweeps, seed: int) -> Content:
     """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, which judge it.
 
     Raises FormatError for a method whose features the box does not compute.
@@ -144,7 +144,7 @@ def completed(content: Content) -> Content:
     )  # fmt: skip
 
 
-def named_by_means(content: Content, sweeps: SweepSet) -> Array:
+def named_by_means(content: Content, sweeps: LabelledSweeps) -> Array:
     """Logits [N, K] as the box computes them from class means where a label is enrolled, not cooled."""
     embedding = onnx.ModelProto()
     embedding.CopyFrom(content.model)
@@ -156,7 +156,7 @@ def named_by_means(content: Content, sweeps: SweepSet) -> Array:
     return named
 
 
-def golden_sweeps(sweeps: SweepSet, logits: Array, also: Array) -> bytes:
+def golden_sweeps(sweeps: LabelledSweeps, logits: Array, also: Array) -> bytes:
     """An .npz of one training sweep of the first and the last material, and their logits.
 
     Of those that are recognised, by the logits `also` too, it is the one whose probability is the median: neither so sure that a small fault does
@@ -174,7 +174,7 @@ def golden_sweeps(sweeps: SweepSet, logits: Array, also: Array) -> bytes:
     return packed.getvalue()
 
 
-def thresholds(sweeps: SweepSet, full_scale: float | None) -> bundle.Thresholds:
+def thresholds(sweeps: LabelledSweeps, full_scale: float | None) -> bundle.Thresholds:
     """What a window must reach: a tenth of the weakest contact in training, the strongest taxel's mean."""
     weakest = float(sweeps.samples.mean(axis=1, dtype=np.float64).max(axis=(1, 2)).min())
     kind = sweeps.samples.dtype
@@ -184,7 +184,7 @@ def thresholds(sweeps: SweepSet, full_scale: float | None) -> bundle.Thresholds:
     return bundle.Thresholds(contact=contact, full_scale=float(top if full_scale is None else full_scale))
 
 
-def score(classifier: Classifier, sweeps: SweepSet, *, fused: bool = False) -> Array:
+def score(classifier: Classifier, sweeps: LabelledSweeps, *, fused: bool = False) -> Array:
     """Labels that the box gives, int64 [N] into the bundle's, or REFUSED or UNKNOWN.
 
     fused: each sweep gets what the box says after all of its recording.
@@ -203,7 +203,7 @@ def score(classifier: Classifier, sweeps: SweepSet, *, fused: bool = False) -> A
     return given
 
 
-def figures(classifier: Classifier, sweeps: SweepSet, protocol: str) -> dict[str, Any]:
+def figures(classifier: Classifier, sweeps: LabelledSweeps, protocol: str) -> dict[str, Any]:
     """Accuracy by sweep, and by recording where one holds several; what the box refuses or does not know is wrong."""
     right = score(classifier, sweeps) == sweeps.labels
     told = {protocol: figure(int(right.sum()), len(sweeps))}
@@ -214,7 +214,7 @@ def figures(classifier: Classifier, sweeps: SweepSet, protocol: str) -> dict[str
     return told
 
 
-def judge(folder: Path, held: SweepSet, logits: Array, protocol: str) -> dict[str, Any]:
+def judge(folder: Path, held: LabelledSweeps, logits: Array, protocol: str) -> dict[str, Any]:
     """Figures of the bundle in `folder` on `held`, run as the box runs it; `logits` [N, K]: what export saw there.
 
     Raises ExportRefused where the box gives another label than export, or refuses too many sweeps.

@@ -21,14 +21,14 @@ DRAWS = 2000
 
 
 @dataclass(frozen=True)
-class Tally:
+class Score:
     """`right` of `total`."""
 
     right: int
     total: int
 
     @classmethod
-    def of(cls, right: Array) -> Tally:
+    def of(cls, right: Array) -> Score:
         """Of booleans [n]."""
         return cls(int(right.sum()), len(right))
 

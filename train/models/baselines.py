@@ -32,10 +32,10 @@ from sklearn.svm import SVC
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import LEAST_PROBABILITY
 from appliance.inference.session import session
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.models.heads import temperature
 from train.models.methods import Method
-from train.onnx_tools.graph_builder import IR, OPSET, Graph
+from train.onnx_tools.graph_builder import IR, OPSET, GraphBuilder
 
 Array = NDArray[Any]
 NEIGHBOURS = 4
@@ -94,7 +94,7 @@ class Gauss(ClassifierMixin, BaseEstimator):
         """Labels [n] of features [n, F]."""
         return self.classes_[self.decision_function(x).argmax(axis=1)]
 
-    def nodes(self, g: Graph, features: str) -> str:
+    def nodes(self, g: GraphBuilder, features: str) -> str:
         """`decision_function` in ONNX, which skl2onnx cannot know; the name of its output [1, K]."""
         white = g("MatMul", g("Sub", features, g.constant(self.means_[:, None])), g.constant(self.whites_))
         squares = g("ReduceSum", g("Mul", white, white), g.constant([1, 2], "int64"), keepdims=0)
@@ -138,7 +138,7 @@ class FeatureModel:
         return np.array(rows, np.float32).reshape(-1, classes)
 
 
-def learn(make: Callable[[], Estimator], sweeps: SweepSet, given: Array, seed: int) -> FeatureModel:
+def learn(make: Callable[[], Estimator], sweeps: LabelledSweeps, given: Array, seed: int) -> FeatureModel:
     """Train what `make` makes on features `given` float32 [N, F] of `sweeps`; nothing in it is random.
 
     The temperature is that of the sweeps held out in turn: by position, or by recording where there are not several or
@@ -158,7 +158,7 @@ def learn(make: Callable[[], Estimator], sweeps: SweepSet, given: Array, seed: i
     return FeatureModel(written(make().fit(seen, labels), classes, cooler))
 
 
-def _folds(sweeps: SweepSet) -> Iterator[tuple[Array, Array]]:
+def _folds(sweeps: LabelledSweeps) -> Iterator[tuple[Array, Array]]:
     """(training, held-out) numbers of sweeps; held out are only sweeps whose material is in training."""
     names = ("position", "recording") if "position" in sweeps.groups else ("recording",)
     for group in map(sweeps.group, names):
@@ -182,7 +182,7 @@ def written(estimator: Estimator, classes: int, cooler: float = 1.0) -> onnx.Mod
     cooler: the temperature, which divides the estimator's scores: log likelihoods of Gauss, log votes of kNN, votes and
     bounded confidences of the SVM. A class that the estimator never saw has ABSENT.
     """
-    g, size = Graph(), getattr(estimator, "n_features_in_", 0) or estimator.means_.shape[1]
+    g, size = GraphBuilder(), getattr(estimator, "n_features_in_", 0) or estimator.means_.shape[1]
     sound = g("Clip", "features", g.constant(-LIMIT), g.constant(LIMIT), output="sound")
     scores = estimator.nodes(g, sound) if isinstance(estimator, Gauss) else _converted(g, estimator, sound, size)
     log_p = g("LogSoftmax", g("Mul", scores, g.constant(1 / cooler)))
@@ -199,7 +199,7 @@ def written(estimator: Estimator, classes: int, cooler: float = 1.0) -> onnx.Mod
     return made
 
 
-def _converted(g: Graph, estimator: KNeighborsClassifier | Pipeline, features: str, size: int) -> str:
+def _converted(g: GraphBuilder, estimator: KNeighborsClassifier | Pipeline, features: str, size: int) -> str:
     """skl2onnx's nodes for the estimator, added to `g`; the name of its scores [1, K]."""
     *before, last = (each for _, each in estimator.steps) if isinstance(estimator, Pipeline) else [estimator]
     if votes := isinstance(last, KNeighborsClassifier):
@@ -221,7 +221,7 @@ def _converted(g: Graph, estimator: KNeighborsClassifier | Pipeline, features: s
     return scores if len(last.classes_) == 2 else _tally(g, scores, len(last.classes_))
 
 
-def _tally(g: Graph, duels: str, classes: int) -> str:
+def _tally(g: GraphBuilder, duels: str, classes: int) -> str:
     """SVC's `decision_function`: decisions one against one [1, pairs] -> votes and bounded confidences [1, classes].
 
     A duel (i, j), i < j, is a vote for j where its decision is below 0, else for i; a sum s of a class's decisions adds

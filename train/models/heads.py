@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from appliance.core.errors import FormatError
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 
 Array = NDArray[Any]
 HELD_OUT = 0.2
@@ -26,7 +26,7 @@ ABSENT = -30.0
 1e-12."""
 
 
-def hold_out(sweeps: SweepSet, seed: int) -> tuple[SweepSet, SweepSet, str]:
+def hold_out(sweeps: LabelledSweeps, seed: int) -> tuple[LabelledSweeps, LabelledSweeps, str]:
     """(to train on, held out, by what): whole positions where there are several and these allow it, else recordings.
 
     Raises FormatError where the set has too few groups, or one sweep of a material would be all that is left.
@@ -37,7 +37,7 @@ def hold_out(sweeps: SweepSet, seed: int) -> tuple[SweepSet, SweepSet, str]:
     return _parted(sweeps, "recording", seed)
 
 
-def _parted(sweeps: SweepSet, by: str, seed: int) -> tuple[SweepSet, SweepSet, str]:
+def _parted(sweeps: LabelledSweeps, by: str, seed: int) -> tuple[LabelledSweeps, LabelledSweeps, str]:
     train, held = sweeps.split(by, 1 - HELD_OUT, seed)
     counts = np.bincount(train.labels, minlength=len(sweeps.materials))
     if 1 in counts:

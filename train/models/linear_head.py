@@ -15,7 +15,7 @@ import onnx
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.models.heads import ABSENT, hold_out, temperature
 from train.onnx_tools.graph_builder import run, with_head
 
@@ -47,7 +47,7 @@ class Headed:
 def headed(
     features: onnx.ModelProto,
     fit: Callable[[Array, Array], tuple[Array, Array]],
-    sweeps: SweepSet,
+    sweeps: LabelledSweeps,
     given: Array,
     seed: int,
 ) -> Headed:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.signal import features
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.features import kinds
 
 Array = NDArray[Any]
@@ -79,7 +79,7 @@ class Method:
     name: str
     about: str
     input: str
-    train: Callable[[SweepSet, Array, int], Model]
+    train: Callable[[LabelledSweeps, Array, int], Model]
     extra: str = ""
     effort: str = ""
 
@@ -89,7 +89,7 @@ class Method:
         return self.input == "raw" or self.input in features.KINDS
 
 
-def given(kind: str, sweeps: SweepSet) -> Array:
+def given(kind: str, sweeps: LabelledSweeps) -> Array:
     """What a method with the input `kind` is given of `sweeps`: their digits, or float32 [N, F] as the box computes."""
     if kind == "raw":
         return sweeps.samples

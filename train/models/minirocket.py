@@ -17,10 +17,10 @@ from sklearn.preprocessing import StandardScaler
 
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.models.linear_head import Headed, headed
 from train.models.methods import Method
-from train.onnx_tools.graph_builder import Graph
+from train.onnx_tools.graph_builder import GraphBuilder
 
 Array = NDArray[Any]
 LENGTH, KERNELS = 9, np.array(list(combinations(range(9), 3)))
@@ -31,7 +31,7 @@ ALPHAS = np.logspace(-3, 3, 10)
 """Ridge penalties that leave-one-out chooses from: what aeon's MiniRocketClassifier and the authors' code use."""
 
 
-def train(sweeps: SweepSet, given: Array, seed: int) -> Headed:
+def train(sweeps: LabelledSweeps, given: Array, seed: int) -> Headed:
     """MiniRocket and ridge on `given`, the digits [N, T, R, C] of `sweeps`.
 
     Raises FormatError where aeon is missing, a window is shorter than a kernel, or `sweeps` are too few.
@@ -68,7 +68,7 @@ def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelPro
     dilation number plus kernel number is even, the window is padded with zeros; else the kernel stays within it.
     """
     counts, taxels, dilations, per_kernel, biases = parameters
-    g, size, at = Graph(), form.rows * form.cols, 0
+    g, size, at = GraphBuilder(), form.rows * form.cols, 0
     chosen = iter(np.split(taxels, np.cumsum(counts)[:-1]))
     x = g("Cast", g("Reshape", "sweep", g.constant([1, form.window, size], "int64")), to=TensorProto.FLOAT)
     x, parts = g("Transpose", x, perm=[0, 2, 1]), []

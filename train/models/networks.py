@@ -22,7 +22,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from appliance.core.types import SweepFormat
 from train.models.heads import ABSENT
-from train.onnx_tools.graph_builder import Graph, centred
+from train.onnx_tools.graph_builder import GraphBuilder, centred
 
 STATE, PATCHES, LEAST_PATCH = 64, 128, 8
 """Of Recurrent: size of its state, about how many patches it sees, frames of the shortest."""
@@ -92,7 +92,7 @@ def texture_scale(samples: NDArray[Any]) -> float:
 
 
 @dataclass(frozen=True)
-class Image:
+class ImageShape:
     """Layers of an ImageNetwork. channels: of each convolution; strides: its steps in (time, taxels); pool: in time.
 
     norm: batch norms behind the convolutions. dense: neurons of the layer before the head.
@@ -107,9 +107,9 @@ class Image:
 
 KERNEL = (15, 5)
 """Of the paper's convolutions, frames by taxels (table I)."""
-PAPER = Image(channels=(32, 64), strides=((1, 1), (1, 1)), pool=10, norm=False, dense=1024)
+PAPER = ImageShape(channels=(32, 64), strides=((1, 1), (1, 1)), pool=10, norm=False, dense=1024)
 """The paper's CNN (eq. 6 to 9, table I)."""
-TACTNET2 = Image(channels=(32, 64, 128), strides=((5, 2), (5, 2), (5, 1)), pool=2, norm=True, dense=1024)
+TACTNET2 = ImageShape(channels=(32, 64, 128), strides=((5, 2), (5, 2), (5, 1)), pool=2, norm=True, dense=1024)
 """TactNet-II as far as it is known: three convolutions, batch norm, 1.84 M parameters (Tulbure and Baeuml 2018; here
 1.83 M for 1500 x 4 x 4 and six classes). The kernels are those of its predecessor; channels, strides, which stand for
 most of the pooling and are a twentieth of the work, and the dense layer are ours."""
@@ -121,7 +121,7 @@ class ImageNetwork(Network):
     Zero padding keeps sizes; where the pooling runs over the end it pools what is there.
     """
 
-    def __init__(self, form: SweepFormat, classes: int, scale: float, offset: float | None, plan: Image) -> None:
+    def __init__(self, form: SweepFormat, classes: int, scale: float, offset: float | None, plan: ImageShape) -> None:
         super().__init__(form, scale, offset)
         self.plan, steps, taxels = plan, form.window, form.rows * form.cols
         self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
@@ -145,7 +145,7 @@ class ImageNetwork(Network):
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; the batch norms are folded into the convolutions."""
-        g, form, classes = Graph(), self.form, self.head.out_features
+        g, form, classes = GraphBuilder(), self.form, self.head.out_features
         steps, taxels = form.window, form.rows * form.cols
         if self.offset is None:
             x = g("Transpose", centred(g, form)[0], perm=[0, 2, 1])
@@ -185,7 +185,7 @@ class Recurrent(Network):
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]."""
-        g, unit = Graph(), self.unit
+        g, unit = GraphBuilder(), self.unit
         x = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
         x = g("Relu", g("Conv", x, *_constants(g, self.patches), strides=[self.stride]))
         given, kept = (_reordered(w) for w in (unit.weight_ih_l0, unit.weight_hh_l0))
@@ -197,7 +197,7 @@ class Recurrent(Network):
         return g.model(self.form, "logits", self.head.out_features)
 
 
-def _constants(g: Graph, layer: nn.Module) -> tuple[str, str]:
+def _constants(g: GraphBuilder, layer: nn.Module) -> tuple[str, str]:
     return g.constant(layer.weight.detach().numpy()), g.constant(layer.bias.detach().numpy())
 
 

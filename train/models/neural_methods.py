@@ -19,30 +19,30 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.models.heads import hold_out, temperature
 from train.models.methods import USUAL, Effort, Method, Model
 from train.models.networks import PAPER, TACTNET2, ImageNetwork, Network, Recurrent, texture_scale
-from train.models.training import Cost, Log, Recipe, in_order, learn, one_thread, silent, tensors
+from train.models.training import Cost, Log, TrainingRecipe, in_order, learn, one_thread, silent, tensors
 from train.onnx_tools.graph_builder import Graphed
 from train.onnx_tools.quantize import quantize
 
 Array = NDArray[Any]
-Rules = TypeVar("Rules", bound=Recipe)
+Rules = TypeVar("Rules", bound=TrainingRecipe)
 PAPER_STEPS, PROCESSOR_STEPS = 4000, 200
 """Iterations of the paper's CNN: the paper's (table I) on a GPU; fewer on a processor, where one core needs about a
 second and a half for each."""
-PAPER_RECIPE = Recipe(batch=50, peak_rate=1e-4, weight_decay=0.0, smoothing=0.0, ema=0.0, dropout=0.25, noise=0.0,
+PAPER_RECIPE = TrainingRecipe(batch=50, peak_rate=1e-4, weight_decay=0.0, smoothing=0.0, ema=0.0, dropout=0.25, noise=0.0,
                       gain=0.0, cycle=False)  # fmt: skip
 """As printed (section IV.D); its p_d = .75 is the share that is kept."""
 PAPER_INT8 = ("Conv", "Relu", "MaxPool", "Gemm")
 """Nodes of the paper's CNN that its int8 form has in int8."""
-TACTNET2_RECIPE = Recipe(steps=120, batch=32, peak_rate=2e-3, smoothing=0.0, ema=0.9, dropout=0.5, noise=0.0, gain=0.0,
+TACTNET2_RECIPE = TrainingRecipe(steps=120, batch=32, peak_rate=2e-3, smoothing=0.0, ema=0.9, dropout=0.5, noise=0.0, gain=0.0,
                          adversarial=0.01)  # fmt: skip
 """Adversarial training as in Goodfellow et al. 2015, half of the cost; dropout as in Gal and Ghahramani 2016. The
 numbers are ours, so that one core needs about half a minute for 480 sweeps; farther than .01 only cost accuracy on
 positions held out inside a training set."""
-RECURRENT_RECIPE = Recipe(steps=400)
+RECURRENT_RECIPE = TrainingRecipe(steps=400)
 """As the compact network's, with half the iterations."""
 LEAST_STEPS = 2
 """However small the effort is."""
@@ -108,12 +108,12 @@ def _statistics(samples: Array) -> tuple[float, float]:
 
 
 def train_network(
-    sweeps: SweepSet,
+    sweeps: LabelledSweeps,
     given: Array,
     seed: int,
     *,
     build: Build,
-    recipe: Recipe,
+    recipe: TrainingRecipe,
     calibrated: bool,
     bfloat16: bool,
     log: Log,
@@ -136,7 +136,7 @@ def train_network(
     return replace(trained, forms={"int8": Graphed(quantize(network.graph(), train.samples, int8))} if int8 else {})
 
 
-def parts(sweeps: SweepSet, seed: int) -> tuple[SweepSet, SweepSet, str]:
+def parts(sweeps: LabelledSweeps, seed: int) -> tuple[LabelledSweeps, LabelledSweeps, str]:
     """As heads.hold_out; too small a set is trained on whole, and there Platt's doubt alone bounds the temperature."""
     try:
         return hold_out(sweeps, seed)
@@ -144,7 +144,7 @@ def parts(sweeps: SweepSet, seed: int) -> tuple[SweepSet, SweepSet, str]:
         return sweeps, sweeps, "nothing"
 
 
-def ran(recipe: Recipe, device: str, half: bool, wanted: bool) -> str:
+def ran(recipe: TrainingRecipe, device: str, half: bool, wanted: bool) -> str:
     """What was computed, and how."""
     digits = "bfloat16" if half else "float32 (no bfloat16 here)" if wanted else "float32"
     return f"{recipe.steps} iterations of {recipe.batch} in {digits} on {device}"
@@ -170,7 +170,7 @@ def methods(effort: Effort = USUAL, log: Log = silent) -> tuple[Method, ...]:
     if steps is None:
         steps = round((PAPER_STEPS if torch.cuda.is_available() else PROCESSOR_STEPS) * effort.share)
 
-    def network(name: str, about: str, build: Build, recipe: Recipe, printed: bool = False) -> Method:
+    def network(name: str, about: str, build: Build, recipe: TrainingRecipe, printed: bool = False) -> Method:
         return Method(name, about, "raw", partial(
             train_network, build=build, recipe=recipe, calibrated=not printed, log=log,
             bfloat16=(half := effort.bfloat16 and printed), int8=PAPER_INT8 if printed else (),

@@ -21,10 +21,10 @@ from sklearn.svm import LinearSVC
 
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.models.linear_head import Headed, headed
 from train.models.methods import Method
-from train.onnx_tools.graph_builder import Graph, run
+from train.onnx_tools.graph_builder import GraphBuilder, run
 
 Array = NDArray[Any]
 FRAMES, SIDE, STEP = 16, 2, 8
@@ -44,7 +44,7 @@ CONTRAST = 0.1
 """Added to a cell's squared length, as in HMP: a silent cell stays silent."""
 
 
-def train(sweeps: SweepSet, given: Array, seed: int) -> Headed:
+def train(sweeps: LabelledSweeps, given: Array, seed: int) -> Headed:
     """ST-HMP and a linear SVM on `given`, the digits [N, T, R, C] of `sweeps`.
 
     Raises FormatError where a window is too short, or `sweeps` are too few.
@@ -97,7 +97,7 @@ def dictionary(patches: Array, rng: np.random.Generator) -> Array:
 def coded(patches: Array, atoms: Array) -> Array:
     """Codes float32 [n, ATOMS] of patches [n, frames, r, c], by the nodes that the box runs, as one long sweep."""
     n, frames, rows, cols = patches.shape
-    g, form = Graph(), SweepFormat(rows, cols, 1.0, n * frames, "float32")
+    g, form = GraphBuilder(), SweepFormat(rows, cols, 1.0, n * frames, "float32")
     g("Reshape", _codes(g, form, atoms, frames, 1.0), g.constant([1, -1], "int64"), output="features")
     sweep = patches.reshape(1, n * frames, rows, cols).astype(np.float32)
     return run(g.model(form, "features", n * len(atoms)), sweep).reshape(n, len(atoms))
@@ -108,7 +108,7 @@ def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
 
     atoms: [ATOMS, frames, r, c]. scale: makes of digits what the atoms were learnt from.
     """
-    g, steps = Graph(), (form.window - atoms.shape[1]) // STEP + 1
+    g, steps = GraphBuilder(), (form.window - atoms.shape[1]) // STEP + 1
     rows, cols = (n - size + 1 for n, size in zip((form.rows, form.cols), atoms.shape[2:], strict=True))
     codes = g("Reshape", _codes(g, form, atoms, STEP, scale), g.constant([steps, rows, cols, -1], "int64"))
     both = g("Concat", codes, g("Neg", codes), axis=3)
@@ -130,12 +130,12 @@ def _parts(n: int, parts: int) -> list[tuple[int, int]]:
     return [(i * n // parts, -(-(i + 1) * n // parts)) for i in range(parts)]
 
 
-def _cut(g: Graph, x: str, axis: int, part: tuple[int, int]) -> str:
+def _cut(g: GraphBuilder, x: str, axis: int, part: tuple[int, int]) -> str:
     """`x` from part[0] to part[1] along `axis`."""
     return g("Slice", x, *(g.constant([n], "int64") for n in (*part, axis)))
 
 
-def _codes(g: Graph, form: SweepFormat, atoms: Array, step: int, scale: float) -> str:
+def _codes(g: GraphBuilder, form: SweepFormat, atoms: Array, step: int, scale: float) -> str:
     """Orthogonal matching pursuit of all patches of `sweep` at once: codes [patches, ATOMS], by time, row, column.
 
     Atoms sum to zero on each taxel, so their products with a patch are those with it less its means: one convolution.
@@ -149,7 +149,7 @@ def _codes(g: Graph, form: SweepFormat, atoms: Array, step: int, scale: float) -
     return _pursuit(g, left, flat @ flat.T)
 
 
-def _pursuit(g: Graph, left: str, gram: Array) -> str:
+def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
     """Codes [n, K] from products of n patches with K atoms, `left` [n, K], and those of the atoms, `gram` [K, K].
 
     The atoms that a patch chooses are made orthogonal one after another (Cholesky); the products of those directions

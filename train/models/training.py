@@ -1,4 +1,4 @@
-"""The room of the training loop, one for all networks. In: a Network, a SweepSet, a Recipe. Out: it trained, the cost.
+"""The room of the training loop, one for all networks. In: a Network, a LabelledSweeps, a TrainingRecipe. Out: it trained, the cost.
 
 Sweeps are drawn and augmented with a generator of their own; no random state outside is read or changed as long as the
 caller forks PyTorch's.
@@ -18,7 +18,7 @@ from torch import Generator, Tensor
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.models.networks import Network
 
 Array = NDArray[Any]
@@ -30,7 +30,7 @@ Vary = Callable[[Tensor, Generator], Tensor]
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TrainingRecipe:
     """How a network is trained: AdamW (Adam where `weight_decay` is 0) on batches drawn from shuffled rounds.
 
     cycle: the rate rises to `peak_rate` and falls again; else it stays there. ema: share that the moving average of the
@@ -75,7 +75,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def unsettled(x: Tensor, recipe: Recipe, rng: Generator) -> Tensor:
+def unsettled(x: Tensor, recipe: TrainingRecipe, rng: Generator) -> Tensor:
     """Sweeps [B, R * C, T] with other gains and another noise."""
     if recipe.gain:
         x = x * (1 + recipe.gain * torch.randn(x.shape[:2], generator=rng)[..., None])
@@ -84,8 +84,8 @@ def unsettled(x: Tensor, recipe: Recipe, rng: Generator) -> Tensor:
 
 def learn(
     model: Net,
-    sweeps: SweepSet,
-    recipe: Recipe,
+    sweeps: LabelledSweeps,
+    recipe: TrainingRecipe,
     seed: int,
     log: Log = silent,
     device: str = "cpu",
@@ -123,7 +123,7 @@ def learn(
     return average.module.cpu().fused(), cost
 
 
-def descend(model: Network, x: Tensor, labels: Tensor, recipe: Recipe) -> float:
+def descend(model: Network, x: Tensor, labels: Tensor, recipe: TrainingRecipe) -> float:
     """Leave the cost's gradients in the weights; the cost itself, of the sweeps as they are."""
     x.requires_grad_(recipe.adversarial > 0)
     loss = functional.cross_entropy(model.judge(x).float(), labels, label_smoothing=recipe.smoothing)

@@ -26,7 +26,7 @@ TENSOR = {
 OPSET, IR = 17, 8
 
 
-class Graph:
+class GraphBuilder:
     """An ONNX graph in the making."""
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class Graph:
         return made
 
 
-def centred(g: Graph, form: SweepFormat) -> tuple[str, str]:
+def centred(g: GraphBuilder, form: SweepFormat) -> tuple[str, str]:
     """Nodes that take each taxel's mean away: `sweep` -> ([1, R * C, T], sums over time [1, R * C]), float32.
 
     Matrix products do it, five times as fast in onnxruntime as ReduceMean and Sub along time, and exact for whole

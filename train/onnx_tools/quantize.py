@@ -33,14 +33,14 @@ def quantize(model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv"
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         path = Path(folder) / "int8.onnx"
         quantize_static(
-            mine, path, _Reader(sweeps[some]), QuantFormat.QDQ, list(ops), per_channel=True, reduce_range=True,
+            mine, path, _CalibrationReader(sweeps[some]), QuantFormat.QDQ, list(ops), per_channel=True, reduce_range=True,
             activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8,
             calibrate_method=CalibrationMethod.Percentile, extra_options={"CalibPercentile": PERCENTILE},
         )  # fmt: skip
         return onnx.load(path)
 
 
-class _Reader(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime ships no types
+class _CalibrationReader(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime ships no types
     """Hands sweeps to the calibration one by one."""
 
     def __init__(self, sweeps: Array) -> None:

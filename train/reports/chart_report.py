@@ -21,7 +21,7 @@ from train.data import sets
 from train.evaluation import evaluate, parallel, robustness
 from train.evaluation.evaluate import Plan, Where
 from train.evaluation.fold import fingerprint
-from train.evaluation.robustness_data import Trial
+from train.evaluation.robustness_data import EvaluationSweeps
 from train.export import measure
 from train.export.measure import Packed
 from train.metrics import score
@@ -55,7 +55,7 @@ TARGETS = {
 
 
 @dataclass(frozen=True)
-class Part:
+class ChartPart:
     """An axis of accuracy. sets: joined; with real, files in the folder of real sweeps. only: of each set."""
 
     sets: tuple[str, ...]
@@ -63,7 +63,7 @@ class Part:
     only: tuple[str, ...] = ()
     real: bool = False
 
-    def load(self, data: Path | None) -> sets.SweepSet | None:
+    def load(self, data: Path | None) -> sets.LabelledSweeps | None:
         """Its sweeps; None where they are real and nobody said where."""
         if self.real and data is None:
             return None
@@ -78,7 +78,7 @@ class Chart:
     named: methods that belong there; others: those that join where an earlier run has left results. rounds: of timing.
     """
 
-    parts: dict[str, Part]
+    parts: dict[str, ChartPart]
     train: str
     trial: str
     named: tuple[str, ...]
@@ -90,10 +90,10 @@ class Chart:
 RUNGS = ("compact", *(f"compact-{size}" for size in LADDER))
 FULL = Chart(
     {
-        "hard": Part(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1"),
-        "lopo": Part(("sim:T-REAL:1",), "leave:position"),
-        "force": Part((FABRICS,), "leave:force", SEVEN, True),
-        "speed": Part((FABRICS,), "leave:speed", SEVEN, True),
+        "hard": ChartPart(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1"),
+        "lopo": ChartPart(("sim:T-REAL:1",), "leave:position"),
+        "force": ChartPart((FABRICS,), "leave:force", SEVEN, True),
+        "speed": ChartPart((FABRICS,), "leave:speed", SEVEN, True),
     },
     "sim:T-REAL:1",
     "sim:T-REAL:2:2",
@@ -102,8 +102,8 @@ FULL = Chart(
 )
 QUICK = Chart(
     {
-        "hard": Part(("sim:T-REAL:1001:3", "sim:T-HARD:1001-1002:2"), "split:set=0->1", ("position<=2",)),
-        "lopo": Part(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)),
+        "hard": ChartPart(("sim:T-REAL:1001:3", "sim:T-HARD:1001-1002:2"), "split:set=0->1", ("position<=2",)),
+        "lopo": ChartPart(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)),
     },
     "sim:T-REAL:1001:3",
     "sim:T-LAB:1002:1",
@@ -160,7 +160,7 @@ class Charting:
             self._stressed(found, [name for name in names if (name, "") in found], where)
         return found
 
-    def _evaluated(self, found: Accuracy, protocol: str, part: Part, names: Sequence[str], where: Where) -> None:
+    def _evaluated(self, found: Accuracy, protocol: str, part: ChartPart, names: Sequence[str], where: Where) -> None:
         """Add what methods and their forms reach under one protocol."""
         sweeps = part.load(self.data)
         if sweeps is None:
@@ -180,7 +180,7 @@ class Charting:
 
     def _stressed(self, found: Accuracy, names: Sequence[str], where: Where) -> None:
         """Add accuracies under stress of the methods themselves; stress.py does not test their other forms."""
-        train, trial = sets.load(self.chart.train).select(self.chart.only), Trial.simulated(self.chart.trial)
+        train, trial = sets.load(self.chart.train).select(self.chart.only), EvaluationSweeps.simulated(self.chart.trial)
         result = robustness.run(names, train, trial, where, seeds=self.seeds, effort=self.effort, log=self.log)
         for name, entry in result["methods"].items():
             if entry["curves"]:

@@ -43,7 +43,7 @@ COST_POINTS = 160
 
 
 @dataclass(frozen=True)
-class Part:
+class PaperPart:
     """A column of the paper's results: what is trained on, what is tested on.
 
     sets: joined; {w} stands for the world, {a} and {b} for its first and last seed of T-HARD. only: of each set.
@@ -54,7 +54,7 @@ class Part:
     folds: int
     only: tuple[str, ...] = ()
 
-    def load(self, world: int) -> sets.SweepSet:
+    def load(self, world: int) -> sets.LabelledSweeps:
         """Its sweeps."""
         last = ATTACHMENTS * world
         names = [name.format(w=world, a=last - ATTACHMENTS + 1, b=last) for name in self.sets]
@@ -77,10 +77,10 @@ class Step:
 
 ALL = ("lopo", "hard", "lab", "random")
 FULL = {
-    "lopo": Part(("sim:T-REAL:{w}",), "leave:position", 9),
-    "hard": Part(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}"), "split:set=0->1", 1),
-    "lab": Part(("sim:T-LAB:{w}",), "random:10", 10),
-    "random": Part(("sim:T-REAL:{w}",), "random:9", 9),
+    "lopo": PaperPart(("sim:T-REAL:{w}",), "leave:position", 9),
+    "hard": PaperPart(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}"), "split:set=0->1", 1),
+    "lab": PaperPart(("sim:T-LAB:{w}",), "random:10", 10),
+    "random": PaperPart(("sim:T-REAL:{w}",), "random:9", 9),
 }
 HARD, EASY = ("hard", "lopo"), ("lab", "random")
 FULL_STEPS = (
@@ -98,10 +98,10 @@ FULL_STEPS = (
 )
 """What is hard comes first, so that a run that was broken off has told the most: see `kept`."""
 QUICK = {
-    "lopo": Part(("sim:T-REAL:{w}:4",), "leave:position", 3, ("position<=2",)),
-    "hard": Part(("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", 1, ("position<=2",)),
-    "lab": Part(("sim:T-LAB:{w}:10",), "random:3", 3),
-    "random": Part(("sim:T-REAL:{w}:4",), "random:3", 3, ("position<=2",)),
+    "lopo": PaperPart(("sim:T-REAL:{w}:4",), "leave:position", 3, ("position<=2",)),
+    "hard": PaperPart(("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", 1, ("position<=2",)),
+    "lab": PaperPart(("sim:T-LAB:{w}:10",), "random:3", 3),
+    "random": PaperPart(("sim:T-REAL:{w}:4",), "random:3", 3, ("position<=2",)),
 }
 QUICK_STEPS = (
     Step(BASELINES, ALL, (1, 2), 0.3),
@@ -172,7 +172,7 @@ def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effo
 
 
 def _outcomes(
-    parts: dict[str, Part], steps: Sequence[Step], where: Where, effort: Effort, log: Log
+    parts: dict[str, PaperPart], steps: Sequence[Step], where: Where, effort: Effort, log: Log
 ) -> Iterator[Outcome]:
     """Step by step; after each fold `log` gets how far it is and how long all that is left will take."""
     todo = [(step, part, world) for step in steps for part in step.parts for world in step.worlds]
@@ -196,7 +196,7 @@ def _outcomes(
             pace = took / expected[i]
 
 
-def summary(outcomes: Sequence[Outcome], parts: dict[str, Part], effort: Effort = USUAL) -> dict[str, Any]:
+def summary(outcomes: Sequence[Outcome], parts: dict[str, PaperPart], effort: Effort = USUAL) -> dict[str, Any]:
     """All that the page tells, as plain numbers; see story.py, which reads it."""
     held: dict[tuple[str, str], list[Outcome]] = {}
     for outcome in outcomes:

@@ -21,7 +21,7 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.core.types import SweepFormat
 from train.data import readers, sets
-from train.data.readers import Recording
+from train.data.readers import RecordedSweep
 from train.reports.plot_style import ACCENT, FAINT, GREY, INK, PAPER, SMALL, TEXT, WIDTH, add, scale, svg, write
 
 WIDE, SKIN, SPECTRUM, HIGH = 2 * WIDTH, (0.95, 4.55), (5.45, 7.05), 7.45
@@ -77,7 +77,7 @@ def look(what: str, number: int | None = None) -> Look:
     if path.suffix == ".npy":
         if number is not None:
             raise FormatError(f"{what} is one sweep; leave --number away")
-        return _recorded(readers.Recording.load(path))
+        return _recorded(readers.RecordedSweep.load(path))
     held = readers.ok(readers.recorded(path)) if path.is_dir() else sets.load(what, 1)
     if number is None or not 0 <= number < len(held):
         wanted = "" if number is None else f" and none of number {number}"
@@ -85,7 +85,7 @@ def look(what: str, number: int | None = None) -> Look:
     return _recorded(held[number]) if isinstance(held, list) else _of_set(held, number)
 
 
-def _recorded(one: Recording) -> Look:
+def _recorded(one: RecordedSweep) -> Look:
     """A recording with what its sidecar knows."""
     sweep, about = one.sweep, one.about
     if not len(sweep.frames):
@@ -109,7 +109,7 @@ def _recorded(one: Recording) -> Look:
     )  # fmt: skip
 
 
-def _of_set(held: sets.SweepSet, number: int) -> Look:
+def _of_set(held: sets.LabelledSweeps, number: int) -> Look:
     """A sweep of a set with its groups."""
     named = [held.materials[held.labels[number]], *(f"{by} {v[number]}" for by, v in sorted(held.groups.items()))]
     taxels = held.samples[number]

@@ -18,13 +18,13 @@ from scipy.stats import t as student
 
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
-from train.data.sets import SweepSet, digest
+from train.data.sets import LabelledSweeps, digest
 from train.data.splitters import Protocol
 from train.data.transforms import WHOLE, Change
 from train.evaluation import corruptions, parallel
 from train.evaluation.evaluate import Where, folds
-from train.evaluation.fold import Fold, Task
-from train.evaluation.robustness_data import Trial
+from train.evaluation.fold import Fold, FoldTask
+from train.evaluation.robustness_data import EvaluationSweeps
 from train.metrics.score import interval
 from train.models import methods
 from train.selection.scene import Scene
@@ -43,7 +43,7 @@ class Refused(FormatError):
 
 
 @dataclass(frozen=True)
-class Part:
+class HeldOutPart:
     """Some values of one group. out: bool [N], its sweeps."""
 
     group: str
@@ -51,7 +51,7 @@ class Part:
     out: Array = field(repr=False)
 
 
-def parts(sweeps: SweepSet, varies: Sequence[str], folds: int = 0) -> list[Part]:
+def parts(sweeps: LabelledSweeps, varies: Sequence[str], folds: int = 0) -> list[HeldOutPart]:
     """The parts of all groups `varies`; of recordings, materials spread evenly, where nothing varies.
 
     Raises FormatError where a group has a single value, cuts recordings, or takes a material along when left out.
@@ -71,7 +71,7 @@ def parts(sweeps: SweepSet, varies: Sequence[str], folds: int = 0) -> list[Part]
     return found
 
 
-def _part(sweeps: SweepSet, name: str, values: Array) -> Part:
+def _part(sweeps: LabelledSweeps, name: str, values: Array) -> HeldOutPart:
     told = ", ".join(map(str, sorted(values.tolist())[:5]))
     out = np.isin(sweeps.group(name), values)
     recording = sweeps.group("recording")
@@ -80,7 +80,7 @@ def _part(sweeps: SweepSet, name: str, values: Array) -> Part:
     for label in np.setdiff1d(sweeps.labels[out], sweeps.labels[~out]):
         raise FormatError(f"{sweeps.source}: without {name} {told} there is no {sweeps.materials[label]!r} to train on; "
                           f"record it elsewhere too, or take {name!r} out of varies")  # fmt: skip
-    return Part(name, tuple(sorted(values.tolist())), out)
+    return HeldOutPart(name, tuple(sorted(values.tolist())), out)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Trials:
     """
 
     def __init__(
-        self, sweeps: SweepSet, scene: Scene, effort: methods.Effort, where: Where, log: Callable[[str], None]
+        self, sweeps: LabelledSweeps, scene: Scene, effort: methods.Effort, where: Where, log: Callable[[str], None]
     ) -> None:
         self.sweeps, self._effort, self._where, self._log = sweeps, effort, where, log
         self.seeds = range(1, scene.seeds + 1)
@@ -118,7 +118,7 @@ class Trials:
         self.clusters = np.stack([sweeps.group(name) for name in self.groups])
         found = corruptions.find(list(scene.stress))
         self.conditions = ["as recorded", *(f"{s.name} {scene.stress[s.name]:g} {s.unit}" for s in found)]
-        under = [s.apply(Trial(sweeps), scene.stress[s.name], 1) for s in found]
+        under = [s.apply(EvaluationSweeps(sweeps), scene.stress[s.name], 1) for s in found]
         many = len(self.conditions)
         self.asked = replace(
             sweeps, samples=np.concatenate([sweeps.samples, *under]), labels=np.tile(sweeps.labels, many),
@@ -141,7 +141,9 @@ class Trials:
         for change in dict.fromkeys(name[1] for name in left):
             changed = change.of(self.asked)
             tasks = {
-                name: Task(method, self._effort, name[2], *self._split(name[3])) for name in left if name[1] == change
+                name: FoldTask(method, self._effort, name[2], *self._split(name[3]))
+                for name in left
+                if name[1] == change
             }
             for name, fold in folds(tasks, changed, digest(changed), known.input, self._where):
                 self._done[name] = fold

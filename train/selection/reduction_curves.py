@@ -1,4 +1,4 @@
-"""The room of what a scene does not need. In: a Choice. Out: a curve for each thing that may be left out, and a Change.
+"""The room of what a scene does not need. In: a Selection. Out: a curve for each thing that may be left out, and a Change.
 
 Each curve trains the chosen method anew with less, on the same parts, and compares with the whole, sweep by sweep. What
 is kept is the least for which it, and all that is more, loses no more than one standard error.
@@ -17,7 +17,7 @@ from train.data import transforms
 from train.data.transforms import WHOLE, Change
 from train.selection.nested_cv import Trials
 from train.selection.scene import Scene
-from train.selection.select import Choice
+from train.selection.select import Selection
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -36,7 +36,7 @@ SET_IT = {
 }
 
 
-def curves(choice: Choice, scene: Scene, log: Callable[[str], None]) -> tuple[list[Json], Change, Json]:
+def curves(choice: Selection, scene: Scene, log: Callable[[str], None]) -> tuple[list[Json], Change, Json]:
     """The curves of scene.reduce; what of scene.apply is left out together, and the accuracy with it."""
     told, least = [], {}
     for kind in scene.reduce:
@@ -52,7 +52,7 @@ def curves(choice: Choice, scene: Scene, log: Callable[[str], None]) -> tuple[li
     return told, applied, accuracy
 
 
-def _curve(choice: Choice, scene: Scene, kind: str) -> tuple[Json, Step]:
+def _curve(choice: Selection, scene: Scene, kind: str) -> tuple[Json, Step]:
     trials, method = choice.trials, choice.final.chosen
     full = choice.final.scores[method]
     whole: Step = ("all", 1.0, [WHOLE] * len(trials.parts), WHOLE)
@@ -139,7 +139,7 @@ STEPS: dict[str, Callable[[Trials], Iterator[Step]]] = {
 }  # fmt: skip
 
 
-def _together(choice: Choice, scene: Scene, least: dict[str, Step]) -> tuple[Change, Json]:
+def _together(choice: Selection, scene: Scene, least: dict[str, Step]) -> tuple[Change, Json]:
     """What is left out of all that may be, one after another as long as all together lose no more than may be lost."""
     trials, method = choice.trials, choice.final.chosen
     full = held = choice.final.scores[method]
@@ -157,7 +157,7 @@ def _together(choice: Choice, scene: Scene, least: dict[str, Step]) -> tuple[Cha
     return total, trials.accuracy(held) | {"behind": trials.difference(full, held).json()}
 
 
-def classes(choice: Choice, wanted: float) -> Json:
+def classes(choice: Selection, wanted: float) -> Json:
     """What is gained by counting materials as one, the most confused pair first; counted, not trained anew.
 
     Proposed are pairs that are CONFUSED, and as many as it takes to reach what is wanted. Nothing is applied: whether

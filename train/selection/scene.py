@@ -20,7 +20,7 @@ import numpy as np
 from appliance.bundle.bundle import LABEL
 from appliance.core.errors import FormatError
 from train.data import sets
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.evaluation import corruptions
 from train.models import methods
 
@@ -124,7 +124,7 @@ class Scene:
     budget: Budget = Budget()
     path: Path = Path()
 
-    def sweeps(self) -> SweepSet:
+    def sweeps(self) -> LabelledSweeps:
         """The sweeps at hand, narrowed and merged. Raises FormatError naming scene.toml and what does not fit the sets."""
         whole = sets.join([sets.load(self._place(spec), 1) for spec in self.sets]).select(self.only)
         known = whole.materials

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import ApplianceError, FormatError
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.evaluation.evaluate import Where
 from train.models import methods
 from train.selection import prices as rungs
@@ -36,7 +36,7 @@ class NothingFits(ApplianceError):
 
 
 @dataclass
-class Climb:
+class SizeSearch:
     """One choice as it is made, rung by rung in the order of cost. aside: the part that it must not see, or None.
 
     scores: of the rungs so far, as Trials.scores. vain: by family, its newest rung and how many in a row changed nothing.
@@ -95,15 +95,15 @@ def _kin(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Selection:
     """What was chosen. why_not: reasons by rung that was not tried. final: the choice with all data; inner: without each
     part in turn. prices: of all rungs, cheapest first."""
 
     trials: Trials
     prices: dict[str, Price]
     why_not: dict[str, str]
-    final: Climb
-    inner: list[Climb]
+    final: SizeSearch
+    inner: list[SizeSearch]
 
     @property
     def honest(self) -> Array:
@@ -174,7 +174,7 @@ class Choice:
         ]
 
 
-def choose(sweeps: SweepSet, scene: Scene, effort: methods.Effort, where: Where, log: Log) -> Choice:
+def choose(sweeps: LabelledSweeps, scene: Scene, effort: methods.Effort, where: Where, log: Log) -> Selection:
     """Climb the ladder. Raises NothingFits where no rung can be taken, and FormatError where the scene cannot be judged."""
     trials = Trials(sweeps, scene, effort, where, log)
     alone = [p for p in range(len(trials.parts)) if not trials.seen_from(p)]
@@ -184,7 +184,7 @@ def choose(sweeps: SweepSet, scene: Scene, effort: methods.Effort, where: Where,
                           "to judge the choice by")  # fmt: skip
     prices = rungs.prices(rungs.ladder(scene), sweeps, scene, effort, where, log)
     why_not = {name: price.refused or _over(price, scene) for name, price in prices.items()}
-    final, inner = Climb(trials, None), [Climb(trials, p) for p in range(len(trials.parts))]
+    final, inner = SizeSearch(trials, None), [SizeSearch(trials, p) for p in range(len(trials.parts))]
     for name in prices:
         if why_not[name]:
             continue
@@ -201,7 +201,7 @@ def choose(sweeps: SweepSet, scene: Scene, effort: methods.Effort, where: Where,
         raise NothingFits(_nearest(prices, why_not, scene))
     for p, climb in enumerate(inner):
         trials.run(climb.chosen, [(p,)])
-    return Choice(trials, prices, {k: v for k, v in why_not.items() if v}, final, inner)
+    return Selection(trials, prices, {k: v for k, v in why_not.items() if v}, final, inner)
 
 
 def _over(price: Price, scene: Scene) -> str:

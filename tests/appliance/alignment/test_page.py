@@ -26,10 +26,10 @@ from appliance.bundle import bundle
 from appliance.bundle.bundle import Manifest
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ConfigError
-from appliance.signal.contact import Place
+from appliance.signal.contact import ContactPositions
 
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-PLACE = Place(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
+PLACE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 LOADS = tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4))
 VIEW = View(
     7, "usb", "tubes 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1", "move the skin", (4, 4),
@@ -342,7 +342,7 @@ def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypa
     context, held = browser.new_context(), threading.Event()
     seen = Seen(context, page.address)
     seen.state("off")
-    monkeypatch.setattr(web.Handler, "do_GET", lambda self: held.wait(3 * WAIT_S))
+    monkeypatch.setattr(web.PageHandler, "do_GET", lambda self: held.wait(3 * WAIT_S))
     try:
         seen.state("no-connection")
     finally:

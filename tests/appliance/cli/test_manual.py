@@ -256,9 +256,9 @@ def test_samples_are_what_the_box_prints():
     told += status.lines(file, now_ns)
     detail = "start 1 of 3, 7 of 20 sweeps, 41 of 600 s, as of its last start or end"
     told += bundle_list.lines([
-        bundle_list.Entry("9" * 64, "9f3c2a1b", "mine", "2", 2, "anna", "on trial", detail),
-        bundle_list.Entry("5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""),
-        bundle_list.Entry("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
+        bundle_list.ListedBundle("9" * 64, "9f3c2a1b", "mine", "2", 2, "anna", "on trial", detail),
+        bundle_list.ListedBundle("5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""),
+        bundle_list.ListedBundle("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
     ])  # fmt: skip
     assert [line for line in told if line not in BLOCKS] == []
 

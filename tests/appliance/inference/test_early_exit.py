@@ -21,7 +21,7 @@ from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider, decides
 from appliance.io.robot_link import StdoutPort
 from appliance.recording.capture import CaptureWriter, Playback
-from appliance.recording.sweep_window import Recorder
+from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Box
 from appliance.sim import devices, gpio, rig, script
 from appliance.tools import demo
@@ -97,7 +97,7 @@ def acts(*slides: np.ndarray, label: str = "left", new_object: tuple[int, ...] =
     ]
 
 
-def world_of(*slides: np.ndarray, stops: bool = True, packet_frames: int = 3, clock=None, **more) -> devices.SimWorld:
+def world_of(*slides: np.ndarray, stops: bool = True, packet_frames: int = 3, clock=None, **more) -> devices.SimDevices:
     """A world in which these are slid."""
     world = devices.build(FMT, acts(*slides, **more), clock or rig.VirtualClock(), "sim", stops=stops)
     world.backend.board = rig.Board(FMT, world.robot, world.clock, packet_frames=packet_frames)
@@ -115,7 +115,7 @@ def told(verdicts: list[Verdict]) -> list[tuple[str, str, float]]:
     return [(str(v.status), v.label, v.share) for v in verdicts]
 
 
-def levels(world: devices.SimWorld, *names: str) -> list[tuple[str, bool]]:
+def levels(world: devices.SimDevices, *names: str) -> list[tuple[str, bool]]:
     """How these lines moved."""
     return [(name, level) for _, name, level in world.gpio.written if name in names]
 
@@ -248,8 +248,8 @@ def test_one_run_of_the_graph_at_each_step(rigged: Callable[..., Rigged], monkey
     """
     asked: list[int] = []
     looked: list[int] = []
-    heads, look = Classifier.early, Recorder._seq_at
-    monkeypatch.setattr(Recorder, "_seq_at", lambda self, t_ns: looked.append(box.box.answered) or look(self, t_ns))
+    heads, look = Classifier.early, SweepCutter._seq_at
+    monkeypatch.setattr(SweepCutter, "_seq_at", lambda self, t_ns: looked.append(box.box.answered) or look(self, t_ns))
     monkeypatch.setattr(Classifier, "early", lambda self, x: asked.append(box.box.answered) or heads(self, x))
     box = rigged(world_of(slid(10), slid(-10, 60)), SETS, toy())
     all_of(box)
@@ -429,7 +429,7 @@ def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_pat
     classifier = Classifier(toy((0.97, 0.95, 0.93, 0.7)), play)
     again, kept = [], []
     replayed = Box(
-        play, play, Recorder(FMT, SweepConfig(lead_ms=100)), classifier, play, early=Decider(classifier),
+        play, play, SweepCutter(FMT, SweepConfig(lead_ms=100)), classifier, play, early=Decider(classifier),
         port=StdoutPort("replay", play.commands), keepers=[lambda sweep, verdict: kept.append(sweep)],
     )  # fmt: skip
     while not play.finished:

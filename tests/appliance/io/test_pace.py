@@ -17,9 +17,9 @@ from appliance.core.types import EPOCH_BITS, Frames, Status, SweepFormat
 from appliance.io import packets as wire
 from appliance.io.trigger import Edge, EdgeKind
 from appliance.io.usb_sensor import UsbSensor
-from appliance.recording.sweep_window import Recorder
+from appliance.recording.sweep_window import SweepCutter
 from appliance.sim import skin
-from appliance.sim.devices import SimWorld
+from appliance.sim.devices import SimDevices
 from tests.factories.simulated_box import SECOND, idle_world
 
 FMT = skin.FORMAT
@@ -27,12 +27,12 @@ COUNTS = 1 << 32
 Alter = Callable[[wire.Packet, wire.Packet], tuple[int, int]]
 
 
-def sensor_on(world: SimWorld, **settings) -> UsbSensor:
+def sensor_on(world: SimDevices, **settings) -> UsbSensor:
     """The real driver on this world's bus."""
     return UsbSensor(SensorConfig(**settings), FMT, world.clock, world.backend)
 
 
-def read_for(sensor: UsbSensor, world: SimWorld, seconds: float) -> tuple[Frames, set[str]]:
+def read_for(sensor: UsbSensor, world: SimDevices, seconds: float) -> tuple[Frames, set[str]]:
     """All frames of some seconds of the world, and the states that were seen."""
     end_ns = world.clock.now_ns() + round(seconds * SECOND)
     parts, states = [], set()
@@ -42,13 +42,13 @@ def read_for(sensor: UsbSensor, world: SimWorld, seconds: float) -> tuple[Frames
     return Frames.joined(parts), states
 
 
-def late_ms(frames: Frames, world: SimWorld) -> np.ndarray:
+def late_ms(frames: Frames, world: SimDevices) -> np.ndarray:
     """By how many ms each frame's stamp [n] is later than the moment at which the board took it."""
     taken_ns = [world.backend.board.frame_ns(int(seq) & ((1 << EPOCH_BITS) - 1)) for seq in frames.seq]
     return (frames.t_ns - np.array(taken_ns)) / 1e6
 
 
-def alter(world: SimWorld, how: Alter, packets: int) -> None:
+def alter(world: SimDevices, how: Alter, packets: int) -> None:
     """The next packets get another number and another time, as `how` says of (a packet, the first one)."""
     first: list[wire.Packet] = []
 
@@ -174,7 +174,7 @@ def test_windows_over_many_offsets(ppm: float):
     late = (150_000 + int(rng.integers(50, 200)) * 1_000_000 * (rng.random() < 0.01) for _ in iter(int, 1))
     world = idle_world(ppm=ppm, latency=lambda: next(late), fifo_frames=3000, packet_frames=6)
     sensor, board = sensor_on(world), world.backend.board
-    recorders = [Recorder(FMT, SweepConfig()) for _ in range(10)]
+    recorders = [SweepCutter(FMT, SweepConfig()) for _ in range(10)]
     begun = world.clock.now_ns()
     edges = [
         [round(begun + (5 + 2.4 * k + rng.uniform(0, 0.3)) * SECOND) for k in range(13)] for _ in recorders

@@ -127,7 +127,7 @@ def test_garbage_never_raises_and_is_counted(data: bytes):
 def test_follow_accounts_for_every_frame(order: list[int], first: int):
     """In whatever order packets come: numbers rise, and fresh + lost frames span exactly what was seen."""
     packets = [wire.Packet((first + 3 * k) % 2**32, 0, wire.Flag(0), np.zeros((3, 1, 1), np.uint8)) for k in order]
-    fresh, place, lost, stale = wire.follow(packets, wire.Place(0))
+    fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     starts = [s for s, _ in fresh]
     assert starts == sorted(set(starts))
     assert 3 * len(fresh) + stale == 3 * len(packets)
@@ -139,7 +139,7 @@ def test_follow_accounts_for_every_frame(order: list[int], first: int):
 def test_follow_wraps():
     """The 32-bit count wraps without loss."""
     packets = wire.unpack(b"".join(stream(3, first=2**32 - 4))).packets
-    fresh, _, lost, stale = wire.follow(packets, wire.Place(2))
+    fresh, _, lost, stale = wire.follow(packets, wire.StreamPosition(2))
     assert [s - (2 << EPOCH_BITS) for s, _ in fresh] == [2**32 - 4, 2**32 - 1, 2**32 + 2]
     assert (lost, stale) == (0, 0)
 
@@ -147,7 +147,7 @@ def test_follow_wraps():
 def test_follow_takes_a_count_far_back_as_restart():
     """A board that begins again at 0 starts a new epoch: nothing is lost, and nothing looks adjacent."""
     packets = wire.unpack(stream(1, first=900_000)[0] + stream(1, first=0)[0]).packets
-    fresh, place, lost, stale = wire.follow(packets, wire.Place(0))
+    fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     assert [s for s, _ in fresh] == [900_000, 1 << EPOCH_BITS]
     assert (place.epoch, lost, stale) == (1, 0, 0)
 

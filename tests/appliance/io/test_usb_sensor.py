@@ -12,19 +12,19 @@ from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
 from appliance.io import packets
 from appliance.io.usb_sensor import UsbSensor
 from appliance.sim import rig, skin
-from appliance.sim.devices import SimWorld
+from appliance.sim.devices import SimDevices
 from tests.factories.simulated_box import SECOND, idle_world, numbered
 
 FMT = skin.FORMAT
 
 
-def sensor_on(world: SimWorld, fmt: SweepFormat = FMT, **settings) -> UsbSensor:
+def sensor_on(world: SimDevices, fmt: SweepFormat = FMT, **settings) -> UsbSensor:
     """The real driver on this world's bus."""
     link = "acm" if world.backend.acm else "vendor"
     return UsbSensor(SensorConfig(link=link, **settings), fmt, world.clock, world.backend)
 
 
-def read_for(sensor: UsbSensor, world: SimWorld, seconds: float) -> Frames:
+def read_for(sensor: UsbSensor, world: SimDevices, seconds: float) -> Frames:
     """All frames of some seconds of the world."""
     end_ns = world.clock.now_ns() + round(seconds * SECOND)
     parts = []

@@ -18,7 +18,7 @@ from appliance.inference.classifier import Classifier
 from appliance.io import packets
 from appliance.io.robot_link import StdoutPort
 from appliance.recording.capture import CaptureWriter, Playback
-from appliance.recording.sweep_window import Recorder
+from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Box
 from appliance.sim import devices, rig, script, skin
 from tests.factories.simulated_box import SECOND, Rigged
@@ -30,7 +30,7 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     sweeps: list[Sweep] = []
     verdicts: list[Verdict] = []
     port = StdoutPort("replay", play.commands)
-    recorder, classifier = Recorder(play.format, SweepConfig()), Classifier(model, play)
+    recorder, classifier = SweepCutter(play.format, SweepConfig()), Classifier(model, play)
     box = Box(play, play, recorder, classifier, play, port=port, keepers=[lambda sweep, verdict: sweeps.append(sweep)])
     while not play.finished:
         verdicts += box.step()

@@ -17,7 +17,7 @@ import pytest
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.types import Frames, Status, Sweep, Verdict, load, sidecar
 from appliance.recording import recording
-from appliance.recording.recording import Labels, Recording, SweepFolder, told
+from appliance.recording.recording import Labels, RecordingSession, SweepFolder, told
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import Rigged
@@ -30,7 +30,7 @@ class Desk:
 
     def __init__(self, folder: Path, labels: Labels = WOOD) -> None:
         self.t_ns, self.said, self.logged = 0, [], []
-        self.recording = Recording(
+        self.recording = RecordingSession(
             folder, toy_bundle.FORMAT, labels, self, circumstances=lambda: {"bundle": "b"}, say=self.hear,
             log=self.logged.append,
         )  # fmt: skip
@@ -79,9 +79,9 @@ def pairs(*numbers: int) -> list[str]:
 def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Callable[..., Rigged]:
     """Builds boxes that record to `tmp_path`."""
 
-    def make(world: devices.SimWorld, labels: Labels = NONE) -> Rigged:
+    def make(world: devices.SimDevices, labels: Labels = NONE) -> Rigged:
         box: Rigged
-        recording = Recording(
+        recording = RecordingSession(
             tmp_path, skin.FORMAT, labels, world.clock, circumstances=lambda: box.box.circumstances(),
             say=lambda line: box.port.say(line), log=print,
         )  # fmt: skip

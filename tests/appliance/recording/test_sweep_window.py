@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from appliance.core.config import SweepConfig
 from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat
 from appliance.io.trigger import Edge, EdgeKind
-from appliance.recording.sweep_window import MAX_GAP, Recorder
+from appliance.recording.sweep_window import MAX_GAP, SweepCutter
 from appliance.sim import skin
 from tests.factories.simulated_box import SECOND, numbered
 
@@ -32,7 +32,7 @@ class Bench:
     """A recorder with its own time."""
 
     def __init__(self, fmt: SweepFormat = FMT, **settings) -> None:
-        self.recorder = Recorder(fmt, SweepConfig(**settings))
+        self.recorder = SweepCutter(fmt, SweepConfig(**settings))
         self.now = 10 * SECOND
 
     def put(self, some: Frames) -> None:

@@ -41,12 +41,12 @@ def slide(label: str = "wood", seed: int = 3) -> np.ndarray:
     return skin.sweep(label, place, np.random.default_rng(seed), rest_s=0, slide_s=3, after_s=0)
 
 
-def world_of(acts: list[rig.Act] | Iterator[rig.Act]) -> devices.SimWorld:
+def world_of(acts: list[rig.Act] | Iterator[rig.Act]) -> devices.SimDevices:
     """A world that plays `acts`."""
     return devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
 
 
-def quiet() -> devices.SimWorld:
+def quiet() -> devices.SimDevices:
     """A world in which the skin is idle for a minute; a test drives the lines itself."""
     off = np.zeros((60 * RATE, 4, 4), np.uint8)
     return world_of([rig.Act(off, 10**7, 10**7 + 1, "")])

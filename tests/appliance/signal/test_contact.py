@@ -33,17 +33,17 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Status, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.io.robot_link import MAX_LINE, result
-from appliance.signal.contact import Place, advice, centre, mended, moved
+from appliance.signal.contact import ContactPositions, advice, centre, mended, moved
 from appliance.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import SECOND, idle_world
 from train.data import sets
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.export import contact_positions
 from train.reports import contact_report
 
 TARE = np.zeros((4, 4))
-MIDDLE = Place(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
+MIDDLE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 NAN, INF = float("nan"), float("inf")
 
 
@@ -164,7 +164,7 @@ def test_the_advice_names_direction_and_distance(offset: tuple[float, float], sa
 
 def test_the_nearest_position_counts():
     """Distance is to the nearest position, not to their middle; the limit itself is within."""
-    two = Place(2.0, (0.0, 6.0), (0.0, 0.0), 0.5)
+    two = ContactPositions(2.0, (0.0, 6.0), (0.0, 0.0), 0.5)
     assert two.offset((3.1, 0.0)) == pytest.approx((0.2, 0.0))
     assert two.within((0.3, -0.4))
     assert not two.within((0.3, -0.41))
@@ -186,7 +186,7 @@ def model(default_bundle: Bundle) -> Bundle:
     return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE, schema=3))
 
 
-def placing(world: devices.SimWorld, model: Bundle) -> tuple[Placing, Callable[[float], list[View]]]:
+def placing(world: devices.SimDevices, model: Bundle) -> tuple[Placing, Callable[[float], list[View]]]:
     """A Placing on `world`, and what gives its Views of so many seconds."""
     how = world.wire(config.load(None, [], site=NO_SITE))
     one = Placing(how.sensor, model, world)
@@ -203,7 +203,7 @@ def placing(world: devices.SimWorld, model: Bundle) -> tuple[Placing, Callable[[
     return one, views
 
 
-def resting(seed: int = 1) -> devices.SimWorld:
+def resting(seed: int = 1) -> devices.SimDevices:
     """The simulated finger that rests on the tube while the skin is placed."""
     return devices.build(skin.FORMAT, script.named("rest", skin.FORMAT, seed)[0], rig.VirtualClock(), "sim")
 
@@ -230,7 +230,7 @@ def test_somebody_places_the_skin(model: Bundle):
     assert [v.turn for v in seen] == list(range(1, len(seen) + 1))
 
 
-def pressed(*loads: float) -> devices.SimWorld:
+def pressed(*loads: float) -> devices.SimDevices:
     """A skin with these loads on all taxels but the last, a second each."""
     on = np.concatenate([np.full((750, 4, 4), load, np.uint8) for load in loads])
     on[:, 3, 3] = 3
@@ -420,12 +420,12 @@ def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal
     assert text.count("reading the unloaded skin") >= 1
 
 
-def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> SweepSet:
+def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> LabelledSweeps:
     """A set with `each` sweeps at each of these places, in taxels."""
     samples = np.stack([np.stack([patch(*at)] * 3) for at in places for _ in range(each)]).astype(np.float32)
     n = len(samples)
     numbers = {group: 7 + 2 * (np.arange(n) // each)}
-    return SweepSet(samples, np.arange(n) % 2, ("a", "b"), 100.0, numbers, "recorded")
+    return LabelledSweeps(samples, np.arange(n) % 2, ("a", "b"), 100.0, numbers, "recorded")
 
 
 def test_the_places_of_a_training_set():
@@ -470,7 +470,7 @@ def test_sets_that_tell_no_place():
 def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     """A skin in its place is not flagged, one that sits a row ahead always is; figures, picture and lines agree."""
     monkeypatch.setattr(contact_positions, "OFF_MM", (5.0,))
-    wide = replace(model, manifest=replace(model.manifest, place=Place(4.0, (5.5,), (6.0,), 1.2)))
+    wide = replace(model, manifest=replace(model.manifest, place=ContactPositions(4.0, (5.5,), (6.0,), 1.2)))
     told = contact_positions.measure(
         Classifier(wide, SystemClock()), "sim:T-LAB:3:2", "sim:T-LAB:1:1", "sim:T-HARD:1:1", lambda line: None
     )

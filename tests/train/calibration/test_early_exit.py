@@ -146,7 +146,7 @@ def made():
     trunks = trunk(FORM, True)
     x, size = run(trunks, digits), 1
     done = posthoc.finish(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
-    done = replace(done, rule=early_exit.Rule(Early((0.9,) * 9, 2)))
+    done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
     model = done.graph(trunks)
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: done.means()}
     manifest = Manifest("toy", "1", FORM, "raw", ("a", "b", "c"), Thresholds(1.0, 32767.0),
@@ -171,7 +171,10 @@ def test_the_graph_gives_what_training_computed(made):
 def test_a_graph_without_tenths_has_no_early_heads(made):
     """From a trunk of the whole window: logits and embedding alone; without a rule none either."""
     done, x, digits, _, _ = made
-    for model in (done.graph(trunk(FORM)), replace(done, rule=early_exit.Rule(None, "why")).graph(trunk(FORM, True))):
+    for model in (
+        done.graph(trunk(FORM)),
+        replace(done, rule=early_exit.EarlyRule(None, "why")).graph(trunk(FORM, True)),
+    ):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
         assert np.allclose(
             classifier.softmax(run(model, digits[:2])), classifier.softmax(done.logits(x[:2, -1])), atol=1e-3

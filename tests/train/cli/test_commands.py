@@ -21,10 +21,10 @@ from train.metrics import score
 from train.models import heads
 from train.models.compact import architectures, fit, spectrum
 from train.models.compact.architectures import LADDER, USUAL
-from train.models.compact.fit import Fit, Recipe
+from train.models.compact.fit import Fit, FitRecipe
 from train.models.compact.network import Compact
 
-QUICK = Recipe(steps=40)
+QUICK = FitRecipe(steps=40)
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     """Weights that are not of the shape that the file names, and a file from before there were shapes."""
     replace(fitted, shape=LADDER["1k"]).save(tmp_path / "fit.npz")
     with pytest.raises(
-        FormatError, match=r"^fit.npz: its weights are not those of its Shape\(channels=\(2, 6, 8\).*; fit again$"
+        FormatError, match=r"^fit.npz: its weights are not those of its Architecture\(channels=\(2, 6, 8\).*; fit again$"
     ):
         Fit.load(tmp_path / "fit.npz")
     with np.load(tmp_path / "fit.npz") as z:
@@ -232,7 +232,7 @@ def test_fabrics_are_told_apart(tmp_path: Path):
     whole = sets.load(str(path)).select(["direction=0", "force<=180"])
     assert len(whole.materials) == 7
     seen, unseen = whole.split("recording", 0.7, 1)
-    made = fit.fit(seen, 1, Recipe(steps=300))
+    made = fit.fit(seen, 1, FitRecipe(steps=300))
     with torch.no_grad():
         given = made.network()(torch.from_numpy(unseen.samples.astype(np.float32))).argmax(1).numpy()
     assert np.mean(given == unseen.labels) > 0.9

@@ -23,7 +23,7 @@ from appliance.core.types import Status, load
 from tests.factories.recordings import record
 from train.cli.main import parser
 from train.data import pull
-from train.data.pull import Box, Tally
+from train.data.pull import PullReport, RecordingHost
 
 SSH = """#!/bin/sh
 for command; do :; done
@@ -58,10 +58,10 @@ class Ground:
         args = parser().parse_args(["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more])
         args.run(args)
 
-    def fetch(self) -> Tally:
+    def fetch(self) -> PullReport:
         """The same as a call."""
-        tally = Tally()
-        pull.pull(Box("user@box", str(self.box)), self.here, tally, lambda line: None)
+        tally = PullReport()
+        pull.pull(RecordingHost("user@box", str(self.box)), self.here, tally, lambda line: None)
         return tally
 
     def same(self) -> bool:
@@ -132,14 +132,14 @@ def test_a_connection_that_breaks_off_leaves_whole_pairs(ground: Ground):
 
 def test_an_interrupted_call_goes_on(ground: Ground):
     """Control-C after two recordings: these stay, the next call fetches two."""
-    tally = Tally()
+    tally = PullReport()
 
     def stop(line: str) -> None:
         if line == "2 of 4":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        pull.pull(Box("user@box", str(ground.box)), ground.here, tally, stop)
+        pull.pull(RecordingHost("user@box", str(ground.box)), ground.here, tally, stop)
     assert len(tally.fetched) == 2
     assert len(files(ground.here)) == 4
     again = ground.fetch()
@@ -316,7 +316,7 @@ def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.Ca
     """Not there, and sudo wants a password: both in one message, after the box's own words."""
     ground.program("sudo", "#!/bin/sh\necho 'sudo: a password is required' >&2\nexit 1\n")
     with pytest.raises(ApplianceError, match=r"^user@box: /nowhere cannot be read; name another with --from, let .*"):
-        pull.pull(Box("user@box", "/nowhere"), ground.here, Tally(), lambda line: None)
+        pull.pull(RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None)
     assert capsys.readouterr().err == "user@box: sudo: a password is required\n"
 
 
@@ -382,8 +382,8 @@ def test_through_a_real_sshd(tmp_path: Path, sshd: list[str]):
     """Keys, a login shell, the real tools: all comes, twice; and a wrong key is no connection."""
     for i in range(3):
         record(tmp_path / "box" / "a session" / f"sweep-{i:06d}.npy", "ab"[i % 2], id=i)
-    box = Box(f"{getpass.getuser()}@palpate", str(tmp_path / "box"), sshd)
-    tally = Tally()
+    box = RecordingHost(f"{getpass.getuser()}@palpate", str(tmp_path / "box"), sshd)
+    tally = PullReport()
     pull.pull(box, tmp_path / "here", tally, lambda line: None)
     pull.pull(box, tmp_path / "here", tally, lambda line: None)
     assert (len(tally.fetched), len(tally.there)) == (3, 3)

@@ -18,10 +18,10 @@ from appliance.core.errors import FormatError
 from appliance.core.statistics import wilson
 from appliance.core.types import Status, SweepFormat
 from appliance.sim import skin
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.evaluation import corruptions, robustness
 from train.evaluation.evaluate import Where
-from train.evaluation.robustness_data import Trial
+from train.evaluation.robustness_data import EvaluationSweeps
 from train.models import methods
 from train.models.methods import Method, given
 
@@ -29,18 +29,18 @@ BY_NAME = {s.name: s for s in corruptions.STRESSES}
 DIGITAL = [s.name for s in corruptions.STRESSES if s.only != "simulated"]
 
 
-def small(kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0) -> SweepSet:
+def small(kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0) -> LabelledSweeps:
     """Sweeps of two materials: the second is stronger and rougher."""
     labels = np.arange(shape[0]) % 2
     rough = np.random.default_rng(7).standard_normal(shape) * (3 + 3 * labels)[:, None, None, None]
     samples = (rough + (60 + 10 * labels)[:, None, None, None]).astype(kind)
-    return SweepSet(samples, labels, ("smooth", "rough"), rate_hz, {}, "small")
+    return LabelledSweeps(samples, labels, ("smooth", "rough"), rate_hz, {}, "small")
 
 
 @cache
-def scene() -> Trial:
+def scene() -> EvaluationSweeps:
     """A small simulated one: two worlds, one place each, two sweeps of each material there."""
-    return Trial.simulated("sim:T-LAB:1001-1002:2")
+    return EvaluationSweeps.simulated("sim:T-LAB:1001-1002:2")
 
 
 @dataclass
@@ -63,7 +63,7 @@ def _figures(given: np.ndarray) -> np.ndarray:
     return np.stack([x.mean(axis=(1, 2, 3)), x.std(axis=1).mean(axis=(1, 2))], axis=1)
 
 
-def learn(sweeps: SweepSet, given: np.ndarray, seed: int) -> NearestMean:
+def learn(sweeps: LabelledSweeps, given: np.ndarray, seed: int) -> NearestMean:
     """Train the fake; refuses sweeps that are too short, as real methods do."""
     if given.shape[1] < 20:
         raise FormatError(f"a window of {given.shape[1]} frames is too short; use at least 20")
@@ -78,9 +78,9 @@ FAKE = Method("fake", "two figures, nearest mean", "raw", learn)
     "sweeps", [small(), small("float32", (4, 128, 16, 1), 35.6), small("uint8", (2, 40, 1, 1), 10)]
 )
 @pytest.mark.parametrize("name", DIGITAL)
-def test_digits_stay_digits(name: str, sweeps: SweepSet):
+def test_digits_stay_digits(name: str, sweeps: LabelledSweeps):
     """For any grid, rate and type: none is bit for bit none, severe is another sweep of the same form, twice the same."""
-    entry, trial = BY_NAME[name], Trial(sweeps)
+    entry, trial = BY_NAME[name], EvaluationSweeps(sweeps)
     before = sweeps.samples.copy()
     assert entry.apply(trial, 0, 3) is sweeps.samples
     severe = entry.apply(trial, entry.severities[-1], 3)
@@ -100,14 +100,14 @@ def test_the_scene_is_drawn_anew(name: str):
     assert (severe.shape, severe.dtype) == (scene().sweeps.samples.shape, np.uint8)
     assert (severe != scene().sweeps.samples).any(axis=(1, 2, 3)).all()
     with pytest.raises(FormatError, match=f"stress '{name}' draws sweeps anew and small cannot; use sim:NAME"):
-        entry.apply(Trial(small()), entry.severities[-1], 0)
+        entry.apply(EvaluationSweeps(small()), entry.severities[-1], 0)
 
 
 @pytest.mark.parametrize("name", ["dead", "stuck", "gain-spread", "gain-down", "gain-up", "drift", "bits", "lost",
                                   "saturation", "hum", "noise", "noisy", "shift-grid", "turn-grid"])  # fmt: skip
 def test_a_stress_only_grows(name: str):
     """The more severe, the further from the sound sweep."""
-    trial = Trial(small("float32"))
+    trial = EvaluationSweeps(small("float32"))
     away = [np.abs(BY_NAME[name].apply(trial, s, 1) - trial.sweeps.samples).mean() for s in BY_NAME[name].severities]
     assert (np.diff(away) > 0).all() if name != "bits" else (np.diff(away) > -1e-3).all()
 
@@ -116,7 +116,7 @@ def test_a_stress_only_grows(name: str):
 def test_no_severity_beyond_the_scale(severity: float):
     """What the scale does not know is refused by name."""
     with pytest.raises(FormatError, match=r"of stress 'dead' is out of range; use 0 to 4"):
-        BY_NAME["dead"].apply(Trial(small()), severity, 0)
+        BY_NAME["dead"].apply(EvaluationSweeps(small()), severity, 0)
 
 
 def test_stresses_by_name():
@@ -127,7 +127,7 @@ def test_stresses_by_name():
     physical = {"shift-rows", "turn", "force-down", "force-up", "speed-down", "speed-up", "window"}
     instead = {"shift-grid", "turn-grid", "window-held", "stretch", "shorten"}
     assert {s.name for s in corruptions.usual(scene())} == set(BY_NAME) - instead
-    assert {s.name for s in corruptions.usual(Trial(small()))} == set(BY_NAME) - physical
+    assert {s.name for s in corruptions.usual(EvaluationSweeps(small()))} == set(BY_NAME) - physical
 
 
 def test_the_scene_is_what_the_simulator_draws():
@@ -155,7 +155,7 @@ def test_a_window_error_reaches_into_the_rest():
     moved = BY_NAME["window"].apply(scene(), 100, 0)
     is_late = (moved == late).all(axis=(1, 2, 3))
     assert 0 < is_late.sum() < len(sound)
-    held = BY_NAME["window-held"].apply(trial := Trial(small()), 100, 0)
+    held = BY_NAME["window-held"].apply(trial := EvaluationSweeps(small()), 100, 0)
     whole = trial.sweeps.samples
     for mine, was in zip(held, whole, strict=True):
         early = np.concatenate([was[:1]] * 10 + [was[:-10]])
@@ -187,7 +187,7 @@ def test_speed_is_the_fingers():
 
 def test_dead_stuck_and_noisy_taxels():
     """As many taxels as said, the others as they were; those dead at 1 are dead at 3 too."""
-    trial = Trial(small())
+    trial = EvaluationSweeps(small())
     for name in ("dead", "stuck", "noisy"):
         one, three = (BY_NAME[name].apply(trial, n, 5) != trial.sweeps.samples for n in (1, 3))
         one, three = one.any(axis=1), three.any(axis=1)
@@ -202,7 +202,7 @@ def test_dead_stuck_and_noisy_taxels():
 
 def test_lost_frames_lie_on_the_line():
     """About a fifth is lost, never more than two in a row, and each is on the line between those that came."""
-    trial = Trial(small("float32", (6, 400, 1, 2)))
+    trial = EvaluationSweeps(small("float32", (6, 400, 1, 2)))
     got, was = BY_NAME["lost"].apply(trial, 0.2, 0), trial.sweeps.samples
     lost = (got != was).all(axis=(2, 3))
     assert 0.15 < lost.mean() < 0.25
@@ -217,15 +217,15 @@ def test_lost_frames_lie_on_the_line():
 def test_stretching_moves_frequencies(name: str, share: float, hz: float):
     """A tone of 10 Hz becomes one of 5, 15 or 12 Hz, as strong as before."""
     tone = np.sin(2 * np.pi * 10 * np.arange(400) / 100).astype(np.float32).reshape(1, 400, 1, 1)
-    sweeps = SweepSet(np.repeat(tone, 2, axis=0), np.arange(2), ("a", "b"), 100.0)
-    got = BY_NAME[name].apply(Trial(sweeps), share, 0)[0, :, 0, 0]
+    sweeps = LabelledSweeps(np.repeat(tone, 2, axis=0), np.arange(2), ("a", "b"), 100.0)
+    got = BY_NAME[name].apply(EvaluationSweeps(sweeps), share, 0)[0, :, 0, 0]
     assert np.abs(np.fft.rfft(got)).argmax() / 4 == pytest.approx(hz, abs=0.26)
     assert got.std() == pytest.approx(tone.std(), rel=0.1)
 
 
 def test_gains_drift_steps_and_clipping():
     """The plain ones, each by its own law."""
-    trial = Trial(small("float32"))
+    trial = EvaluationSweeps(small("float32"))
     was = trial.sweeps.samples
 
     def apply(name: str, severity: float) -> np.ndarray:
@@ -247,7 +247,7 @@ def test_hum_and_noise_are_as_strong_as_said():
     """50 Hz on all taxels alike; white noise as a share of each taxel's own deviation."""
     sweeps = small("float32", (4, 600, 2, 2), 300.0)
     sweeps.samples[:, :, 0, 0] *= 4
-    trial = Trial(sweeps)
+    trial = EvaluationSweeps(sweeps)
     hum = BY_NAME["hum"].apply(trial, 2, 0) - sweeps.samples
     assert np.ptp(hum, axis=(2, 3)).max() < 1e-4
     assert (np.abs(np.fft.rfft(hum[:, :, 0, 0], axis=1)).argmax(axis=1) * 0.5 == 50).all()
@@ -260,20 +260,20 @@ def test_digits_are_digitized_again():
     """uint8 ends at 255 and int16 stays whole: more gain saturates, it does not wrap."""
     sweeps = small("uint8")
     sweeps.samples[:, :, 1, 1] = 200
-    up = BY_NAME["gain-up"].apply(Trial(sweeps), 0.5, 0)
+    up = BY_NAME["gain-up"].apply(EvaluationSweeps(sweeps), 0.5, 0)
     assert (up[:, :, 1, 1] == 255).all()
-    assert (BY_NAME["gain-down"].apply(Trial(small()), 0.5, 0) == np.rint(small().samples / 2)).all()
+    assert (BY_NAME["gain-down"].apply(EvaluationSweeps(small()), 0.5, 0) == np.rint(small().samples / 2)).all()
 
 
 def test_the_grid_is_read_elsewhere():
     """One row on: each row reads its neighbour, the last the one before it, but for gains that training never saw."""
-    trial = Trial(small("float32", (3, 50, 4, 2)))
+    trial = EvaluationSweeps(small("float32", (3, 50, 4, 2)))
     was = trial.sweeps.samples
     ratio = BY_NAME["shift-grid"].apply(trial, 1, 0) / was[:, :, [1, 2, 3, 2]]
     assert np.ptp(ratio, axis=1).max() < 1e-4
     assert np.abs(np.log(ratio)).max() <= 0.25 / 1.5 + 1e-4
     was[:] = 50 + np.arange(50)[:, None, None]
-    turned = BY_NAME["turn-grid"].apply(Trial(trial.sweeps), 30, 0)
+    turned = BY_NAME["turn-grid"].apply(EvaluationSweeps(trial.sweeps), 30, 0)
     assert np.ptp(turned / was, axis=1).max() < 1e-4, "a skin that feels the same everywhere may be turned"
     was[:] = np.array([[0, 1], [1, 2], [2, 3], [3, 4]]) * 10.0 + 10
     quarter = corruptions._regrid(was[:, :, 1:3], 0.0, 90.0, 0.0, np.random.default_rng(0))[0, 0]
@@ -283,17 +283,21 @@ def test_the_grid_is_read_elsewhere():
 def test_fewer_sweeps_as_many_of_each():
     """Of a file about `most` are taken, evenly over the materials; what is not more is taken whole."""
     sweeps = small("uint8", (40, 20, 1, 1))
-    assert len(Trial.of(sweeps).sweeps) == 40
-    assert np.bincount(Trial.of(sweeps, 10, 1).sweeps.labels).tolist() == [5, 5]
-    assert (Trial.of(sweeps, 10, 1).sweeps.samples == Trial.of(sweeps, 10, 1).sweeps.samples).all()
-    assert (Trial.of(sweeps, 10, 1).sweeps.samples != Trial.of(sweeps, 10, 2).sweeps.samples).any()
+    assert len(EvaluationSweeps.of(sweeps).sweeps) == 40
+    assert np.bincount(EvaluationSweeps.of(sweeps, 10, 1).sweeps.labels).tolist() == [5, 5]
+    assert (
+        EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples == EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples
+    ).all()
+    assert (
+        EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples != EvaluationSweeps.of(sweeps, 10, 2).sweeps.samples
+    ).any()
 
 
 @pytest.mark.parametrize("spec", ["sim:T-NONE", "sim:T-LAB:3-2"])
 def test_an_unknown_scene_is_refused(spec: str):
     """As sets.load refuses it."""
     with pytest.raises(FormatError, match="set 'sim:T"):
-        Trial.simulated(spec)
+        EvaluationSweeps.simulated(spec)
 
 
 def test_the_fall_is_between_two_severities():
@@ -350,7 +354,7 @@ def test_the_table_says_where_each_falls():
 
 def test_the_table_tells_what_becomes_of_sweeps_that_tell_nothing():
     """How many methods do what, and the box's status where it is known."""
-    result = robustness.merge([robustness.one(FAKE, small(), Trial(small()), corruptions.find(["hum"]), 0)])
+    result = robustness.merge([robustness.one(FAKE, small(), EvaluationSweeps(small()), corruptions.find(["hum"]), 0)])
     lines = robustness.table(
         result | {"box": dict.fromkeys(("constant", "saturated"), "x") | {"one-frame": "short", "silent": "no-contact"}}
     ).splitlines()
@@ -360,7 +364,7 @@ def test_the_table_tells_what_becomes_of_sweeps_that_tell_nothing():
 
 def test_one_task_travels_and_counts():
     """A task can be sent away and comes back as JSON; its numbers are those counted by hand."""
-    sweeps, trial = small(), Trial(small())
+    sweeps, trial = small(), EvaluationSweeps(small())
     sent = pickle.loads(pickle.dumps((FAKE, sweeps, trial, corruptions.STRESSES, 0)))
     done = robustness.one(*sent[:3], corruptions.find(["gain-up", "hum"]), 0)
     assert json.loads(json.dumps(done)) == done
@@ -372,7 +376,7 @@ def test_one_task_travels_and_counts():
 
 def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Each method and seed is a task of its own; what is done is not done again; unknown names are refused."""
-    sweeps, trial = small(), Trial(small())
+    sweeps, trial = small(), EvaluationSweeps(small())
     monkeypatch.setattr(methods, "find", lambda names, effort: [replace(FAKE, name=name) for name in names])
     monkeypatch.setattr(methods, "module_of", lambda name: "train.models.baselines")
     lines: list[str] = []
@@ -398,7 +402,7 @@ def test_all_usual_stresses_by_default():
             return np.zeros((len(x), 2), np.float32)
 
     method = Method("spy", "", "L", lambda *_: Spy())
-    trial = Trial(small())
+    trial = EvaluationSweeps(small())
     done = robustness.one(method, small(), trial, None, 6)
     assert list(done["curves"]) == [s.name for s in corruptions.usual(trial)]
     assert seen[0].shape == (12, 3)
@@ -411,9 +415,9 @@ def test_all_usual_stresses_by_default():
 def test_what_cannot_be_done_is_said():
     """A set of another kind is the caller's mistake; a method that refuses its set is a result."""
     with pytest.raises(FormatError, match=r"small .*3x3 uint8.* is not of the kind of small .*3x3 int16"):
-        robustness.one(FAKE, small(), Trial(small("uint8")), None, 0)
+        robustness.one(FAKE, small(), EvaluationSweeps(small("uint8")), None, 0)
     short = small(shape=(4, 10, 3, 3))
-    entry = robustness.merge([robustness.one(FAKE, short, Trial(short), None, 0)])["methods"]["fake"]
+    entry = robustness.merge([robustness.one(FAKE, short, EvaluationSweeps(short), None, 0)])["methods"]["fake"]
     assert entry["refused"] == "a window of 10 frames is too short; use at least 20"
     assert (entry["curves"], entry["clean"]) == ({}, None)
 
@@ -428,16 +432,16 @@ def test_an_answer_that_is_no_number_is_wrong():
             return logits
 
     model = Broken(learn(small(), small().samples, 0).means)
-    done = robustness.score(FAKE, model, Trial(small()), corruptions.find(["dead"]), 0)
+    done = robustness.score(FAKE, model, EvaluationSweeps(small()), corruptions.find(["dead"]), 0)
     assert done["curves"]["dead"]["right"][0] == 9
     assert done["curves"]["dead"]["broken"] == [3] * 5
-    assert robustness.trouble(FAKE, model, Trial(small()))["silent"] == "not finite"
+    assert robustness.trouble(FAKE, model, EvaluationSweeps(small()))["silent"] == "not finite"
 
 
 def test_trouble_has_a_name():
     """Sound methods stay finite or refuse; what is no digit never reaches them; a crash is told, and the worst wins."""
     model = learn(small(), small().samples, 0)
-    found = robustness.trouble(FAKE, model, Trial(small("float32")))
+    found = robustness.trouble(FAKE, model, EvaluationSweeps(small("float32")))
     assert [found[k] for k in ("silent", "constant", "saturated")] == ["finite"] * 3
     assert found["one-frame"].startswith("refused: 3x3 float32 at 100 Hz, window 1 instead of")
     for name in ("nan", "inf"):
@@ -447,7 +451,7 @@ def test_trouble_has_a_name():
         def logits(self, given: np.ndarray) -> np.ndarray:
             raise ZeroDivisionError("no contact")
 
-    crashed = robustness.trouble(FAKE, Crash(), Trial(small()))
+    crashed = robustness.trouble(FAKE, Crash(), EvaluationSweeps(small()))
     assert crashed["silent"] == "crashed: ZeroDivisionError: no contact"
     assert set(crashed) == {"silent", "constant", "one-frame", "saturated"}
     both = [

@@ -10,7 +10,7 @@ import pytest
 
 from appliance.core.errors import FormatError
 from train.calibration.posthoc import finish
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.evaluation import uncertainty, uncertainty_cases
 from train.evaluation.evaluate import Where
 from train.evaluation.uncertainty_cases import NOBODY, Case
@@ -162,7 +162,7 @@ def test_the_page_stands_alone(told):
     assert "nan" not in html.lower().replace("finance", "")
 
 
-def sweeps(materials: int = 3) -> SweepSet:
+def sweeps(materials: int = 3) -> LabelledSweeps:
     """Hums of different pitch, four positions, 128 x 16 x 1 float32 at 36 Hz."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(materials), 6), 4)
@@ -170,7 +170,7 @@ def sweeps(materials: int = 3) -> SweepSet:
     hum = np.stack([np.sin(2 * np.pi * (3 + 3 * k) * t + rng.uniform(0, 6)) * rng.uniform(0.8, 1.2) for k in labels])
     x = (hum[:, :, None] + rng.normal(0, 0.5, (len(labels), 128, 16, 1))).astype(np.float32)
     position = np.repeat(np.arange(4), 6 * materials)
-    return SweepSet(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
+    return LabelledSweeps(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
 
 
 def test_from_set_to_page_and_again_from_the_cache(tmp_path):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from appliance.inference.classifier import softmax
-from train.metrics.score import Tally, fused, interval
+from train.metrics.score import Score, fused, interval
 
 
 def test_a_tally_counts():
     """Right of how many, as plain numbers."""
-    assert Tally.of(np.array([True, False, True])).json() == {"right": 2, "total": 3}
+    assert Score.of(np.array([True, False, True])).json() == {"right": 2, "total": 3}
 
 
 def test_one_pool_has_the_papers_wilson_interval():

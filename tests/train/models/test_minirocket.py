@@ -14,7 +14,7 @@ from appliance.core.types import SweepFormat
 from appliance.inference.classifier import softmax
 from appliance.inference.session import session
 from tests.factories.sweep_sets import easy
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.models import linear_head, minirocket
 from train.onnx_tools import graph_builder
 
@@ -95,7 +95,7 @@ def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_array_equal(logits.argmax(1), want)
 
 
-def head(sweeps: SweepSet) -> linear_head.Headed:
+def head(sweeps: LabelledSweeps) -> linear_head.Headed:
     """A ridge on made-up features, which need no aeon."""
     graph = minirocket.transform(sweeps.format, parameters(sweeps.format.window, 4))
     return linear_head.headed(graph, minirocket._ridge, sweeps, sweeps.samples, 0)

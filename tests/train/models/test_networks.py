@@ -16,11 +16,11 @@ from appliance.core.types import SweepFormat
 from appliance.inference.classifier import softmax
 from appliance.sim import skin
 from tests.factories.sweep_sets import easy
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.evaluation import evaluate, fold
 from train.models import methods, networks, neural_methods, training
 from train.models.compact import fit, network
-from train.models.compact.fit import Recipe
+from train.models.compact.fit import FitRecipe
 from train.models.heads import closed_form_head
 from train.models.methods import Effort, Method
 from train.onnx_tools import graph_builder
@@ -36,15 +36,17 @@ def method(name: str, effort: Effort = BRIEF) -> Method:
     return methods.find([name], effort)[0]
 
 
-def made(shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0) -> SweepSet:
+def made(shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0) -> LabelledSweeps:
     """Sweeps [N, T, R, C] of noise, the class in its strength; two sweeps to a recording."""
     rng, labels = np.random.default_rng(seed), np.arange(shape[0]) // 2 % classes
     samples = 60 + (1 + 6 * labels)[:, None, None, None] * rng.standard_normal(shape)
     names = tuple(f"material {k}" for k in range(classes))
-    return SweepSet(samples.astype(dtype), labels, names, rate_hz, {"recording": np.arange(shape[0]) // 2}, "made")
+    return LabelledSweeps(
+        samples.astype(dtype), labels, names, rate_hz, {"recording": np.arange(shape[0]) // 2}, "made"
+    )
 
 
-def train(name: str, s: SweepSet, effort: Effort = BRIEF, seed: int = 1) -> neural_methods.Trained:
+def train(name: str, s: LabelledSweeps, effort: Effort = BRIEF, seed: int = 1) -> neural_methods.Trained:
     """Train the method on everything."""
     return method(name, effort).train(s, s.samples, seed)
 
@@ -113,7 +115,7 @@ def test_the_loop_is_adam_as_the_paper_prints_it():
 def test_adversarial_training_sees_the_worse_sweep():
     """The gradient is that of the sweep and of the one moved against it by the fast gradient sign, together."""
     s = made((6, 20, 2, 2), "float32", 2)
-    net = networks.ImageNetwork(s.format, 2, 0.1, 60.0, networks.Image((4, 4), ((2, 1), (2, 1)), 2, False, 8))
+    net = networks.ImageNetwork(s.format, 2, 0.1, 60.0, networks.ImageShape((4, 4), ((2, 1), (2, 1)), 2, False, 8))
     x, labels = net.prepare(torch.from_numpy(s.samples)), torch.from_numpy(s.labels)
     still = x.clone().requires_grad_()
     cost = nn.functional.cross_entropy(net.judge(still), labels)
@@ -123,7 +125,7 @@ def test_adversarial_training_sees_the_worse_sweep():
     worse.backward()
     want = [p.grad.clone() for p in net.parameters()]
     net.zero_grad()
-    told = training.descend(net, x, labels, Recipe(adversarial=0.1, smoothing=0.0))
+    told = training.descend(net, x, labels, FitRecipe(adversarial=0.1, smoothing=0.0))
     assert told == pytest.approx(cost.item())
     for p, gradient in zip(net.parameters(), want, strict=True):
         torch.testing.assert_close(p.grad, gradient)
@@ -249,7 +251,7 @@ def test_compact_is_what_palpate_train_fits():
     s = easy(12)
     line = replace(s, samples=s.samples.reshape(len(s), 64, 4, 1))
     for given in (s, line):
-        same, model = fit.fit(given, 1, Recipe(steps=6)), train("compact", given)
+        same, model = fit.fit(given, 1, FitRecipe(steps=6)), train("compact", given)
         with torch.no_grad():
             want = same.network()(torch.from_numpy(given.samples.astype(np.float32))).numpy()
         have = model.forms["float"].logits(given.samples)
@@ -315,7 +317,7 @@ def test_forms_are_kept_and_counted(tmp_path: Path):
     """Logits of the other precision come back from the file as they were, and evaluate tells them beside the others."""
     s = easy(12)
     order = np.arange(len(s))
-    made_ = fold.run(fold.Task("paper-cnn", BRIEF, 1, order[::2], order[1::2]), s, s.samples)
+    made_ = fold.run(fold.FoldTask("paper-cnn", BRIEF, 1, order[::2], order[1::2]), s, s.samples)
     made_.save(tmp_path / "fold.npz")
     again = fold.Fold.load(tmp_path / "fold.npz")
     assert set(again.forms) == {"int8"}

@@ -16,7 +16,7 @@ from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
 from train.export import export
 from train.models.compact import fit
-from train.models.compact.fit import Fit, Recipe
+from train.models.compact.fit import Fit, FitRecipe
 from train.onnx_tools import layers, parity
 from train.onnx_tools.layers import Layer
 from train.onnx_tools.quantize import quantize
@@ -25,7 +25,7 @@ from train.onnx_tools.quantize import quantize
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on a set that takes all int8 has."""
-    return fit.fit(close(), 1, Recipe(steps=60))
+    return fit.fit(close(), 1, FitRecipe(steps=60))
 
 
 def measured(fitted: Fit) -> parity.Parity:

@@ -21,7 +21,7 @@ from appliance.core.types import SweepFormat
 from appliance.inference.classifier import Classifier
 from appliance.sim import skin
 from tests.factories.chart_data import DOTS, FRONT, dot
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.evaluation.evaluate import Where
 from train.export import measure, measure_process
 from train.models import methods, minirocket
@@ -29,7 +29,7 @@ from train.models.compact import graph
 from train.models.compact.architectures import LADDER
 from train.models.methods import Method
 from train.onnx_tools import cost
-from train.onnx_tools.graph_builder import Graph, Graphed, run
+from train.onnx_tools.graph_builder import GraphBuilder, Graphed, run
 from train.onnx_tools.quantize import quantize
 from train.reports import chart_page, chart_report, pareto, scatter
 
@@ -38,17 +38,17 @@ KEYS = ("method", "precision", "weights", "macs", "file_kb", "rss_mb", "ms_p50",
 """What the issue asks of each dot, beside `accuracy`."""
 
 
-def sweeps(kind: str = "uint8", n: int = 24) -> SweepSet:
+def sweeps(kind: str = "uint8", n: int = 24) -> LabelledSweeps:
     """Sweeps of two materials at six positions, the second louder."""
     labels = np.arange(n) % 2
     noise = np.random.default_rng(5).standard_normal((n, 40, 2, 2)) * (2 + 18 * labels)[:, None, None, None]
     groups = {"position": np.arange(n) // 4, "recording": np.arange(n)}
-    return SweepSet((100 + noise).clip(0, 255).astype(kind), labels, ("soft", "loud"), 100.0, groups, "small")
+    return LabelledSweeps((100 + noise).clip(0, 255).astype(kind), labels, ("soft", "loud"), 100.0, groups, "small")
 
 
 def loudness(form: SweepFormat = FORM) -> onnx.ModelProto:
     """A graph that tells the two apart: a convolution that takes differences, its mean size, a threshold."""
-    g, taxels = Graph(), form.rows * form.cols
+    g, taxels = GraphBuilder(), form.rows * form.cols
     x = g("Cast", g("Reshape", "sweep", g.constant([1, form.window, taxels], "int64")), to=TensorProto.FLOAT)
     x = g("Transpose", x, perm=[0, 2, 1])
     taps = np.zeros((3, taxels, 2))
@@ -78,7 +78,7 @@ class Loud:
 def loud(calls: list[int]) -> Method:
     """A method that needs no training; `calls` counts how often it was asked to."""
 
-    def train(known: SweepSet, given: np.ndarray, seed: int) -> Loud:
+    def train(known: LabelledSweeps, given: np.ndarray, seed: int) -> Loud:
         calls.append(seed)
         return Loud(loudness(), {"int8": Graphed(quantize(loudness(), given))})
 
@@ -293,7 +293,7 @@ def test_touch_time_is_read_or_refused(tmp_path: Path):
 def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
     """A small chart end to end; real sweeps that nobody named are left out; kept, the accuracies are the same."""
     parts = {
-        "lopo": chart_report.Part(("sim:T-REAL:1001:1",), "leave:position", ("position<=2",)),
+        "lopo": chart_report.ChartPart(("sim:T-REAL:1001:1",), "leave:position", ("position<=2",)),
         "force": chart_report.FULL.parts["force"],
     }
     chart = chart_report.Chart(

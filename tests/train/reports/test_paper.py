@@ -14,7 +14,7 @@ import pytest
 from appliance.sim.skin import MATERIALS
 from train.evaluation.evaluate import Where
 from train.reports import html, paper_experiment, paper_page, paper_printed
-from train.reports.paper_experiment import Outcome, Part, Step
+from train.reports.paper_experiment import Outcome, PaperPart, Step
 
 SURE, VOID = 9.0, {"meta", "br", "!doctype", "path", "use"}
 FIGURES = [f"figure-{n}" for n in (4, 5, 6, 7, 9, 10, 11, 12, 13)] + ["methods"]
@@ -256,10 +256,10 @@ def test_run_writes_everything_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     """A tiny plan writes page, pictures and results; a second run takes the kept folds and gives the same figures."""
     real, one = "sim:T-REAL:100{w}:2", ("position<=1",)
     parts = {
-        "lopo": Part((real,), "leave:position", 2, one),
-        "hard": Part((real, "sim:T-HARD:100{w}:2"), "split:set=0->1", 1, one),
-        "lab": Part(("sim:T-LAB:100{w}:2",), "random:2", 2),
-        "random": Part((real,), "random:2", 2, one),
+        "lopo": PaperPart((real,), "leave:position", 2, one),
+        "hard": PaperPart((real, "sim:T-HARD:100{w}:2"), "split:set=0->1", 1, one),
+        "lab": PaperPart(("sim:T-LAB:100{w}:2",), "random:2", 2),
+        "random": PaperPart((real,), "random:2", 2, one),
     }
     monkeypatch.setattr(paper_experiment, "QUICK", parts)
     monkeypatch.setattr(paper_experiment, "QUICK_STEPS", (Step(("L-gauss", "H-svm"), tuple(parts), (1,), 0.1),))

@@ -1,4 +1,4 @@
-"""The room of the ladder. In: a number of weights. Out: a Shape, what a compact network of that size is made of.
+"""The room of the ladder. In: a number of weights. Out: a Architecture, what a compact network of that size is made of.
 
 One architecture in several sizes: dense strided convolutions over time with the taxels as input channels; the head sees
 the log of every stage's mean responses.
@@ -46,7 +46,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Shape:
+class Architecture:
     """A rung of the ladder. channels: of each stage; kernel and stride: of the first stage for long windows.
 
     planned: how many stages there were before some were cut off, 0 for no more than there are; all may be. spectrum:
@@ -60,7 +60,7 @@ class Shape:
     spectrum: bool = False
     fewest: int = 1
 
-    def cut(self, depth: int, spectrum: bool = False) -> Shape:
+    def cut(self, depth: int, spectrum: bool = False) -> Architecture:
         """The first `depth` stages, each as it was, and the spectrum or not."""
         planned = max(self.planned, len(self.channels))
         return replace(self, channels=self.channels[:depth], planned=planned, spectrum=spectrum)
@@ -108,13 +108,13 @@ class Shape:
 
 
 LADDER = {
-    "bands": Shape((), planned=3, spectrum=True, fewest=0),
-    "1k": Shape((2, 6, 8), 32, 8),
-    "4k": Shape((5, 12, 16), 32, 8),
-    "10k": Shape((8, 20, 36), 32, 8),
-    "20k": Shape((24, 24, 24)),
-    "50k": Shape((40, 48, 64)),
-    "100k": Shape((32, 72, 104)),
+    "bands": Architecture((), planned=3, spectrum=True, fewest=0),
+    "1k": Architecture((2, 6, 8), 32, 8),
+    "4k": Architecture((5, 12, 16), 32, 8),
+    "10k": Architecture((8, 20, 36), 32, 8),
+    "20k": Architecture((24, 24, 24)),
+    "50k": Architecture((40, 48, 64)),
+    "100k": Architecture((32, 72, 104)),
 }
 """By about how many weights they have at most, for 1500 x 4 x 4 digits and six materials; the last is as large as its
 bundle may be, the first has nothing but the spectrum and a head."""

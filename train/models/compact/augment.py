@@ -1,4 +1,4 @@
-"""The room of augmentation. In: prepared sweeps and a Scene, which says what varies. Out: the same sweeps as another
+"""The room of augmentation. In: prepared sweeps and a Augmentation, which says what varies. Out: the same sweeps as another
 scene would have given them: the skin put on anew, slid at another speed, read by a worse amplifier.
 
 Everything is drawn anew for every sweep, from one generator. A knob at 0 draws nothing and changes nothing.
@@ -23,7 +23,7 @@ PIECES = 1 << 16
 
 
 @dataclass(frozen=True)
-class Scene:
+class Augmentation:
     """What varies in a scene; 0 is off. Spreads are standard deviations; amplitudes are in deviations of all taxels
     together, which `Network.prepare` makes 1.
 
@@ -62,12 +62,12 @@ class Scene:
     """Share of the taxels that are cut off above, anywhere within two of their own deviations of their mean."""
 
 
-SLOW = Scene(gain=0.4, noise=0.1, silent=0.0, damped=0.0, colour=0.0)
+SLOW = Augmentation(gain=0.4, noise=0.1, silent=0.0, damped=0.0, colour=0.0)
 """For sensors that are too slow for vibrations: what fingers and tape do to those does not concern them, and what lies
 below says more of force and friction."""
 
 
-def vary(x: Tensor, rows: int, scene: Scene, rng: Generator) -> Tensor:
+def vary(x: Tensor, rows: int, scene: Augmentation, rng: Generator) -> Tensor:
     """Sweeps float32 [B, R * C, T] as `scene` may give them, R being `rows`; the same of the same `rng`.
 
     x: what `Network.prepare` gives, about 1 and, where something is drawn that shows it, around 0. It is left as it is.
@@ -78,7 +78,7 @@ def vary(x: Tensor, rows: int, scene: Scene, rng: Generator) -> Tensor:
     return x
 
 
-def _put_on(x: Tensor, rows: int, scene: Scene, rng: Generator) -> Tensor:
+def _put_on(x: Tensor, rows: int, scene: Augmentation, rng: Generator) -> Tensor:
     """The skin is put on anew: it sits elsewhere, its gains are others, a taxel fails."""
     n, taxels, _ = x.shape
     if scene.shift and 1 < rows < taxels:
@@ -98,7 +98,7 @@ def _put_on(x: Tensor, rows: int, scene: Scene, rng: Generator) -> Tensor:
     return x * gain
 
 
-def _slid(x: Tensor, scene: Scene, rng: Generator) -> Tensor:
+def _slid(x: Tensor, scene: Augmentation, rng: Generator) -> Tensor:
     """At another speed; past its end a sweep runs back."""
     n, _, frames = x.shape
     if not scene.stretch or frames < 2:
@@ -110,7 +110,7 @@ def _slid(x: Tensor, scene: Scene, rng: Generator) -> Tensor:
     return torch.lerp(x.gather(2, take), x.gather(2, take + 1), (at - left)[:, None])
 
 
-def _passed(x: Tensor, scene: Scene, rng: Generator) -> Tensor:
+def _passed(x: Tensor, scene: Augmentation, rng: Generator) -> Tensor:
     """Through skin, tape and glove, which pass on some rates better than others."""
     n, _, frames = x.shape
     if not (scene.damped or scene.colour) or frames < 2:
@@ -128,7 +128,7 @@ def _passed(x: Tensor, scene: Scene, rng: Generator) -> Tensor:
     return torch.fft.irfft(torch.fft.rfft(x) * passed[:, None], frames)
 
 
-def _disturbed(x: Tensor, scene: Scene, rng: Generator) -> Tensor:
+def _disturbed(x: Tensor, scene: Augmentation, rng: Generator) -> Tensor:
     """By what the sensor adds of its own: noise, an offset that moves, hum."""
     n, taxels, frames = x.shape
     if scene.noise or scene.noisy:
@@ -145,7 +145,7 @@ def _disturbed(x: Tensor, scene: Scene, rng: Generator) -> Tensor:
     return x
 
 
-def _cut_off(x: Tensor, scene: Scene, rng: Generator) -> Tensor:
+def _cut_off(x: Tensor, scene: Augmentation, rng: Generator) -> Tensor:
     """By a converter or a skin that has come to its end."""
     if not scene.clipped:
         return x

@@ -1,4 +1,4 @@
-"""The room of training. In: a SweepSet and a seed. Out: a Fit, which holds the network and the sweeps it saw.
+"""The room of training. In: a LabelledSweeps and a seed. Out: a Fit, which holds the network and the sweeps it saw.
 
 The convolutions are trained by gradient on sweeps that vary as the scene does; then shrinkage LDA in closed form
 replaces the head, one for the network and one for its int8 trunk. Groups that were held out tell how many stages the
@@ -25,12 +25,12 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import read
 from appliance.core.types import SweepFormat
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
-from train.data.sets import SweepSet
+from train.data.sets import LabelledSweeps
 from train.metrics.score import figure
 from train.models import training
 from train.models.compact import graph, spectrum
-from train.models.compact.architectures import USUAL, Shape
-from train.models.compact.augment import SLOW, Scene, vary
+from train.models.compact.architectures import USUAL, Architecture
+from train.models.compact.augment import SLOW, Augmentation, vary
 from train.models.compact.network import Compact
 from train.models.heads import closed_form_head, hold_out
 from train.models.networks import Network, texture_scale
@@ -44,7 +44,7 @@ COPIES = 2
 
 
 @dataclass(frozen=True)
-class Recipe(training.Recipe):
+class FitRecipe(training.TrainingRecipe):
     """How the compact network is trained.
 
     scene: what varies, and so do the training sweeps; gain and noise are its matter. None: `usual`.
@@ -54,7 +54,7 @@ class Recipe(training.Recipe):
     steps: int = 600
     noise: float = 0.0
     gain: float = 0.0
-    scene: Scene | None = None
+    scene: Augmentation | None = None
     keep_means: bool = False
 
 
@@ -70,10 +70,10 @@ class Fit:
 
     weights: dict[str, Array]
     scale: float
-    shape: Shape
+    shape: Architecture
     reach: graph.Ranges
-    train: SweepSet
-    held: SweepSet
+    train: LabelledSweeps
+    held: LabelledSweeps
     about: dict[str, Any]
     cost: Cost = field(default_factory=list)
 
@@ -131,9 +131,9 @@ class Fit:
                 {k.removeprefix(p): v for k, v in held.items() if k.startswith(p)} for p in ("weight_", "group_")
             )
             samples, labels, materials = held["set_samples"], held["set_labels"], tuple(meta["materials"])
-            whole = SweepSet(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
+            whole = LabelledSweeps(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
             first = np.arange(len(whole)) < meta["trained_on"]
-            shape = Shape(**meta["shape"] | {"channels": tuple(meta["shape"]["channels"])})
+            shape = Architecture(**meta["shape"] | {"channels": tuple(meta["shape"]["channels"])})
             reach = graph.Ranges(meta["reach"]["digits"], tuple(meta["reach"]["responses"]))
             made = cls(weights, meta["scale"], shape, reach, whole.take(first), whole.take(~first), meta["about"])
         except (KeyError, ValueError, TypeError) as e:
@@ -145,13 +145,19 @@ class Fit:
         return made
 
 
-def fit(sweeps: SweepSet, seed: int, recipe: Recipe, log: Log = silent, shape: Shape = USUAL) -> Fit:
+def fit(sweeps: LabelledSweeps, seed: int, recipe: FitRecipe, log: Log = silent, shape: Architecture = USUAL) -> Fit:
     """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it, and for windows too short."""
     return fit_on(*hold_out(sweeps, seed), seed, recipe, log, shape)
 
 
 def fit_on(
-    train: SweepSet, held: SweepSet, by: str, seed: int, recipe: Recipe, log: Log = silent, shape: Shape = USUAL
+    train: LabelledSweeps,
+    held: LabelledSweeps,
+    by: str,
+    seed: int,
+    recipe: FitRecipe,
+    log: Log = silent,
+    shape: Architecture = USUAL,
 ) -> Fit:
     """Train on `train`; `held` gives temperature and validation. by: how they were parted, for the story."""
     if not (shape.channels or spectrum.count(train.format)):
@@ -174,7 +180,9 @@ def fit_on(
     return Fit(weights, scale, model.shape, reach, train, held, about, cost)
 
 
-def _seen(model: Compact, reach: graph.Ranges, train: SweepSet, held: SweepSet, more: Iterable[SweepSet]) -> Seen:
+def _seen(
+    model: Compact, reach: graph.Ranges, train: LabelledSweeps, held: LabelledSweeps, more: Iterable[LabelledSweeps]
+) -> Seen:
     """What the heads see of the training sweeps with their copies, and of those held out: (float, int8)."""
     trunk = graph.trunk(model.form, model.scale, model.weights(), model.shape, reach, keep_means=model.keep_means)
     asked = (partial(features, model), lambda sweeps: run(trunk, sweeps.samples))
@@ -214,17 +222,17 @@ def _judged(model: Compact, seen: Seen, labels: Array, held_labels: Array) -> tu
     return model, {k: v.numpy() for k, v in model.state_dict().items()} | named
 
 
-def usual(form: SweepFormat, shape: Shape) -> Scene:
+def usual(form: SweepFormat, shape: Architecture) -> Augmentation:
     """What varies where nobody says it: another scene for a sensor that is too slow for kernels that sum to zero."""
-    return Scene() if shape.zero_sum(form.window) else SLOW
+    return Augmentation() if shape.zero_sum(form.window) else SLOW
 
 
-def varied(x: Tensor, rng: Generator, rows: int, scene: Scene) -> Tensor:
+def varied(x: Tensor, rng: Generator, rows: int, scene: Augmentation) -> Tensor:
     """augment.vary, as the loop calls it."""
     return vary(x, rows, scene, rng)
 
 
-def copies(model: Compact, sweeps: SweepSet, change: Vary, seed: int) -> Iterator[SweepSet]:
+def copies(model: Compact, sweeps: LabelledSweeps, change: Vary, seed: int) -> Iterator[LabelledSweeps]:
     """The sweeps again COPIES times as the scene might have given them: the head must know how materials vary, too."""
     rng, kind = torch.Generator().manual_seed(seed), sweeps.samples.dtype
     for _ in range(COPIES):
@@ -240,6 +248,6 @@ def copies(model: Compact, sweeps: SweepSet, change: Vary, seed: int) -> Iterato
 
 
 @torch.no_grad()
-def features(model: Network, sweeps: SweepSet) -> Array:
+def features(model: Network, sweeps: LabelledSweeps) -> Array:
     """What the head sees of each sweep, float32 [N, F]."""
     return np.concatenate([model.seen(x).numpy() for x in tensors(sweeps.samples, in_order(len(sweeps)))])

@@ -18,8 +18,8 @@ from onnx import TensorProto, helper
 
 from appliance.core.types import SweepFormat
 from train.models.compact import spectrum
-from train.models.compact.architectures import CAP, FLOOR, Shape, Stage
-from train.onnx_tools.graph_builder import IR, OPSET, TENSOR, Graph
+from train.models.compact.architectures import CAP, FLOOR, Architecture, Stage
+from train.onnx_tools.graph_builder import IR, OPSET, TENSOR, GraphBuilder
 
 Array = NDArray[Any]
 FLOAT = TensorProto.FLOAT
@@ -41,7 +41,7 @@ class Ranges:
     responses: tuple[float, ...]
 
 
-def level_frames(window: int, shape: Shape) -> int:
+def level_frames(window: int, shape: Architecture) -> int:
     """Of how many frames the mean is taken away from digits that are no bytes: the first tenth, or the whole window.
 
     Kernels that sum to zero need no level, but int8 does. The first tenth is known by the time of every early answer.
@@ -53,7 +53,7 @@ def trunk(
     form: SweepFormat,
     scale: float,
     weights: Mapping[str, Array],
-    shape: Shape,
+    shape: Architecture,
     reach: Ranges | None = None,
     tenths: bool = False,
     keep_means: bool = False,
@@ -65,7 +65,7 @@ def trunk(
     yet does not tremble) or none is capped. A stage that has seen too little by then counts as silent.
     The bands of the spectrum are the last features, in float.
     """
-    g, seen, sizes = Graph(), [], []
+    g, seen, sizes = GraphBuilder(), [], []
     raw = g("Reshape", "sweep", g.constant([1, form.window, form.rows * form.cols], "int64"))
     turned = _capping(g, raw, form)
     if shape.channels:
@@ -85,7 +85,7 @@ def trunk(
 
 
 def _log_means(
-    g: Graph, form: SweepFormat, shape: Shape, weights: Mapping[str, Array], x: str, step: float,
+    g: GraphBuilder, form: SweepFormat, shape: Architecture, weights: Mapping[str, Array], x: str, step: float,
     reach: Ranges | None, tenths: bool,
 ) -> str:  # fmt: skip
     """The stages on [n, R * C, T], which `step` makes the network's unit: [1, 1 or TENTHS, sum of channels]."""
@@ -112,7 +112,14 @@ def _log_means(
 
 
 def _front(
-    g: Graph, form: SweepFormat, scale: float, shape: Shape, raw: str, turned: str, reach: Ranges | None, tenths: bool
+    g: GraphBuilder,
+    form: SweepFormat,
+    scale: float,
+    shape: Architecture,
+    raw: str,
+    turned: str,
+    reach: Ranges | None,
+    tenths: bool,
 ) -> tuple[str, float]:
     """Digits [1, T, R * C], `turned` down -> ([1, R * C, T], the step that is left to the first convolution's weights).
 
@@ -135,7 +142,7 @@ def _front(
     return _turned(g, _quantized(g, x, step, MIDDLE), step, MIDDLE), step
 
 
-def _capping(g: Graph, raw: str, form: SweepFormat) -> str:
+def _capping(g: GraphBuilder, raw: str, form: SweepFormat) -> str:
     """Digits [1, T, R * C] -> what each taxel is multiplied with, [1, 1, R * C]; see ladder.Cap."""
     step, most = CAP.step(form.window), CAP.place(form.rows * form.cols) + 1
     older, newer = (
@@ -149,7 +156,7 @@ def _capping(g: Graph, raw: str, form: SweepFormat) -> str:
     return g("Div", limit, g("Max", trembling, limit))
 
 
-def _turned_down(g: Graph, raw: str, turned: str, form: SweepFormat, scale: float) -> str:
+def _turned_down(g: GraphBuilder, raw: str, turned: str, form: SweepFormat, scale: float) -> str:
     """Bytes [1, T, R * C] times `turned` [1, 1, R * C], as bytes; exact where that is 1."""
     whole = g("Expand", _quantized(g, turned, 1 / 255), g.constant([1, form.window, form.rows * form.cols], "int64"))
     factors = g("DequantizeLinear", whole, g.constant(1 / 255), g.constant(0, "uint8"))
@@ -157,16 +164,16 @@ def _turned_down(g: Graph, raw: str, turned: str, form: SweepFormat, scale: floa
     return _quantized(g, g("Mul", digits, factors), scale)
 
 
-def _quantized(g: Graph, x: str, step: float, zero: int = 0) -> str:
+def _quantized(g: GraphBuilder, x: str, step: float, zero: int = 0) -> str:
     return g("QuantizeLinear", x, g.constant(step), g.constant(zero, "uint8"))
 
 
-def _turned(g: Graph, x: str, step: float, zero: int) -> str:
+def _turned(g: GraphBuilder, x: str, step: float, zero: int) -> str:
     """Bytes [n, T, R * C] as what they mean [n, R * C, T]."""
     return g("DequantizeLinear", g("Transpose", x, perm=[0, 2, 1]), g.constant(step), g.constant(zero, "uint8"))
 
 
-def _bytes(g: Graph, weight: Array, bias: Array, step: float, zero_sum: bool) -> tuple[str, str]:
+def _bytes(g: GraphBuilder, weight: Array, bias: Array, step: float, zero_sum: bool) -> tuple[str, str]:
     """Weight [filters, inputs, kernel] in seven bits, a step for each filter; bias in 32 bits of both steps."""
     least = np.abs(bias) / (step * 2**30)  # a silent filter's bias must fit as well
     steps = np.maximum(np.maximum(np.abs(weight).max(axis=(1, 2)) / SEVEN_BITS, least), 1e-12).astype(np.float32)
@@ -207,7 +214,7 @@ def _counts(stage: Stage, window: int, tenths: bool) -> list[int]:
     return [max((end - stage.reach) // stage.hop + 1, 0) for end in ends]
 
 
-def _sums(g: Graph, x: str, steps: int, counts: list[int], whole: bool = False, apart: bool = False) -> str:
+def _sums(g: GraphBuilder, x: str, steps: int, counts: list[int], whole: bool = False, apart: bool = False) -> str:
     """[1, steps, C] -> sums over the first `counts` of them, of whole numbers or not, [1, len(counts), C].
 
     apart: [len(counts), steps, C] -> [len(counts), 1, C], each over a row of its own.
@@ -221,7 +228,7 @@ def _sums(g: Graph, x: str, steps: int, counts: list[int], whole: bool = False, 
     return g("MatMulInteger" if whole else "MatMul", ones, x)
 
 
-def _factors(g: Graph, step: float, counts: list[int], size: int, apart: bool = False) -> str:
+def _factors(g: GraphBuilder, step: float, counts: list[int], size: int, apart: bool = False) -> str:
     """What makes sums over `counts` their means, as `_sums` gives them."""
     each = np.array([step / max(n, 1) for n in counts])  # nothing known: its sum is 0 as well
     lead = (len(counts), 1) if apart else (1, len(counts))
@@ -229,13 +236,13 @@ def _factors(g: Graph, step: float, counts: list[int], size: int, apart: bool = 
     return g("Expand", g.constant(each), g.constant([*lead, size], "int64"))
 
 
-def _levels(g: Graph, x: str, form: SweepFormat, counts: list[int], apart: bool = False) -> str:
+def _levels(g: GraphBuilder, x: str, form: SweepFormat, counts: list[int], apart: bool = False) -> str:
     """Digits [1, T, R * C] -> means over the first `counts` frames, [1, len(counts), R * C] or apart."""
     taxels = form.rows * form.cols
     return g("Mul", _sums(g, x, form.window, counts, apart=apart), _factors(g, 1.0, counts, taxels, apart))
 
 
-def _model(g: Graph, form: SweepFormat, x: str, output: str, size: list[int]) -> onnx.ModelProto:
+def _model(g: GraphBuilder, form: SweepFormat, x: str, output: str, size: list[int]) -> onnx.ModelProto:
     """The finished, checked model: `sweep` -> `output` float32 of `size`."""
     g("Reshape", x, g.constant(size, "int64"), output=output)
     sweep = helper.make_tensor_value_info("sweep", TENSOR[form.dtype], [1, form.window, form.rows, form.cols])

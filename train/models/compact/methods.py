@@ -15,9 +15,9 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from train.data.sets import SweepSet
-from train.models.compact.architectures import LADDER, USUAL, Shape
-from train.models.compact.fit import Fit, Recipe, fit_on
+from train.data.sets import LabelledSweeps
+from train.models.compact.architectures import LADDER, USUAL, Architecture
+from train.models.compact.fit import Fit, FitRecipe, fit_on
 from train.models.heads import ABSENT
 from train.models.methods import USUAL as WHOLE
 from train.models.methods import Effort, Method, Model
@@ -26,7 +26,7 @@ from train.models.training import Cost, Log, silent
 from train.onnx_tools.graph_builder import run, with_head
 
 Array = NDArray[Any]
-RECIPE = Recipe()
+RECIPE = FitRecipe()
 SPECTRUM = "the spectrum that all taxels share, and a closed-form head: nothing else is learnt"
 
 
@@ -57,7 +57,9 @@ class Int8:
         return with_head(self.made.trunk(), self.weight, self.bias)
 
 
-def train_compact(sweeps: SweepSet, given: Array, seed: int, *, shape: Shape, recipe: Recipe, log: Log) -> Int8:
+def train_compact(
+    sweeps: LabelledSweeps, given: Array, seed: int, *, shape: Architecture, recipe: FitRecipe, log: Log
+) -> Int8:
     """Train a network of this shape and its closed-form heads, as `palpate-train fit` does.
 
     Raises FormatError where only one material occurs, each only once, or a window is too short.
@@ -81,7 +83,7 @@ def methods(effort: Effort = WHOLE, log: Log = silent) -> tuple[Method, ...]:
     """The family, trained with this effort. log: is told of every iteration."""
     recipe = shortened(RECIPE, effort)
 
-    def rung(name: str, about: str, shape: Shape) -> Method:
+    def rung(name: str, about: str, shape: Architecture) -> Method:
         train = partial(train_compact, shape=shape, recipe=recipe, log=log)
         return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations")
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from appliance.core.types import SweepFormat
 from train.models.compact.architectures import MAINS_HZ
-from train.onnx_tools.graph_builder import Graph
+from train.onnx_tools.graph_builder import GraphBuilder
 
 Array = NDArray[Any]
 SEGMENTS = 10
@@ -46,7 +46,7 @@ def bands(x: Tensor, form: SweepFormat) -> Tensor:
     return torch.log(((cut @ waves).square() @ collect).mean(1) + QUIET)
 
 
-def nodes(g: Graph, raw: str, turned: str, form: SweepFormat, scale: float, tenths: bool) -> str:
+def nodes(g: GraphBuilder, raw: str, turned: str, form: SweepFormat, scale: float, tenths: bool) -> str:
     """Digits [1, T, R * C], and what each taxel is multiplied with [1, 1, R * C], as log band powers [1, rows, bands].
 
     One row for the whole window; or with `tenths` a row for the first tenth, two tenths ... of it.
@@ -104,7 +104,7 @@ def _matrices(length: int, mains: float) -> tuple[Array, Array]:
     return (waves - unwanted @ (unwanted.T @ waves)).astype(np.float32), collect.astype(np.float32)
 
 
-def _waves(g: Graph, length: int, mains: float) -> str:
+def _waves(g: GraphBuilder, length: int, mains: float) -> str:
     """Nodes that give the waves: onnxruntime folds them into one constant when it loads the model, and the file holds
     none of it."""
     one = g.constant(1, "int64")
@@ -118,7 +118,7 @@ def _waves(g: Graph, length: int, mains: float) -> str:
     return g("Sub", waves, heard)
 
 
-def _collect(g: Graph, edges: Array) -> str:
+def _collect(g: GraphBuilder, edges: Array) -> str:
     """Nodes that give what makes the mean of each band of squares; folded as `_waves` is."""
     k = g("Range", *(g.constant(n, "int64") for n in (2, int(edges[-1]), 1)))
     k = g("Unsqueeze", g("Concat", k, k, axis=0), g.constant([1], "int64"))

@@ -7,9 +7,9 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from train.models.compact.augment import Scene, vary
+from train.models.compact.augment import Augmentation, vary
 
-OFF = Scene(**{f.name: 0.0 for f in fields(Scene)})
+OFF = Augmentation(**{f.name: 0.0 for f in fields(Augmentation)})
 KNOBS = ("gain", "gains", "silent", "stretch", "damped", "colour", "noise", "noisy", "drift", "hum", "clipped")
 
 
@@ -38,9 +38,9 @@ def test_nothing_varies_at_zero_and_nothing_is_drawn():
 
 
 @pytest.mark.parametrize(
-    "knobs", [Scene(), replace(OFF, shift=1.0, moved=0.5), *(replace(OFF, **{k: 0.5}) for k in KNOBS)]
+    "knobs", [Augmentation(), replace(OFF, shift=1.0, moved=0.5), *(replace(OFF, **{k: 0.5}) for k in KNOBS)]
 )
-def test_every_knob_changes_sweeps_each_otherwise_and_leaves_its_input(knobs: Scene):
+def test_every_knob_changes_sweeps_each_otherwise_and_leaves_its_input(knobs: Augmentation):
     """Same generator, same bits; another one, others; sweeps that were equal differ; the input stays."""
     x = sweeps(1).expand(12, -1, -1).clone()
     before = x.clone()
@@ -57,11 +57,11 @@ def test_every_knob_changes_sweeps_each_otherwise_and_leaves_its_input(knobs: Sc
 def test_no_random_state_outside_is_read_or_changed():
     """PyTorch's own generator neither matters nor moves."""
     state = torch.get_rng_state()
-    first = vary(sweeps(), 4, Scene(), torch.Generator().manual_seed(6))
+    first = vary(sweeps(), 4, Augmentation(), torch.Generator().manual_seed(6))
     assert torch.equal(torch.get_rng_state(), state)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(2)
-        assert torch.equal(vary(sweeps(), 4, Scene(), torch.Generator().manual_seed(6)), first)
+        assert torch.equal(vary(sweeps(), 4, Augmentation(), torch.Generator().manual_seed(6)), first)
 
 
 def test_a_shift_reads_between_rows_and_fills_the_edge():
@@ -200,7 +200,7 @@ def test_what_is_clipped_is_cut_off_above():
 )
 def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames: int):
     """One taxel, one frame, odd lengths: with every knob up, silent sweeps stay finite and keep their shape."""
-    everything = replace(Scene(), **dict.fromkeys(KNOBS, 0.5))
+    everything = replace(Augmentation(), **dict.fromkeys(KNOBS, 0.5))
     x = torch.zeros(5, taxels, frames)
     now = vary(x, rows, everything, torch.Generator().manual_seed(7))
     assert now.shape == x.shape

@@ -20,14 +20,14 @@ from tests.factories.sweep_sets import easy
 from train.models import methods
 from train.models.compact import fit, graph, network, spectrum
 from train.models.compact import methods as family
-from train.models.compact.architectures import LADDER, USUAL, Shape
-from train.models.compact.augment import Scene
-from train.models.compact.fit import Fit, Recipe
+from train.models.compact.architectures import LADDER, USUAL, Architecture
+from train.models.compact.augment import Augmentation
+from train.models.compact.fit import Fit, FitRecipe
 from train.models.compact.network import Compact
 from train.models.methods import Effort
 from train.onnx_tools import graph_builder
 
-SMALL = Shape((6, 8, 8), 8, 2)
+SMALL = Architecture((6, 8, 8), 8, 2)
 LIMITS = {"compact-10k": (1e6, 24), "compact-100k": (12e6, 96)}
 """Multiply-accumulates and kilobytes that the issue allows."""
 RUNGS = {name: shape for name, shape in LADDER.items() if shape.channels}
@@ -42,7 +42,9 @@ def drawn(form: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
     return (x + rng.standard_normal((n, form.window, form.rows, form.cols))).astype(form.dtype)
 
 
-def trunks(form: SweepFormat, shape: Shape = SMALL, **asked: bool) -> tuple[Compact, onnx.ModelProto, onnx.ModelProto]:
+def trunks(
+    form: SweepFormat, shape: Architecture = SMALL, **asked: bool
+) -> tuple[Compact, onnx.ModelProto, onnx.ModelProto]:
     """A network with random weights, its float and its int8 trunk."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -62,7 +64,7 @@ def seen(model: Compact, digits: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on the easy set."""
-    return fit.fit(easy(), 1, Recipe(steps=40), shape=SMALL)
+    return fit.fit(easy(), 1, FitRecipe(steps=40), shape=SMALL)
 
 
 @pytest.mark.parametrize(("rows", "cols", "window", "dtype"),
@@ -142,7 +144,7 @@ def test_the_first_kernels_do_not_hear_the_mains():
     hum, tone = (torch.sin(2 * np.pi * hz * at + torch.rand(16, 1)) for hz in (50, 100))
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        deaf, short = (Compact(skin.FORMAT, 3, 1.0, shape=Shape((6, 8), kernel, 4)) for kernel in (16, 8))
+        deaf, short = (Compact(skin.FORMAT, 3, 1.0, shape=Architecture((6, 8), kernel, 4)) for kernel in (16, 8))
     with torch.no_grad():
         for model in (deaf, deaf.fused()):
             first = model.convs[0]
@@ -348,10 +350,10 @@ def test_copies_are_digits_of_the_scene():
     """Nothing varies: the very sweeps, twice. The default scene: others, of the same type, the same of the same seed."""
     for s in (easy(4), replace(easy(4), samples=easy(4).samples.astype(np.float32) / 7)):
         model = Compact(s.format, 3, 0.1, shape=SMALL)
-        still = Scene(shift=0, gain=0, gains=0, silent=0, damped=0, colour=0, noise=0)
+        still = Augmentation(shift=0, gain=0, gains=0, silent=0, damped=0, colour=0, noise=0)
         both = [
             [c.samples for c in fit.copies(model, s, partial(fit.varied, rows=2, scene=scene), 5)]
-            for scene in (still, Scene(), Scene())
+            for scene in (still, Augmentation(), Augmentation())
         ]
         assert len(both[0]) == fit.COPIES
         for same, other, again in zip(*both, strict=True):
@@ -365,7 +367,7 @@ def test_copies_are_digits_of_the_scene():
 def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
     """With keep_means the head sees each taxel's mean beside the rest, in int8 too, and of each tenth."""
     s = easy(6)
-    made = fit.fit(s, 1, Recipe(steps=2, keep_means=True), shape=SMALL)
+    made = fit.fit(s, 1, FitRecipe(steps=2, keep_means=True), shape=SMALL)
     level = s.samples.mean(axis=(1,)).reshape(len(s), -1) * made.scale
     first = sum(made.shape.channels)
     for int8 in (False, True):

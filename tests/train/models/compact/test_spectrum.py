@@ -18,14 +18,14 @@ from appliance.core.types import SweepFormat
 from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.models.compact import fit, graph, methods, spectrum
-from train.models.compact.architectures import LADDER, Shape
-from train.models.compact.fit import Recipe
+from train.models.compact.architectures import LADDER, Architecture
+from train.models.compact.fit import FitRecipe
 from train.models.compact.network import Compact
 from train.models.methods import Effort
 from train.onnx_tools import graph_builder
 
 BARE = LADDER["bands"]
-SMALL = Shape((6, 8, 8), 8, 2)
+SMALL = Architecture((6, 8, 8), 8, 2)
 ODD = SweepFormat(2, 2, 100.0, 163, "int16")
 FORMS = {
     "skin": (skin.FORMAT, True),
@@ -182,7 +182,7 @@ def test_a_window_too_short_has_no_spectrum():
     """Less than four frames a tenth: none is counted, a fit has none, and the rung of nothing else refuses by name."""
     short = replace(easy(12), samples=easy(12).samples[:, :39])
     assert spectrum.count(short.format) == 0
-    made = fit.fit(short, 1, Recipe(steps=2))
+    made = fit.fit(short, 1, FitRecipe(steps=2))
     assert (made.shape.spectrum, made.bands) == (False, 0)
     assert made.shape.channels
     rung = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]
