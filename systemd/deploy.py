@@ -1,6 +1,6 @@
 """Delivers a bundle to boxes. In: which boxes, the bundle's folder. Out: a line for each box.
 
-What is copied to a box is not trusted there: `palpate accept` checks signature, manifest, model and golden sweeps with the
+What is copied to a box is not trusted there: `palpate install` checks signature, manifest, model and golden sweeps with the
 box's own runtime and has it run from the next start on, on trial. Cut at any moment, the box has the old bundle or the
 new one; run the command again to finish.
 """
@@ -84,8 +84,8 @@ def deliver(box: Box, parcel: Parcel, shadow: bool) -> str:
     fresh = f"umask 077; mkdir -p {incoming} && find {incoming} -mindepth 1 -delete && mkdir {incoming}/{parcel.sha}"
     box.run("copying", f"{fresh} && tar -x -C {incoming}/{parcel.sha}", user="palpate", stdin=file)
     box.run("tidying up", f"rm {file}")
-    accept = f"{PALPATE} accept {incoming}/{parcel.sha}{' --shadow' if shadow else ''}"
-    box.run("checking it there", accept, user="palpate", limit_s=120)
+    install = f"{PALPATE} install {incoming}/{parcel.sha}{' --shadow' if shadow else ''}"
+    box.run("checking it there", install, user="palpate", limit_s=120)
     box.run("tidying up", f"rm -r {incoming}/{parcel.sha}", user="palpate")
     return told(box, parcel, ready=box.restart(READY_S, STARTS), shadow=shadow)
 

@@ -34,7 +34,7 @@ PLACES = {
     },
     "docs/manual.md": "/usr/share/doc/palpate/manual.md",
     "docs/manual": "/usr/share/doc/palpate/manual",
-    "docs/place/page.png": "/usr/share/doc/palpate/place/page.png",
+    "docs/alignment/page.png": "/usr/share/doc/palpate/alignment/page.png",
     "firmware_config/PROTOCOL.md": "/usr/share/doc/palpate/PROTOCOL.md",
 }
 """Files of this checkout, and where a box looks for them."""

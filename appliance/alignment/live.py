@@ -1,6 +1,6 @@
 """The room of placing the skin: frames of the finger at rest in, a View of where it is touched out, five times a second.
 
-`palpate place` runs it. A View goes to the terminal (place_screen) and, where asked for, to a page (place_web).
+`palpate align` runs it. A View goes to the terminal (place_screen) and, where asked for, to a page (place_web).
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ class Canvas:
     def _words(self, address: str) -> None:
         view, (rows, _) = self._view, self._view.shape
         simulated = "   SIMULATED" * (view.source != "usb")
-        self._put(0, 1, f"palpate place   skin {view.skin}   bundle {view.bundle}{simulated}")
+        self._put(0, 1, f"palpate align   skin {view.skin}   bundle {view.bundle}{simulated}")
         self._put(2, 1, view.said, BOLD)
         self._put(3, 1, view.todo)
         below = TOP + rows * self._cell[0] + 1

@@ -52,17 +52,17 @@ def run_bundles(args: argparse.Namespace) -> int:
     return 0
 
 
-def run_accept(args: argparse.Namespace) -> int:
-    """`palpate accept`: a signed bundle comes into the store."""
+def run_install(args: argparse.Namespace) -> int:
+    """`palpate install`: a signed bundle comes into the store."""
     store = assembly.store(settings(args))
-    sha = store.accept(args.folder, args.shadow)
+    sha = store.install(args.folder, args.shadow)
     committed = "it is committed already" if store.ledger.of(sha).committed else f"it runs on trial {NEXT}"
-    print(f"bundle {sha[:8]} is accepted; {'it is the candidate' if args.shadow else committed}")
+    print(f"bundle {sha[:8]} is installed; {'it is the candidate' if args.shadow else committed}")
     return 0
 
 
 def run_verify(args: argparse.Namespace) -> int:
-    """`palpate verify`: whether a bundle would be accepted, but for its counter."""
+    """`palpate verify`: whether a bundle would be taken, but for its counter."""
     held = assembly.store(settings(args)).examine(args.folder)
     m = held.bundle.manifest
     print(f"bundle {held.bundle.id}: {m.name} {m.version}, counter {m.counter}, signed by {held.signer}; all is well")
@@ -90,6 +90,6 @@ def run_promote(args: argparse.Namespace) -> int:
 
 NEXT = "from the next start on: systemctl restart palpate"
 RUNS = {
-    "replay": run_replay, "config": run_config, "status": run_status, "bundles": run_bundles, "accept": run_accept,
+    "replay": run_replay, "config": run_config, "status": run_status, "bundles": run_bundles, "install": run_install,
     "verify": run_verify, "commit": run_commit, "rollback": run_rollback, "promote": run_promote,
 }  # fmt: skip

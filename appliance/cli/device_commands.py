@@ -222,8 +222,8 @@ def run_enrol(args: argparse.Namespace, devices: OpenDevices) -> int:
     return 0
 
 
-def run_place(args: argparse.Namespace, devices: OpenDevices) -> int:
-    """`palpate place`: where the contact lies, until Ctrl-C."""
+def run_align(args: argparse.Namespace, devices: OpenDevices) -> int:
+    """`palpate align`: where the contact lies, until Ctrl-C."""
     from appliance.alignment import live
 
     how = settings(args)
@@ -233,4 +233,4 @@ def run_place(args: argparse.Namespace, devices: OpenDevices) -> int:
     return 0
 
 
-RUNS = {"run": run, "record": run_record, "check": run_check, "enrol": run_enrol, "place": run_place}
+RUNS = {"run": run, "record": run_record, "check": run_check, "enrol": run_enrol, "align": run_align}

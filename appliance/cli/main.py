@@ -117,7 +117,7 @@ def run_bench(args: argparse.Namespace) -> int:
         return 0
     from appliance.tools import bench
 
-    figures = bench.run(held, staged, args.yardsticks, args.seed, lambda line: print(line, flush=True))
+    figures = bench.run(held, staged, args.references, args.seed, lambda line: print(line, flush=True))
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
     return 0

@@ -91,12 +91,12 @@ def _by_hand(add: Callable[..., Any], world: argparse.ArgumentParser, some: argp
     add("demo", "watch simulated sweeps being classified", world, some).add_argument(
         "--raw", action="store_true", help="print the sentences alone"
     )
-    place = add("place", "show where the contact lies on the skin, and where it should", world)
-    place.add_argument(
+    align = add("align", "show where the contact lies on the skin, and where it should", world)
+    align.add_argument(
         "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
         help=f"as a page on localhost as well (default port {WEB_PORT})",
     )  # fmt: skip
-    place.set_defaults(sweeps=None)
+    align.set_defaults(sweeps=None)
     add("check", "self-test: bundle, golden sweeps, devices", world, some)
     add("status", "how the service is, and its last verdicts").add_argument("--json", action="store_true")
     add("replay", "judge a capture, a kept sweep or a folder of them again").add_argument("file", type=Path)
@@ -104,7 +104,7 @@ def _by_hand(add: Callable[..., Any], world: argparse.ArgumentParser, some: argp
     bench = add("bench", "measure latency, memory, start and processor share on this machine")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
     bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")
-    bench.add_argument("--yardsticks", type=Path, default=Path("build/yardsticks"), help="fp32.onnx, paper_int8.onnx")
+    bench.add_argument("--references", type=Path, default=Path("build/references"), help="fp32.onnx, paper_int8.onnx")
     bench.add_argument("--part", choices=("memory", "stream"), help="one part alone, as JSON, playing --acts")
     bench.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
 
@@ -113,9 +113,9 @@ def _of_bundles(add: Callable[..., Any]) -> None:
     """The commands for the bundles in the store."""
     listed = add("bundles", "the bundles on this box: which one runs, and what it goes back to")
     listed.add_argument("--json", action="store_true")
-    accept = add("accept", "check the signed bundle in DIR, and have it run on trial from the next start on")
-    accept.add_argument("--shadow", action="store_true", help="as the candidate of `run --shadow` instead")
-    for command in (accept, add("verify", "check the signed bundle in DIR, and change nothing")):
+    install = add("install", "check the signed bundle in DIR, and have it run on trial from the next start on")
+    install.add_argument("--shadow", action="store_true", help="as the candidate of `run --shadow` instead")
+    for command in (install, add("verify", "check the signed bundle in DIR, and change nothing")):
         command.add_argument("folder", type=Path, metavar="DIR")
     add("commit", "end the trial of the bundle that runs: it stays")
     add("rollback", "go back to the bundle before, from the next start on")

@@ -4,7 +4,7 @@ In the store's folder, `bundles/SHA/` are whole, verified bundles (shelf), the s
 (none: the packaged one), and `ledger.json` all else. Each step is one renaming, of a file, a folder or the link, and
 what it relies on is on the disk before:
 
-- accept: the bundle's folder takes its name; the ledger gets its standing, on trial and with what it goes back to; then
+- install: the bundle's folder takes its name; the ledger gets its standing, on trial and with what it goes back to; then
   `current` leads to it. The standing of what was current stays as it was, and holds if the power goes in between.
 - choose, at each start: the ledger counts the start before the bundle is touched.
 - commit: the ledger, with the end of the trial and the new least counter in one.
@@ -92,7 +92,7 @@ class Store:
         apart(lambda: self._prove(held.bundle))
         return held
 
-    def accept(self, incoming: Path, shadow: bool = False) -> str:
+    def install(self, incoming: Path, shadow: bool = False) -> str:
         """Take the bundle in `incoming` and have it run from the next start on, on trial; its sha256.
 
         shadow: it becomes the candidate instead. What else lies in `incoming` is not looked at. The folder may be
@@ -116,7 +116,7 @@ class Store:
         """Have the candidate run from the next start on, on trial; its sha256."""
         sha = self.ledger.candidate
         if sha == PACKAGED:
-            raise BundleError("there is no candidate; deploy one with SHADOW=1 (palpate accept --shadow)")
+            raise BundleError("there is no candidate; deploy one with SHADOW=1 (palpate install --shadow)")
         held = self.shelf.get(sha)
         with self._held() as ledger:
             ledger.admit(sha, held.bundle.manifest.counter)

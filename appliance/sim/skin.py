@@ -132,7 +132,7 @@ def position(placement: Placement, world: World) -> tuple[Array, Array]:
 
 
 def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]:
-    """Effect: what taping the skin on has changed: gains [4, 4], bedding [4, 4] in mm, colour of vibrations [7].
+    """Effect: what attaching the skin has changed: gains [4, 4], bedding [4, 4] in mm, colour of vibrations [7].
 
     The colour is the logarithm of a gain at 6 Hz and each octave above it, up to 375 Hz.
     """

@@ -38,7 +38,7 @@ from appliance.tools.bench_process import Build, drain
 SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
 
 
-def run(bundle: Bundle, build: Build, yardsticks: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+def run(bundle: Bundle, build: Build, references: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
     """All figures; `say` gets each as soon as it is there."""
     figures: dict[str, Any] = {"commit": commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id}
 
@@ -49,7 +49,7 @@ def run(bundle: Bundle, build: Build, yardsticks: Path, seed: int, say: Callable
 
     add({k: figures[k] for k in ("commit", "seed", "machine", "bundle")})
     add(_whole_way(bundle.format, build, seed))
-    add({"inference_ms": _inference(bundle, yardsticks, seed)})
+    add({"inference_ms": _inference(bundle, references, seed)})
     if "fp32" not in figures["inference_ms"]:
         say("fp32 and paper_int8 were not measured: they come with the desktop's tools (make bench)")
     for name in bench_process.NAMES:
@@ -105,15 +105,15 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     }
 
 
-def _inference(bundle: Bundle, yardsticks: Path, seed: int) -> dict[str, Any]:
+def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
     """The bundle beside the same network in float and the paper's in int8, taken in turns in one run."""
     rng = np.random.default_rng(seed)
     window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.digits)
     calls: dict[str, Callable[[], object]] = {}
     calls["int8"] = partial(Classifier(bundle, SystemClock()).logits, window)
-    _make_yardsticks(yardsticks)
+    _make_references(references)
     for name in ("fp32", "paper_int8"):
-        path = yardsticks / f"{name}.onnx"
+        path = references / f"{name}.onnx"
         if path.is_file():
             calls[name] = partial(session(path.read_bytes()).run, None, {"sweep": window[None]})
     took_ms: dict[str, list[float]] = {name: [] for name in calls}
@@ -127,14 +127,14 @@ def _inference(bundle: Bundle, yardsticks: Path, seed: int) -> dict[str, Any]:
     return {name: _percentiles(values[len(values) // 10 :]) for name, values in took_ms.items()}
 
 
-def _make_yardsticks(folder: Path) -> None:
+def _make_references(folder: Path) -> None:
     """Have the desktop's tools build the networks to compare with, where they are installed beside this program."""
     tool = Path(sys.executable).with_name("palpate-train")
     if folder.is_dir() or not tool.exists():
         return
-    done = subprocess.run([tool, "yardsticks", "--out", str(folder)], capture_output=True, text=True, check=False)
+    done = subprocess.run([tool, "references", "--out", str(folder)], capture_output=True, text=True, check=False)
     if done.returncode:
-        raise BundleError(f"palpate-train yardsticks failed: {done.stderr.strip()[-300:]}")
+        raise BundleError(f"palpate-train references failed: {done.stderr.strip()[-300:]}")
 
 
 def _child(name: str, seed: int) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 `PYTHONPATH=tests python -m flips --out build/flips.json` flips every bit of a manifest, random bits of the other files,
 swaps each file with that of another signed bundle, and tries bundles that are unsigned, wrongly signed, cut or older.
-Each one goes the way of a delivered bundle, `Store.accept`. Bits of the signature's own file are not counted: some of its
+Each one goes the way of a delivered bundle, `Store.install`. Bits of the signature's own file are not counted: some of its
 line ends, say, may be others, and it is the same signature of the same manifest.
 """
 
@@ -120,7 +120,7 @@ def tried(box: Delivery, case: Case) -> str:
     shutil.rmtree(incoming, ignore_errors=True)
     deliveries.put(incoming, case[2])
     try:
-        box.store.accept(incoming)
+        box.store.install(incoming)
     except BundleError as e:
         return str(e)
     return ""
@@ -154,7 +154,7 @@ def campaign(folder: Path, manifest_bits: int | None, seed: int, every: int = 0)
         if every and n % every == 0:
             print(f"{n}: {case[0]}, {case[1]}", flush=True)
     for n, good in enumerate((deliveries.files(3, box.key), another(box.key))):  # else all of this would prove nothing
-        box.store.accept(deliveries.put(folder / f"good{n}", good))
+        box.store.install(deliveries.put(folder / f"good{n}", good))
     return {kind: dict(count) for kind, count in counts.items()}
 
 

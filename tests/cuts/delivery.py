@@ -28,11 +28,11 @@ from tests.cuts.scene import Found, Scene, Step
 
 STORE, INCOMING = "store", "store/incoming"
 APART = re.compile(r"store/(incoming/.+|bundles/\.[^/]+/.+)")
-"""What is copied, until it is accepted, and what is in the folders that are not complete: nobody reads that."""
+"""What is copied, until it is installed, and what is in the folders that are not complete: nobody reads that."""
 PROBATION = 2
 """Sweeps."""
 ANSWER = re.compile(r"\$PPLP,RES,\d+,[\d.]+,(?:ok|unsure|undecided),(?:[^,]*,){6}([0-9a-f]{8}),")
-PROMISE = re.compile(r"bundle ([0-9a-f]{8}) (?:is accepted; it )?runs (?:on trial )?from the next start on.*")
+PROMISE = re.compile(r"bundle ([0-9a-f]{8}) (?:is installed; it )?runs (?:on trial )?from the next start on.*")
 DIED = 3
 NAMES = ("packaged", "first", "second", "third", "fourth", "fifth", "last")
 START = ("run", "--sim", "skin", "--virtual", "--sweeps", "1")
@@ -90,14 +90,14 @@ class Shop:
         """What happens to a box; before each command, which bundles may run if that is cut short."""
         do = self.palpate
         yield "packaged", self.copy("first")
-        yield "packaged first", do("accept the first ever", "accept", "@first")
+        yield "packaged first", do("install the first ever", "install", "@first")
         yield "first", do("start and commit it", *START_AND_COMMIT)
         yield "first", self.copy("second")
-        yield "first second", do("accept another", "accept", "@second")
+        yield "first second", do("install another", "install", "@second")
         yield "second", do("start it, end in order", *START)
         yield "second", do("start and commit it again", *START_AND_COMMIT)
         yield "second", self.copy("third")
-        yield "second third", do("accept one that will crash", "accept", "@third")
+        yield "second third", do("install one that will crash", "install", "@third")
         yield "third", do("start it, crash", *START, way="crash")
         yield "third", do("start it, crash again", *START, way="crash")
         yield "second third", do("start it, crash a third time", *START, way="crash")
@@ -106,12 +106,12 @@ class Shop:
         yield "first", do("start after rolling back", *START)
         yield "first second", do("roll forward", "rollback")
         yield "second", self.copy("fourth")
-        yield "second", do("accept as the candidate", "accept", "--shadow", "@fourth")
+        yield "second", do("install as the candidate", "install", "--shadow", "@fourth")
         yield "second fourth", do("promote the candidate", "promote")
         yield "fourth", self.copy("fifth")
-        yield "fourth fifth", do("accept one more while that is on trial", "accept", "@fifth")
+        yield "fourth fifth", do("install one more while that is on trial", "install", "@fifth")
         yield "fifth second", do("roll back from the trial", "rollback")
-        yield "second fifth", do("accept it again", "accept", "@fifth")
+        yield "second fifth", do("install it again", "install", "@fifth")
         yield "fifth", do("commit it by hand", "commit")
 
     def scene(self) -> Scene:
@@ -119,8 +119,8 @@ class Shop:
         return self._scene(_bare, list(self.story()))
 
     def alone(self, way: str) -> Scene:
-        """Nothing but an accept, in one of WAYS, on a box that runs the first bundle."""
-        step = self.palpate("accept another", "accept", str(self.at("second")), way=way)
+        """Nothing but an install, in one of WAYS, on a box that runs the first bundle."""
+        step = self.palpate("install another", "install", str(self.at("second")), way=way)
         return self._scene(self._delivered, [("first second", step)])
 
     def _scene(self, prepare: Callable[[Path], None], told: list[tuple[str, Step]]) -> Scene:
@@ -136,7 +136,7 @@ class Shop:
     def _delivered(self, folder: Path) -> None:
         """A box that runs the first bundle."""
         _bare(folder)
-        for words in (("accept", self.at("first")), START_AND_COMMIT):
+        for words in (("install", self.at("first")), START_AND_COMMIT):
             code, said = _apart(self.words(folder, *words))
             if code:
                 raise NotFollowed(f"{words[0]} ended with {code}: {_end(said)}")
@@ -156,7 +156,7 @@ class Shop:
         """What is wrong with the box when the last bundle is delivered and committed."""
         again = folder / INCOMING / "again"
         shutil.copytree(self.at("last"), again)
-        code, said = _apart(self.words(folder, "accept", again))
+        code, said = _apart(self.words(folder, "install", again))
         if code:
             return [f"the next delivery ends with {code}: {_end(said)}"]
         left = [path.name for path in (folder / STORE).iterdir() if path.suffix == storage.PART]

@@ -74,9 +74,9 @@ class Delivery:
         self._made += 1
         return put(self.folder / "incoming" / str(self._made), files(counter, self.key, **changes))
 
-    def accepted(self, counter: int) -> str:
-        """A bundle that was accepted; its sha256."""
-        return self.store.accept(self.made(counter))
+    def installed(self, counter: int) -> str:
+        """A bundle that was installed; its sha256."""
+        return self.store.install(self.made(counter))
 
     def start(self) -> str:
         """A start of the box; the sha256 of what it runs, "" for the packaged bundle."""
@@ -84,7 +84,7 @@ class Delivery:
         return "" if folder == bundle.DEFAULT else folder.name
 
     def committed(self, counter: int) -> str:
-        """A bundle that was accepted and committed; its sha256."""
-        sha = self.accepted(counter)
+        """A bundle that was installed and committed; its sha256."""
+        sha = self.installed(counter)
         assert self.store.commit()
         return sha

@@ -66,7 +66,7 @@ class Store:
         return self.machine.get(*AS_PALPATE, *command)
 
     def deploy(self, *how: str, **changes: Any) -> str:
-        """Copy a new bundle, A with changes to its manifest, to the box and have it accepted; its sha256."""
+        """Copy a new bundle, A with changes to its manifest, to the box and have it installed; its sha256."""
         counter = next(self._counters)
         made = self._folder / f"b{counter}"
         made.mkdir()
@@ -80,7 +80,7 @@ class Store:
             tar.add(made, arcname=made.name)
         unpack = "base64 -d | tar -x -C /var/lib/palpate/incoming"
         self.machine.get("sh", "-c", unpack, say=base64.b64encode(packed.getvalue()).decode())
-        self.do("accept", *how, f"/var/lib/palpate/incoming/{made.name}")
+        self.do("install", *how, f"/var/lib/palpate/incoming/{made.name}")
         return hashlib.sha256((made / "manifest.json").read_bytes()).hexdigest()
 
     @property
@@ -169,7 +169,7 @@ def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
 def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
     machine: Machine, service: Service, store: Store
 ):
-    """Altered on the card after it was accepted: A serves with this very start, no restart."""
+    """Altered on the card after it was installed: A serves with this very start, no restart."""
     new = store.deploy()
     model = f"/var/lib/palpate/bundles/{new}/model.onnx"
     machine.get("sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc")

@@ -1,4 +1,4 @@
-"""The commands that make bundles: fit, export, pack, parity, sign, yardsticks."""
+"""The commands that make bundles: fit, export, pack, parity, sign, references."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from train.models.compact.architectures import LADDER, USUAL
 
 
 def register(add: Add) -> None:
-    """fit, export, pack, parity, sign, yardsticks."""
+    """fit, export, pack, parity, sign, references."""
     _add_fit(add)
     _add_bundles(add)
     one = add(
@@ -76,9 +76,9 @@ def _add_bundles(add: Add) -> None:
         command.add_argument(
             "--pitch-mm",
             type=float,
-            help="from taxel to taxel; without it `palpate place` knows no mm (a simulated skin's is known)",
+            help="from taxel to taxel; without it `palpate align` knows no mm (a simulated skin's is known)",
         )
-    three = add("yardsticks", run_yardsticks, "write the models that palpate bench times beside the bundle")
+    three = add("references", run_references, "write the models that palpate bench times beside the bundle")
     three.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
@@ -136,9 +136,9 @@ def _told(manifest: Manifest, out: Path) -> None:
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
 
 
-def run_yardsticks(args: argparse.Namespace) -> None:
-    """Write the yardsticks and name them."""
-    for path in export.yardsticks(args.out):
+def run_references(args: argparse.Namespace) -> None:
+    """Write the references and name them."""
+    for path in export.references(args.out):
         print(path)
 
 

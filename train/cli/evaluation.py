@@ -1,4 +1,4 @@
-"""The commands that judge methods: methods, evaluate, stress, certainty, calibrate, placing."""
+"""The commands that judge methods: methods, evaluate, stress, certainty, calibrate, alignment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from train.reports import contact_report, plots, uncertainty_report
 
 
 def register(add: Add) -> None:
-    """methods, evaluate, stress, certainty, calibrate, placing."""
+    """methods, evaluate, stress, certainty, calibrate, alignment."""
     add("methods", run_methods, "list the methods that evaluate knows")
     _add_evaluate(add)
     _add_stress(add)
@@ -36,7 +36,7 @@ def register(add: Add) -> None:
     one.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     one.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
     two = add(
-        "placing", run_placing, "tell whether a skin that has moved is flagged before accuracy is lost (simulated)"
+        "alignment", run_alignment, "tell whether a skin that has moved is flagged before accuracy is lost (simulated)"
     )
     two.add_argument("--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)")
     two.add_argument("--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on")
@@ -173,7 +173,7 @@ def run_calibrate(args: argparse.Namespace) -> None:
     print(sim_calibration.table(told))
 
 
-def run_placing(args: argparse.Namespace) -> None:
+def run_alignment(args: argparse.Namespace) -> None:
     """Measure, write, and say the least of it."""
     box = Classifier(bundle.load(args.bundle), SystemClock())
     told = contact_positions.measure(box, args.unseen, args.seen, args.hard, options.Log())

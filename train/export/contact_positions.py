@@ -1,7 +1,7 @@
 """The room of where the skin sat. In: a training set; a bundle and simulated sweeps. Out: a ContactPositions, and what moving costs.
 
 A ContactPositions goes into the bundle, so that the box can say how far a contact lies from those of training. How well that goes
-with accuracy is measured by `palpate-train placing`: the same sweeps again and again, with the skin ever further off.
+with accuracy is measured by `palpate-train alignment`: the same sweeps again and again, with the skin ever further off.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from train.metrics.score import interval, provenance
 Array = NDArray[Any]
 Json = dict[str, Any]
 LEAST = 1 / 8
-"""The limit is never below this share of the pitch: by so much another taping of the skin in the same place moves the
+"""The limit is never below this share of the pitch: by so much attaching the skin again in the same place moves the
 centre (0.5 of 4 mm hold over 95 % of the simulated ones), whatever few or equal positions say."""
 OFF_MM = tuple(np.arange(0.5, 6.25, 0.5).tolist())
 """How far the skin is moved."""
@@ -102,7 +102,7 @@ def _shifted(placement: skin.Placement, name: str, mm: float) -> skin.Placement:
 def _point(
     box: Classifier, trial: EvaluationSweeps, where: Callable[[skin.Placement], skin.Placement] = lambda p: p
 ) -> Json:
-    """The box's answers to the trial's sweeps, with the skin moved. Sweeps of one taping count as together."""
+    """The box's answers to the trial's sweeps, with the skin moved. Sweeps of one attachment count as together."""
     assert trial.scene
     sweeps, place, limits = trial.sweeps, box.bundle.manifest.place, box.bundle.manifest.thresholds
     assert place
@@ -114,17 +114,17 @@ def _point(
         wrong[i], moved[i] = bool(verdict.label) and not right[i], bool(verdict.moved)
         found = centre(window, box.tare, limits.contact)
         told[i] = np.hypot(*place.offset(found)) if found else np.nan
-    taping = sweeps.group("position")
+    attachment = sweeps.group("position")
     return {
-        "n": len(sweeps), "tapings": len(np.unique(taping)), "accuracy": _share(right, taping),
-        "moved": _share(moved, taping), "wrong": int(wrong.sum()), "wrong_unflagged": int((wrong * (1 - moved)).sum()),
+        "n": len(sweeps), "attachments": len(np.unique(attachment)), "accuracy": _share(right, attachment),
+        "moved": _share(moved, attachment), "wrong": int(wrong.sum()), "wrong_unflagged": int((wrong * (1 - moved)).sum()),
         "told_mm": round(float(np.nanmedian(told)), 2) if np.isfinite(told).any() else None,
     }  # fmt: skip
 
 
-def _share(values: Array, taping: Array) -> list[float]:
+def _share(values: Array, attachment: Array) -> list[float]:
     """Mean and its 95 % interval."""
-    return [round(float(values.mean()), 4), *interval(values, taping)]
+    return [round(float(values.mean()), 4), *interval(values, attachment)]
 
 
 def _halves(points: Sequence[Json]) -> Iterator[tuple[str, list[Json]]]:
@@ -146,7 +146,7 @@ def _fall(points: Sequence[Json]) -> Json:
 def lines(told: Json) -> Iterator[str]:
     """For a person: accuracy and share flagged, with intervals, at each displacement."""
     yield f"bundle {told['bundle']}, {told['positions']} positions, limit {told['limit_mm']} mm"
-    named = {k: v for k, v in told.items() if isinstance(v, dict) and "tapings" in v}
+    named = {k: v for k, v in told.items() if isinstance(v, dict) and "attachments" in v}
     rows = [(name, point) for name, point in named.items()]
     rows += [(f"{way} {p['mm']:+.1f} mm", p) for way, points in told["moved"].items() for p in points]
     for name, point in rows:

@@ -148,7 +148,7 @@ def compared(source: Path, sweeps: LabelledSweeps, file: Path | None = None) -> 
     return parity.table(found)
 
 
-def yardsticks(folder: Path, seed: int = 0) -> tuple[Path, Path]:
+def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     """Write what `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx, both with random weights.
 
     The first is the default bundle's network in float32, the second the paper's CNN in int8; both take its sweeps.

@@ -208,7 +208,7 @@ def _reordered(gates: Tensor) -> NDArray[Any]:
 
 
 def paper_cnn(form: SweepFormat, classes: int, rng: np.random.Generator) -> onnx.ModelProto:
-    """The paper's CNN with random weights: a yardstick for time and memory, not for accuracy."""
+    """The paper's CNN with random weights: a reference for time and memory, not for accuracy."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         return ImageNetwork(form, classes, 1 / 255, 0.0, PAPER).graph()

@@ -35,7 +35,8 @@ def chart(told: Json) -> str:
             plot_style.write(
                 axes, 0, -0.28, "mm from a place like those of training", plot_style.GREY, plot_style.SMALL
             )
-    n, tapings = (told["moved"]["rows"][0][name] for name in ("n", "tapings"))
+    n, attachments = (told["moved"]["rows"][0][name] for name in ("n", "attachments"))
     return plot_style.svg(
-        figure, f"Share of {n} simulated sweeps ({tapings} tapings) that are named rightly, and flagged as moved"
+        figure,
+        f"Share of {n} simulated sweeps ({attachments} attachments) that are named rightly, and flagged as moved",
     )

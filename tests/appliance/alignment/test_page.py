@@ -219,7 +219,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """The command itself, with the simulated skin and its page; where that is."""
-    command = [sys.executable, "-m", "appliance", "place", "--sim", "rest", "--web", "0"]
+    command = [sys.executable, "-m", "appliance", "align", "--sim", "rest", "--web", "0"]
     with subprocess.Popen([*command, "--set", f"classifier.bundle={folder}"], stdout=subprocess.PIPE) as run:
         address = run.stdout.readline().decode().removeprefix("page: ").strip()
         yield run, address

@@ -325,8 +325,8 @@ def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(bench, "_child", lambda name, seed: {name: {"seed": seed}})
-    monkeypatch.setattr(bench, "_make_yardsticks", lambda folder: None)
-    assert main(["bench", "--json", str(tmp_path / "b.json"), "--yardsticks", str(tmp_path)]) == 0
+    monkeypatch.setattr(bench, "_make_references", lambda folder: None)
+    assert main(["bench", "--json", str(tmp_path / "b.json"), "--references", str(tmp_path)]) == 0
     figures = json.loads((tmp_path / "b.json").read_text())
     assert figures["accuracy"]["total"] == 6
     assert figures["frames_lost"] == 0

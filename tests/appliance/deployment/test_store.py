@@ -43,8 +43,8 @@ def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
 
 
 def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery):
-    """Accept, start on trial, commit, the next one, commit, and back and forth between the two."""
-    one = box.accepted(1)
+    """Install, start on trial, commit, the next one, commit, and back and forth between the two."""
+    one = box.installed(1)
     chosen = box.store.choose(box.logged.append)
     assert chosen.trial
     assert (chosen.folder.name, chosen.bundle.manifest.counter) == (one, 1)
@@ -61,9 +61,9 @@ def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery)
 
 def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
     """What was packaged is what was before, in a trial and by hand, and by hand forward again."""
-    one = box.accepted(1)
+    one = box.installed(1)
     assert box.store.rollback() == PACKAGED == box.start()
-    assert box.accepted(1) == one
+    assert box.installed(1) == one
     box.store.commit()
     assert box.store.rollback() == PACKAGED == box.start()
     assert box.store.rollback() == one == box.start()
@@ -71,7 +71,7 @@ def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
 
 def test_three_uncommitted_starts_go_back(box: Delivery):
     """The fourth start runs what was committed before, says so in one line, and `bundles` says why."""
-    one, two = box.committed(1), box.accepted(2)
+    one, two = box.committed(1), box.installed(2)
     assert [box.start() for _ in range(MOST_STARTS)] == [two] * MOST_STARTS
     box.logged.clear()
     assert [box.start(), box.start()] == [one, one]
@@ -85,7 +85,7 @@ def test_three_uncommitted_starts_go_back(box: Delivery):
 
 def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
     """Not to the first trial, which nobody had committed."""
-    one, two, three = box.committed(1), box.accepted(2), box.accepted(3)
+    one, two, three = box.committed(1), box.installed(2), box.installed(3)
     assert box.start() == three
     assert box.store.rollback() == one
     told = {e.sha: e.role for e in bundle_list.entries(box.store)}
@@ -96,8 +96,8 @@ def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
 def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
     """What the committed bundle goes back to is still there, however many were tried in between."""
     one, two = box.committed(1), box.committed(2)
-    box.accepted(3)
-    box.accepted(4)
+    box.installed(3)
+    box.installed(4)
     assert [box.start() for _ in range(MOST_STARTS + 1)][-1] == two
     assert box.store.rollback() == one == box.start()
 
@@ -106,7 +106,7 @@ def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
     """Committed once, left by hand, deployed again and failed: going back from the other one does not end there."""
     one, two = box.committed(1), box.committed(2)
     assert box.store.rollback() == one
-    assert box.accepted(2) == two
+    assert box.installed(2) == two
     assert [box.start() for _ in range(MOST_STARTS + 1)][-1] == one
     with pytest.raises(BundleError, match="no committed bundle to go back to"):
         box.store.rollback()
@@ -115,18 +115,18 @@ def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
 def test_deploying_again_what_runs_changes_nothing(box: Delivery):
     """A committed bundle stays committed; one on trial gets its three starts anew."""
     one = box.committed(1)
-    assert box.accepted(1) == one
+    assert box.installed(1) == one
     assert box.store.ledger.of(one).committed
-    two = box.accepted(2)
+    two = box.installed(2)
     box.start()
-    assert box.accepted(2) == two
+    assert box.installed(2) == two
     assert (box.store.ledger.of(two).starts, box.store.ledger.of(two).previous) == (0, one)
 
 
 def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
     """It is current and committed as before; what was on trial is left."""
-    one, two = box.committed(1), box.accepted(2)
-    assert box.accepted(1) == one
+    one, two = box.committed(1), box.installed(2)
+    assert box.installed(1) == one
     assert box.store.current == one
     assert box.store.ledger.of(one).committed
     assert not box.store.ledger.of(two).committed
@@ -138,17 +138,17 @@ def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
     box.store.rollback()
     for counter in (1, 2):
         with pytest.raises(BundleError, match=f"counter {counter}, and 2 was committed here before"):
-            box.store.accept(box.made(counter, version="other"))
+            box.store.install(box.made(counter, version="other"))
     assert box.store.current == one
-    assert box.accepted(2) == two
+    assert box.installed(2) == two
     assert box.start() == two
 
 
 def test_a_trial_does_not_raise_the_least_counter(box: Delivery):
     """What was never committed may be replaced by one with a lower counter."""
     box.committed(1)
-    box.accepted(9)
-    assert box.start() != box.accepted(2) == box.start()
+    box.installed(9)
+    assert box.start() != box.installed(2) == box.start()
 
 
 def alter(name: str) -> Ways:
@@ -220,7 +220,7 @@ def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
     before = box.store.ledger
     make, why = BAD[name]
     with pytest.raises(BundleError, match=why):
-        box.store.accept(make(box))
+        box.store.install(make(box))
     assert (box.store.current, box.store.ledger) == (one, before)
     assert [p.name for p in box.store.shelf.folder.glob("*")] == [one] * bool(one)
 
@@ -229,7 +229,7 @@ def test_what_else_lies_there_is_not_taken(box: Delivery):
     """A file that the manifest does not name stays where it is."""
     folder = box.made(1)
     (folder / "extra").write_bytes(b"x")
-    sha = box.store.accept(folder)
+    sha = box.store.install(folder)
     names = {bundle.MANIFEST, bundle.SIGNATURE, bundle.MODEL, bundle.GOLDEN, bundle.MEANS}
     assert {p.name for p in box.store.shelf.at(sha).iterdir()} <= names
 
@@ -243,7 +243,7 @@ def test_what_was_checked_is_what_is_written(box: Delivery):
             path.write_bytes(b"changed")
 
     changing = store.Store(box.how, change)
-    sha = changing.accept(folder)
+    sha = changing.install(folder)
     assert box.store.shelf.get(sha).sha == sha
 
 
@@ -260,7 +260,7 @@ def test_a_model_that_kills_its_runtime_is_refused(tmp_path: Path, does: Callabl
     """It is tried apart: this process lives on, and says what the other one died of."""
     box = Delivery(tmp_path, does)
     with pytest.raises(BundleError, match=why):
-        box.accepted(1)
+        box.installed(1)
     assert box.store.current == PACKAGED
 
 
@@ -273,13 +273,13 @@ def test_a_model_that_hangs_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
             pass
 
     with pytest.raises(BundleError, match=r"not run within 0\.2 s"):
-        Delivery(tmp_path, hang).accepted(1)
+        Delivery(tmp_path, hang).installed(1)
 
 
 def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: Delivery):
     """Its files have rotted, or the golden sweeps differ, or it does not fit the settings: what was before runs."""
     one = box.committed(1)
-    two = box.accepted(2)
+    two = box.installed(2)
     (box.store.shelf.at(two) / bundle.MODEL).write_bytes(b"rotten")
     assert box.start() == one
     assert "was altered" in box.logged[-1]
@@ -288,7 +288,7 @@ def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: D
         def prove(held: Bundle, error: Exception = error) -> None:
             raise error
 
-        box.accepted(counter)
+        box.installed(counter)
         assert store.Store(box.how, prove).choose(box.logged.append).folder.name == one
         assert str(error) in box.logged[-1]
 
@@ -316,7 +316,7 @@ def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
     one = box.committed(1)
     (box.store.shelf.at(one) / bundle.MODEL).write_bytes(b"rotten")
     assert [e.role for e in bundle_list.entries(box.store)] == ["previous", "damaged"]
-    assert box.accepted(1) == one == box.start()
+    assert box.installed(1) == one == box.start()
     assert os.listdir(box.store.shelf.folder) == [one]
 
 
@@ -326,7 +326,7 @@ def test_leftovers_and_old_bundles_go_at_the_next_accept(box: Delivery):
     left = box.store.shelf.folder / f".{shas[0]}-abc"
     left.mkdir()
     (left / "model.onnx").write_bytes(b"half")
-    five = box.accepted(5)
+    five = box.installed(5)
     assert set(os.listdir(box.store.shelf.folder)) == {five, *shas[2:]} == set(box.store.ledger.standings)
     assert box.store.rollback() == shas[3]
     assert box.store.rollback() == shas[2]
@@ -335,7 +335,7 @@ def test_leftovers_and_old_bundles_go_at_the_next_accept(box: Delivery):
 def test_a_candidate_waits_and_is_promoted(box: Delivery):
     """It changes nothing about what runs; promoted it is on trial."""
     one = box.committed(1)
-    two = box.store.accept(box.made(2), shadow=True)
+    two = box.store.install(box.made(2), shadow=True)
     assert box.start() == one
     candidate = box.store.candidate()
     assert candidate
@@ -346,7 +346,7 @@ def test_a_candidate_waits_and_is_promoted(box: Delivery):
     with pytest.raises(BundleError, match="no candidate"):
         box.store.promote()
     assert box.store.rollback() == one
-    box.store.accept(box.made(3), shadow=True)
+    box.store.install(box.made(3), shadow=True)
     box.committed(4)
     with pytest.raises(BundleError, match="counter 3, and 4 was committed"):
         box.store.promote()
@@ -355,7 +355,7 @@ def test_a_candidate_waits_and_is_promoted(box: Delivery):
 def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
     """Another one is waited for, not for ever; and nobody but the folder's owner changes it."""
     monkeypatch.setattr(store, "LOCK_S", 0.1)
-    box.accepted(1)
+    box.installed(1)
     with box.store._held(), pytest.raises(ApplianceError, match="in use by another command"):
         store.Store(box.how, lambda b: None).commit(wait_s=0.1)
     monkeypatch.setattr(os, "geteuid", lambda: 4711)
@@ -370,7 +370,7 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(box: Delivery, monkey
         raise OSError(28, "No space left on device", str(path))
 
     for committed in (lambda: PACKAGED, lambda: box.committed(1)):
-        before, tried = committed(), box.accepted(2)
+        before, tried = committed(), box.installed(2)
         with monkeypatch.context() as patch:
             patch.setattr("appliance.core.storage.put", full)
             assert box.start() == before
@@ -384,7 +384,7 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(box: Delivery, monkey
 )
 def test_a_ledger_that_cannot_be_read_is_named(box: Delivery, text: str):
     """What it said is not guessed."""
-    box.accepted(1)
+    box.installed(1)
     Path(box.how.folder, "ledger.json").write_text(text)
     with pytest.raises(BundleError, match=r"ledger\.json cannot be read"):
         box.start()
@@ -399,7 +399,7 @@ def test_a_link_out_of_the_store_is_refused(box: Delivery):
 
 def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
     """One line a bundle: role, id, name, counter, signer, trial."""
-    one, two = box.committed(1), box.store.accept(box.made(2, name="tubes", version="7"))
+    one, two = box.committed(1), box.store.install(box.made(2, name="tubes", version="7"))
     box.start()
     lines = bundle_list.lines(bundle_list.entries(box.store))
     assert [line.split()[0] for line in lines] == ["role", "on", "previous", "kept"]

@@ -44,7 +44,7 @@ class Trying(Delivery):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self.one, self.two = self.committed(1), self.accepted(2)
+        self.one, self.two = self.committed(1), self.installed(2)
 
     def tried(self) -> Trial:
         """One more start: its trial."""
@@ -208,7 +208,7 @@ def test_another_command_is_not_waited_for(box: Trying):
 
 def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
     """Another was deployed, or a person went back, while this one still runs."""
-    for way in (lambda: box.accepted(3), box.store.rollback):
+    for way in (lambda: box.installed(3), box.store.rollback):
         trial = box.tried()
         way()
         for _ in range(5):
@@ -217,7 +217,7 @@ def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
         assert trial.text == ""
         assert not box.standing.committed
         assert box.store.ledger.counter == 1
-        box.store.accept(box.made(2))
+        box.store.install(box.made(2))
 
 
 def test_a_person_may_commit_while_it_runs(box: Trying):
@@ -228,7 +228,7 @@ def test_a_person_may_commit_while_it_runs(box: Trying):
     trial.stopping()
     assert box.standing.committed
     with pytest.raises(ApplianceError, match="counter 1"):
-        box.store.accept(box.made(1, version="x"))
+        box.store.install(box.made(1, version="x"))
 
 
 def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):

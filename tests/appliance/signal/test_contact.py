@@ -1,4 +1,4 @@
-"""The room of the skin's place: the contact's centre, what is said of it, and `palpate place` in a terminal."""
+"""The room of the skin's place: the contact's centre, what is said of it, and `palpate align` in a terminal."""
 
 from __future__ import annotations
 
@@ -400,7 +400,7 @@ def terminal() -> Iterator[tuple[int, int]]:
 def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal: tuple[int, int], kind: str):
     """The command itself in a terminal: exit code 0; a screen of its own, left at the end; none where it is dumb."""
     far, near = terminal
-    command = [sys.executable, "-m", "appliance", "place", "--sim", "rest", "--set", f"classifier.bundle={folder}"]
+    command = [sys.executable, "-m", "appliance", "align", "--sim", "rest", "--set", f"classifier.bundle={folder}"]
     with subprocess.Popen(command, stdout=near, env=os.environ | {"TERM": kind}) as run:
         os.close(near)
         shown, pressed = b"", False
@@ -479,7 +479,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     back, home, ahead = told["moved"]["rows"]
     assert (back["mm"], home["mm"], ahead["mm"]) == (-5, 0, 5)
     assert home["accuracy"] == told["other positions"]["accuracy"]
-    assert (home["n"], home["tapings"], home["moved"][0], ahead["moved"][0]) == (12, 1, 0, 1)
+    assert (home["n"], home["attachments"], home["moved"][0], ahead["moved"][0]) == (12, 1, 0, 1)
     assert back["told_mm"] > ahead["told_mm"] + 0.5  # the trained place is a little ahead
     assert ahead["accuracy"][0] < home["accuracy"][0] > 0.8
     assert told["rows, forwards"]["lost_at_mm"] == 5

@@ -174,7 +174,8 @@ def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     """Weights that are not of the shape that the file names, and a file from before there were shapes."""
     replace(fitted, shape=LADDER["1k"]).save(tmp_path / "fit.npz")
     with pytest.raises(
-        FormatError, match=r"^fit.npz: its weights are not those of its Architecture\(channels=\(2, 6, 8\).*; fit again$"
+        FormatError,
+        match=r"^fit.npz: its weights are not those of its Architecture\(channels=\(2, 6, 8\).*; fit again$",
     ):
         Fit.load(tmp_path / "fit.npz")
     with np.load(tmp_path / "fit.npz") as z:

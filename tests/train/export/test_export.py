@@ -332,11 +332,11 @@ def test_the_default_bundle_is_what_the_box_needs():
     assert json.loads(it.bundle.manifest.json())["figures"]["held-out position"]["low"] > 0.9
 
 
-def test_yardsticks_are_what_they_are_called(tmp_path: Path):
+def test_references_are_what_they_are_called(tmp_path: Path):
     """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give six logits."""
     whole = networks.paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
     assert graph_builder.weight_count(whole) == 15_891_910
-    assert main(["yardsticks", "--out", str(tmp_path / "new")]) == 0
+    assert main(["references", "--out", str(tmp_path / "new")]) == 0
     sizes = {}
     for path in (tmp_path / "new").iterdir():
         run = session(path.read_bytes())
