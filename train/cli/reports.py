@@ -1,4 +1,4 @@
-"""The commands that write pages and pictures: paper, chart, matrix."""
+"""The commands that write pages and pictures: paper, chart, matrix, overview."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.cli import options
 from train.cli.options import Add
-from train.reports import chart_report, paper_experiment, plots
+from train.reports import chart_report, overview_plot, paper_experiment, plots
 
 
 def register(add: Add) -> None:
-    """paper, chart, matrix."""
+    """paper, chart, matrix, overview."""
     one = add("paper", run_paper, "run the paper's experiment on the simulated skin and tell it as a page")
     one.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
     one.add_argument(
@@ -39,6 +39,11 @@ def register(add: Add) -> None:
     two.add_argument("results", type=Path, nargs="+", metavar="FILE", help="of evaluate --json; several are joined")
     two.add_argument("--out", type=Path, required=True, metavar="FILE.svg")
     two.add_argument("--recordings", action="store_true", help="count recordings instead of windows")
+    four = add("overview", run_overview, "draw the README's picture: a simulated sweep and what the box answers")
+    four.add_argument(
+        "--out", type=Path, default=Path("docs/overview.svg"), metavar="FILE.svg", help="(docs/overview.svg)"
+    )
+    four.add_argument("--material", default="wood", metavar="NAME", help="of the tube (wood)")
 
 
 def run_paper(args: argparse.Namespace) -> None:
@@ -73,3 +78,9 @@ def run_chart(args: argparse.Namespace) -> None:
     if not found:
         raise FormatError("no model is left to chart; see above, and run it without --kept")
     print(chart_report.write(args.out, found, args.quick, charting.left_out))
+
+
+def run_overview(args: argparse.Namespace) -> None:
+    """The picture's name."""
+    put(args.out, overview_plot.draw(args.material).encode(), parents=True)
+    print(args.out)
