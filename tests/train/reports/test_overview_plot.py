@@ -25,5 +25,5 @@ def test_it_shows_the_verdict_and_every_label():
 
 def test_an_unknown_material_is_named():
     """With what may be used instead."""
-    with pytest.raises(FormatError, match="'cheese' is not simulated; use one of .*wood"):
+    with pytest.raises(FormatError, match=r"'cheese' is not simulated; use one of .*wood"):
         overview_plot.draw("cheese")
