@@ -23,7 +23,7 @@ from tests.factories.sweep_sets import easy
 from train.data import sets
 from train.export import export
 from train.models.compact import fit
-from train.onnx_tools import layers
+from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import TENSOR
 
 EIGHT_BITS = "eight bits"
@@ -54,8 +54,8 @@ def _show(folder: Path, name: str) -> None:
     model = onnx.load(folder / name / bundle.MODEL)
     del model.graph.output[:]
     (folder / f"{name} inside").mkdir()
-    names = [q.output[0] for q in layers.rounded(model)]
-    (folder / f"{name} inside" / "shown.onnx").write_bytes(layers.shown(model, names).SerializeToString())
+    names = [q.output[0] for q in parity.rounded(model)]
+    (folder / f"{name} inside" / "shown.onnx").write_bytes(parity.shown(model, names).SerializeToString())
     np.save(folder / f"{name} inside" / "sweeps.npy", np.load(folder / name / "sweeps.npy")[:SHOWN_SWEEPS])
 
 

@@ -46,7 +46,7 @@ def own_models(names: tuple[str, ...] = ()) -> list[Own]:
     found = [Own("default", default.model, default.manifest)]
     for name, method in methods.every(methods.Effort(0.02, 2)).items():
         if method.input in bundle.INPUTS and name in (names or methods.every()):
-            given = methods.given(method.input, sweeps)
+            given = methods.model_inputs(method.input, sweeps)
             model = method.train(sweeps, given, 1).graph().SerializeToString()
             manifest = Manifest(name, "1", sweeps.format, method.input, sweeps.materials, Thresholds(1, 255), {})
             found.append(Own(name, model, manifest))

@@ -7,7 +7,7 @@ import numpy as np
 from train.models.compact import fit
 
 
-def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> fit.LabelledSweeps:
+def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> fit.Dataset:
     """Three materials that hum at nearly the same rates, in much noise, one sweep [64, 2, 2] to a recording."""
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(3), n)
@@ -16,4 +16,4 @@ def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> fit.LabelledSweep
     offset = rng.uniform(80, 120, (3 * n, 1, 2, 2))
     samples = offset + 12 * np.sin(phase)[:, :, None, None] + 8 * rng.standard_normal((3 * n, 64, 2, 2))
     groups = {"recording": np.arange(3 * n)}
-    return fit.LabelledSweeps(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "close")
+    return fit.Dataset(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "close")

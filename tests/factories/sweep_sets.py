@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 
 
-def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> LabelledSweeps:
+def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> Dataset:
     """Three materials that hum at different rates, `n` sweeps [64, 2, 2] of each, `pieces` to a recording."""
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(3), n)
@@ -18,7 +18,7 @@ def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> L
     offset = rng.uniform(80, 120, (3 * n, 1, 2, 2))
     samples = offset + 12 * np.sin(phase)[:, :, None, None] + 2 * rng.standard_normal((3 * n, 64, 2, 2))
     groups = {"recording": np.arange(3 * n) // pieces, "speed": np.arange(3 * n) // pieces % 4}
-    return LabelledSweeps(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "easy")
+    return Dataset(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "easy")
 
 
 def held() -> dict[str, np.ndarray]:
@@ -39,7 +39,7 @@ def write(path: Path, **changes: object) -> str:
     return str(path)
 
 
-def tones(recordings: int = 6, windows: int = 2, noise: float = 1.0, offset: float = 0.0) -> LabelledSweeps:
+def tones(recordings: int = 6, windows: int = 2, noise: float = 1.0, offset: float = 0.0) -> Dataset:
     """Three materials that hum at 5, 11 and 23 Hz on a 2 x 1 skin at 100 Hz; `offset` tells a material by its mean."""
     rng = np.random.default_rng(1)
     labels = np.repeat(np.arange(3), recordings * windows)
@@ -49,4 +49,4 @@ def tones(recordings: int = 6, windows: int = 2, noise: float = 1.0, offset: flo
     hum = 20 * np.sin(2 * np.pi * np.array([5.0, 11.0, 23.0])[labels][:, None] * t + phase)
     x = 200 + offset * labels[:, None, None] + hum[..., None] + noise * rng.standard_normal((len(labels), 128, 2))
     groups = {"recording": recording, "session": recording % 3}
-    return LabelledSweeps(np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c"), 100.0, groups, "tones")
+    return Dataset(np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c"), 100.0, groups, "tones")

@@ -15,7 +15,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from appliance.bundle.bundle import Early
 from train.calibration.novelty import embed_some, parts
-from train.models.heads import temperature
+from train.models.linear_head import temperature
 
 Array = NDArray[Any]
 LEVELS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.97, 0.95, 0.92, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)

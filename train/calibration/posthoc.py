@@ -1,4 +1,4 @@
-"""The room where a trained trunk gets all that stands on it. In: its features of training sweeps. Out: a Finish.
+"""The room where a trained trunk gets all that stands on it. In: its features of training sweeps. Out: a Posthoc.
 
 That is an embedding, heads for each tenth, temperatures, the rule for early decisions and the limit of what is known;
 and the graph of all of it. What was fitted is judged by sweeps that it did not see, group by group.
@@ -17,17 +17,21 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from appliance.bundle.bundle import Known
+from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
 from train.calibration import early_exit, novelty
 from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.novelty import Embedding
-from train.models.heads import temperature
+from train.models.compact.augment import Augmentation
+from train.models.compact.fit import COPIES, Fit, copies, varied
+from train.models.linear_head import temperature
+from train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Finish:
+class Posthoc:
     """What stands on a trunk. weight [F, K], bias [K]: the head that names, cooled by `temperature`. warmth: temperature
     of logits from class means; steps: of the tenths, cooled; limit: see known."""
 
@@ -68,7 +72,7 @@ class Finish:
 
 
 @dataclass(frozen=True)
-class Copies:
+class AugmentedCopies:
     """The training sweeps again, as the scene might have given them: features [M, F], labels [M], groups [M].
 
     They teach the head that names how materials vary. The embedding does not see them: with them a strange material
@@ -80,9 +84,9 @@ class Copies:
     groups: Array
 
 
-def finish(
-    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, copies: Copies | None = None
-) -> Finish:
+def fit_posthoc(
+    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, also: AugmentedCopies | None = None
+) -> Posthoc:
     """Fit all of it on features [N, D + 1, F] of sweeps with labels [N] from 0 to K - 1, of groups [N].
 
     judged: bool [N], sweeps that the trunk did not see; only these find temperatures, rule and limit, each with heads
@@ -90,12 +94,12 @@ def finish(
     Raises FormatError as known.embed, and where there is but one group or nothing to judge by.
     """
     whole, classes = tenths[:, -1], int(labels.max()) + 1
-    copies = copies or Copies(whole[:0], labels[:0], groups[:0])
+    copied = also or AugmentedCopies(whole[:0], labels[:0], groups[:0])
 
     def named(fit: Array) -> tuple[Array, Array]:
         """The head found without the groups that are not in `fit`, bool [N]."""
-        also = np.isin(copies.groups, groups[fit])
-        x, y = np.concatenate([whole[fit], copies.features[also]]), np.concatenate([labels[fit], copies.labels[also]])
+        more = np.isin(copied.groups, groups[fit])
+        x, y = np.concatenate([whole[fit], copied.features[more]]), np.concatenate([labels[fit], copied.labels[more]])
         return early_exit.lda(x, y, classes)
 
     logits, numbers = early_exit.crossed(tenths, labels, groups, judged, fixed)
@@ -110,7 +114,7 @@ def finish(
     embedding, (weight, bias) = novelty.embed(whole, labels, fixed), named(np.ones(len(labels), bool))
     steps = early_exit.heads(embedding(tenths), labels, classes).cooled(cooler[:-1])
     limit = novelty.limit(novelty.crossed(whole, labels, groups, judged, fixed))
-    return Finish(embedding, weight / cooler[-1], bias / cooler[-1], float(cooler[-1]), warmth, steps, rule, limit)
+    return Posthoc(embedding, weight / cooler[-1], bias / cooler[-1], float(cooler[-1]), warmth, steps, rule, limit)
 
 
 def assembled(
@@ -164,3 +168,25 @@ def _add(graph: onnx.GraphProto, op: str, *inputs: str | Array, output: str, **h
             graph.initializer.append(numpy_helper.from_array(np.array(held, order="C"), names[-1]))
     graph.node.append(helper.make_node(op, names, [output], name=output, **how))
     return output
+
+
+def posthoc_inputs(made: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies]:
+    """What its int8 trunk makes of the sweeps that were trained on and held out, in this order.
+
+    Raises FormatError where none was held out: nothing could judge.
+    """
+    train, held, by = made.train, made.held, made.about["held_out_by"]
+    if by == "nothing":
+        raise FormatError(f"{train.source}: too few groups to hold some out; record more positions")
+    tenths = run(made.trunk(tenths=True), np.concatenate([train.samples, held.samples]))
+    labels, groups = np.append(train.labels, held.labels), np.append(train.group(by), held.group(by))
+    change = partial(varied, rows=train.format.rows, scene=Augmentation(**made.about["recipe"]["scene"]))
+    trunk, seed = made.trunk(), made.about["seed"]
+    changed = np.concatenate([run(trunk, copy.samples) for copy in copies(made.network(), train, change, seed)])
+    also = AugmentedCopies(changed, np.tile(train.labels, COPIES), np.tile(train.group(by), COPIES))
+    return tenths, labels, groups, np.arange(len(labels)) >= len(train), made.bands, also
+
+
+def calibrate(made: Fit) -> Posthoc:
+    """All that stands on the trunk of `made`. Raises FormatError as `seen` and finish.finish."""
+    return fit_posthoc(*posthoc_inputs(made))

@@ -15,7 +15,7 @@ from train.cli.options import Add
 from train.export import export, pack, sign
 from train.models import methods
 from train.models.compact import fit
-from train.models.compact.architectures import LADDER, USUAL
+from train.models.compact.architectures import ARCHITECTURES, DEFAULT
 
 
 def register(add: Add) -> None:
@@ -52,7 +52,7 @@ def _add_fit(add: Add) -> None:
     one.add_argument("--stretch", type=float, metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
     one.add_argument(
-        "--size", choices=[*LADDER, "usual"], default="usual", help="rung of the ladder (default: as compact)"
+        "--size", choices=[*ARCHITECTURES, "usual"], default="usual", help="rung of the ladder (default: as compact)"
     )
     one.add_argument("--keep-means", action="store_true", help="show the head each taxel's mean too, for comparison")
 
@@ -94,7 +94,7 @@ def run_fit(args: argparse.Namespace) -> None:
             args.rest.parent.mkdir(parents=True, exist_ok=True)
             rest.save(args.rest)
             print(f"rest: {len(rest)} sweeps in {args.rest}")
-    shape = LADDER.get(args.size, USUAL)
+    shape = ARCHITECTURES.get(args.size, DEFAULT)
     asked = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
     scene = replace(fit.usual(sweeps.format, shape), **asked)
     recipe = fit.FitRecipe(steps=args.steps, scene=scene, keep_means=args.keep_means)

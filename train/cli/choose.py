@@ -14,7 +14,7 @@ from appliance.bundle.bundle import Manifest
 from appliance.core.provenance import commit
 from appliance.core.storage import put
 from train.cli import options
-from train.data.sets import LabelledSweeps, digest
+from train.data.sets import Dataset, digest
 from train.data.transforms import WHOLE, Change
 from train.export import pack
 from train.metrics import score
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"bundle: {args.out}; why: {page / 'index.html'}")
 
 
-def _packed(args: argparse.Namespace, asked: scene.Scene, sweeps: LabelledSweeps, told: Json, change: Change) -> Json:
+def _packed(args: argparse.Namespace, asked: scene.Scene, sweeps: Dataset, told: Json, change: Change) -> Json:
     """Pack what was chosen, with less where the box can run it and will; what is in the bundle, and what it costs."""
     (method,) = methods.find([told["chosen"]], options.effort(args))
     refused = ""
@@ -66,9 +66,7 @@ def _packed(args: argparse.Namespace, asked: scene.Scene, sweeps: LabelledSweeps
     return _pack(args, asked, method, sweeps, told) | {"refused_with_less": refused}
 
 
-def _pack(
-    args: argparse.Namespace, asked: scene.Scene, method: methods.Method, sweeps: LabelledSweeps, told: Json
-) -> Json:
+def _pack(args: argparse.Namespace, asked: scene.Scene, method: methods.Method, sweeps: Dataset, told: Json) -> Json:
     content = pack.trained(method, sweeps, 1)
     honest = told["honest"]
     figure = {"accuracy": honest["mean"], "n": len(sweeps), "low": honest["low"], "high": honest["high"]}
@@ -84,7 +82,7 @@ def _costs(manifest: Manifest, price: Price, asked: scene.Scene) -> Json:
             "kb": price.kb, "mb": price.mb, "used": used, "figures": manifest.figures}  # fmt: skip
 
 
-def _origin(args: argparse.Namespace, asked: scene.Scene, sweeps: LabelledSweeps) -> Json:
+def _origin(args: argparse.Namespace, asked: scene.Scene, sweeps: Dataset) -> Json:
     """Where it all comes from."""
     effort = options.effort(args)
     words = ["palpate-train", "choose", "--scene", str(args.scene), "--out", str(args.out)]

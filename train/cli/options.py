@@ -28,7 +28,7 @@ def add_set(command: argparse.ArgumentParser) -> None:
 
 def add_effort(command: argparse.ArgumentParser) -> None:
     """How long networks are trained."""
-    usual = methods.USUAL
+    usual = methods.FULL_EFFORT
     command.add_argument("--effort", type=float, default=usual.share, metavar="SHARE",
                          help="of the networks' usual iterations (1)")  # fmt: skip
     command.add_argument("--paper-steps", type=int, metavar="N",
@@ -44,7 +44,7 @@ def add_where(command: argparse.ArgumentParser) -> None:
                          help=f"where finished folds are kept, so that an interrupted run goes on ({evaluate.CACHE})")  # fmt: skip
 
 
-def load(args: argparse.Namespace, seed: int = 1) -> sets.LabelledSweeps:
+def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     """The sets named, joined and narrowed. seed: of simulated ones that name none."""
     return sets.join([sets.load(spec, seed) for spec in args.sets]).select(args.only)
 

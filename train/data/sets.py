@@ -1,4 +1,4 @@
-"""The room of sweep sets. In: a file of the user's, or the name of a simulated set. Out: a checked LabelledSweeps.
+"""The room of sweep sets. In: a file of the user's, or the name of a simulated set. Out: a checked Dataset.
 
 A set knows which sweeps belong together (`groups`), can be narrowed to some of them and split so that no recording is
 on both sides. What a file must hold stands in appliance/sim/sets.py, which the box plays sets with; files.py reads it.
@@ -29,16 +29,16 @@ LIMITS: dict[str, Callable[[Array, int], Array]] = {"<=": np.less_equal, ">=": n
 
 
 @dataclass(frozen=True)
-class LabelledSweeps(sweep_set.SweepSet):
+class Dataset(sweep_set.SweepSet):
     """A set to train on: it can be narrowed and split."""
 
-    def of_several(self) -> LabelledSweeps:
+    def require_materials(self) -> Dataset:
         """The set itself. Raises FormatError where all its sweeps are of one material."""
         if len(present := np.unique(self.labels)) < 2:
             raise self._error(f"only one class, {self.materials[present[0]]!r}; a classifier needs two")
         return self
 
-    def of_whole_recordings(self) -> LabelledSweeps:
+    def require_pure_recordings(self) -> Dataset:
         """The set itself. Raises FormatError where a recording is of several materials: no verdict on it could be right."""
         values, _, counts = self.tally("recording")
         if len(several := values[(counts > 0).sum(axis=1) > 1]):
@@ -48,12 +48,12 @@ class LabelledSweeps(sweep_set.SweepSet):
             )
         return self
 
-    def take(self, index: Array) -> LabelledSweeps:
+    def take(self, index: Array) -> Dataset:
         """The sweeps `index` (mask or numbers) with all materials, so that labels keep their meaning."""
         groups = {k: v[index] for k, v in self.groups.items()}
         return replace(self, samples=self.samples[index], labels=self.labels[index], groups=groups)
 
-    def select(self, conditions: Sequence[str]) -> LabelledSweeps:
+    def select(self, conditions: Sequence[str]) -> Dataset:
         """The sweeps for which all conditions hold, without materials left over.
 
         A condition is a group and a limit ("force<=180") or any of several values ("force=100,150"); `material` goes
@@ -65,7 +65,7 @@ class LabelledSweeps(sweep_set.SweepSet):
             keep &= self._fulfils(text)
         if not keep.any():
             raise self._error(f"no sweep fulfils {' and '.join(conditions)}; ask for less at once")
-        part = self.take(keep).of_several()
+        part = self.take(keep).require_materials()
         present, labels = np.unique(part.labels, return_inverse=True)
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))
 
@@ -89,7 +89,7 @@ class LabelledSweeps(sweep_set.SweepSet):
                 raise self._error(f"no sweep fulfils {name}={value}; it has {shortened(np.unique(of_each))}")
         return np.isin(of_each, values)
 
-    def without_means(self) -> LabelledSweeps:
+    def without_means(self) -> Dataset:
         """The set with each window's mean over time taken from each taxel: samples float32, zero where one is constant.
 
         What is left is texture: the mean alone often tells the session in which a material was recorded.
@@ -105,7 +105,7 @@ class LabelledSweeps(sweep_set.SweepSet):
         np.add.at(counts, (member, self.labels), 1)
         return values, member, counts
 
-    def split(self, by: str, share: float, seed: int) -> tuple[LabelledSweeps, LabelledSweeps]:
+    def split(self, by: str, share: float, seed: int) -> tuple[Dataset, Dataset]:
         """Two parts, of which the first has about `share` of each material's groups `by`; no group is on both sides.
 
         Raises FormatError where a recording or the lack of groups forbids it, or the first part would lack a material.
@@ -138,16 +138,16 @@ class LabelledSweeps(sweep_set.SweepSet):
                 np.savez_compressed(f, materials=np.array(self.materials), **arrays)
 
 
-def load(spec: str, seed: int = 0) -> LabelledSweeps:
+def load(spec: str, seed: int = 0) -> Dataset:
     """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings, or sim:NAME[:SEED[-LAST][:SWEEPS]].
 
     SWEEPS: per material and position. SEED-LAST: one set of several worlds, whose positions differ. seed: of a
     simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
     """
-    return _simulated(spec, seed) if spec.startswith("sim:") else readers.read(Path(spec), LabelledSweeps).of_several()
+    return _simulated(spec, seed) if spec.startswith("sim:") else readers.read(Path(spec), Dataset).require_materials()
 
 
-def join(sets: Sequence[LabelledSweeps]) -> LabelledSweeps:
+def join(sets: Sequence[Dataset]) -> Dataset:
     """One set of several with the same format and materials, the groups that all have, and `set`: the place of each.
 
     Recordings, positions, sessions and objects are numbered on, since number 0 of two sets is not the same thing; a
@@ -158,7 +158,7 @@ def join(sets: Sequence[LabelledSweeps]) -> LabelledSweeps:
     return _one([replace(s, groups=s.groups | {"set": np.full(len(s), i)}) for i, s in enumerate(sets)])
 
 
-def _one(sets: Sequence[LabelledSweeps]) -> LabelledSweeps:
+def _one(sets: Sequence[Dataset]) -> Dataset:
     head, *others = sets
     for s in others:
         if (s.format, s.materials) != (head.format, head.materials):
@@ -176,10 +176,10 @@ def _one(sets: Sequence[LabelledSweeps]) -> LabelledSweeps:
             parts = [part - part.min() + start for part, start in zip(parts, starts, strict=False)]
         groups[name] = np.concatenate(parts)
     samples, labels = (np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels"))
-    return LabelledSweeps(samples, labels, head.materials, head.rate_hz, groups, " + ".join(s.source for s in sets))
+    return Dataset(samples, labels, head.materials, head.rate_hz, groups, " + ".join(s.source for s in sets))
 
 
-def _simulated(spec: str, seed: int) -> LabelledSweeps:
+def _simulated(spec: str, seed: int) -> Dataset:
     found, known = SIMULATED.fullmatch(spec), get_args(skin.SetName)
     if not found or found["name"] not in known:
         raise FormatError(
@@ -191,13 +191,13 @@ def _simulated(spec: str, seed: int) -> LabelledSweeps:
     for world in range(first, int(found["last"] or first) + 1):
         samples, labels, position = skin.sweep_set(found["name"], world, each)
         groups = {"position": position, "world": np.full(len(labels), world)}
-        worlds.append(LabelledSweeps(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, spec))
+        worlds.append(Dataset(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, spec))
     if not worlds:
         raise FormatError(f"set {spec!r} is empty: its last seed comes before its first")
     return replace(_one(worlds), source=spec)
 
 
-def digest(sweeps: LabelledSweeps) -> str:
+def digest(sweeps: Dataset) -> str:
     """16 hex digits (SHA-256) of everything but the source: the same for the same data, from whatever file it came."""
     x, names = sweeps.samples, sorted(sweeps.groups)
     total = hashlib.sha256(repr((sweeps.materials, float(sweeps.rate_hz), x.dtype.name, x.shape, names)).encode())

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sklearn.model_selection import BaseCrossValidator, StratifiedGroupKFold
 
 from appliance.core.errors import FormatError
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 
 Array = NDArray[Any]
 Fold = tuple[Array, Array]
@@ -105,7 +105,7 @@ class Protocol:
         if (found := RANDOM.fullmatch(self.text)) and int(found[1]) < 2:
             raise FormatError(f"protocol {self.text!r} has too few folds; use random:2 or more")
 
-    def splitter(self, sweeps: LabelledSweeps, seed: int) -> BaseCrossValidator:
+    def splitter(self, sweeps: Dataset, seed: int) -> BaseCrossValidator:
         """The scikit-learn splitter for `sweeps`; seed: of random folds. Raises FormatError for an unknown group."""
         if found := RANDOM.fullmatch(self.text):
             return RandomFolds(int(found[1]), seed)
@@ -114,12 +114,12 @@ class Protocol:
         name, train, test = SPLIT.fullmatch(self.text).groups()  # type: ignore[union-attr]
         return TrainTest(name, sweeps.group(name), *([int(v) for v in part.split(",")] for part in (train, test)))
 
-    def folds(self, sweeps: LabelledSweeps, seed: int) -> list[Fold]:
+    def folds(self, sweeps: Dataset, seed: int) -> list[Fold]:
         """All pairs (training, test) of sweep numbers. Raises FormatError where `sweeps` cannot be split so."""
-        sweeps.of_several().of_whole_recordings()
+        sweeps.require_materials().require_pure_recordings()
         return list(self.splitter(sweeps, seed).split(sweeps.samples, sweeps.labels, sweeps.group("recording")))
 
-    def clusters(self, sweeps: LabelledSweeps) -> Array | None:
+    def clusters(self, sweeps: Dataset) -> Array | None:
         """Which sweeps [N] succeed or fail together, for the interval: the left-out groups, else recordings of several
         windows; None where each sweep stands alone."""
         if found := LEAVE.fullmatch(self.text):

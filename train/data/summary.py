@@ -17,7 +17,7 @@ from appliance.core.sweep_set import Array
 from appliance.sim import skin
 from train.data import readers, sets
 from train.data.readers import RecordedSweep
-from train.data.sets import LabelledSweeps, shortened
+from train.data.sets import Dataset, shortened
 
 Names = Mapping[str, Mapping[int, str]]
 """Of a group, and in it of a number: what it is called."""
@@ -33,13 +33,13 @@ def describe(spec: str) -> str:
         return "\n".join(described(sets.load(spec, 1), {}))
     held = readers.recorded(folder)
     named, names = _named(held)
-    lines = described(readers.joined(named, folder, LabelledSweeps), names)
+    lines = described(readers.joined(named, folder, Dataset), names)
     kept = [one.sweep for one in readers.ok(held)]
     if lost := [sweep.lost for sweep in kept if sweep.lost]:
         frames = sum(len(sweep.frames) for sweep in kept)
         lines.append(f"  frames lost: {sum(lost)} of {frames}, in {len(lost)} sweeps, filled in from their neighbours")
     try:
-        readers.joined(held, folder, LabelledSweeps).of_several()
+        readers.joined(held, folder, Dataset).require_materials()
     except FormatError as e:
         lines.append(f"  cannot be trained on yet: {e}")
     return "\n".join(lines)
@@ -61,7 +61,7 @@ def _named(held: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Names]:
     return named, names
 
 
-def described(sweeps: LabelledSweeps, names: Names) -> list[str]:
+def described(sweeps: Dataset, names: Names) -> list[str]:
     """What a set holds: sweeps and their form, materials, recordings, groups and what is confounded."""
     fmt = sweeps.format
     _, _, held = sweeps.tally("recording")

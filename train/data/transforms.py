@@ -1,4 +1,4 @@
-"""The room of less: the same sweeps with fewer frames, taxels or bits. In: a LabelledSweeps, a Change. Out: a LabelledSweeps.
+"""The room of less: the same sweeps with fewer frames, taxels or bits. In: a Dataset, a Change. Out: a Dataset.
 
 Each change is something that an integrator can set on a sensor, and done here as it would be done there; only a shorter
 window is the box's own matter, which takes the middle of each sweep anyhow.
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 
 Array = NDArray[Any]
 BANDS = 6
@@ -37,7 +37,7 @@ class Change:
     taxels: tuple[int, ...] = ()
     bits: int = 0
 
-    def of(self, sweeps: LabelledSweeps) -> LabelledSweeps:
+    def of(self, sweeps: Dataset) -> Dataset:
         """The changed sweeps, of the same digit type. A grid stays one where whole rows and columns are left, else the
         taxels stand in one column. Raises FormatError where no frame is left."""
         x = sweeps.samples
@@ -89,7 +89,7 @@ def _averaged(x: Array, rate: int) -> Array:
     return (mean if x.dtype.kind == "f" else np.rint(mean)).astype(x.dtype)
 
 
-def order(sweeps: LabelledSweeps) -> list[int]:
+def order(sweeps: Dataset) -> list[int]:
     """Taxels by what they tell of the material, the most telling first: the last one goes first when some must go.
 
     Backward elimination (Marill and Green 1963) by Fisher's criterion trace(W^-1 B) (Fukunaga 1990, sec. 10.2) of the

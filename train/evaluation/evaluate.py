@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from train.data.sets import LabelledSweeps, digest
+from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol
 from train.evaluation import parallel
 from train.evaluation.fold import Fold, FoldTask, key, run
@@ -35,7 +35,7 @@ class Result:
     protocol: str
     means_removed: bool
     seed: int
-    sweeps: LabelledSweeps = field(repr=False)
+    sweeps: Dataset = field(repr=False)
     folds: list[Fold] = field(repr=False)
     origin: dict[str, str] = field(default_factory=dict)
 
@@ -123,7 +123,7 @@ class Plan:
     protocols: Sequence[str]
     seeds: Sequence[int] = (1,)
     means_removed: bool = False
-    effort: methods.Effort = methods.USUAL
+    effort: methods.Effort = methods.FULL_EFFORT
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Where:
 
 
 def evaluate(
-    sweeps: LabelledSweeps, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
+    sweeps: Dataset, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
 ) -> Iterator[Result]:
     """Results as they are complete. Raises FormatError where a method or protocol is unknown or does not fit the set."""
     known = methods.find(plan.methods, plan.effort)
@@ -161,7 +161,7 @@ def evaluate(
 
 
 def folds(
-    tasks: dict[Any, FoldTask], sweeps: LabelledSweeps, data: str, kind: str, where: Where
+    tasks: dict[Any, FoldTask], sweeps: Dataset, data: str, kind: str, where: Where
 ) -> Iterator[tuple[Any, Fold]]:
     """Every task's Fold: those in the cache first, then the others as they finish.
 
@@ -171,12 +171,12 @@ def folds(
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()
     left = [named for named in tasks.items() if named[0] not in kept and not where.kept]
-    shared = (sweeps, methods.given(kind, sweeps)) if left else ()
+    shared = (sweeps, methods.model_inputs(kind, sweeps)) if left else ()
     for (name, _), fold in parallel.results(_run, left, shared, where.jobs, where.scheduler):
         if where.cache:
             fold.save(paths[name])
         yield name, fold
 
 
-def _run(named: tuple[Any, FoldTask], sweeps: LabelledSweeps, given: Array) -> Fold:
+def _run(named: tuple[Any, FoldTask], sweeps: Dataset, given: Array) -> Fold:
     return run(named[1], sweeps, given)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.inference.session import session
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.features import kinds
 from train.models import methods
 
@@ -101,7 +101,7 @@ FORM = "form "
 PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
 
 
-def run(task: FoldTask, sweeps: LabelledSweeps, given: Array) -> Fold:
+def run(task: FoldTask, sweeps: Dataset, given: Array) -> Fold:
     """Train on one side, answer on the other. `given`: what the method's input asks for of all `sweeps`."""
     (method,) = methods.find([task.method], task.effort)
     start = time.perf_counter()
@@ -122,15 +122,13 @@ def run(task: FoldTask, sweeps: LabelledSweeps, given: Array) -> Fold:
     return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers)
 
 
-def _as_the_box(
-    method: methods.Method, model: methods.Model, sweeps: LabelledSweeps, some: Array
-) -> tuple[float, Array]:
+def _as_the_box(method: methods.Method, model: methods.Model, sweeps: Dataset, some: Array) -> tuple[float, Array]:
     """Median time in ms of one sweep through features and session, and the labels [n] that come out."""
     graph = session(model.graph().SerializeToString())
     name, times, labels = graph.get_inputs()[0].name, [], []
     for digits in sweeps.samples[some]:
         start = time.perf_counter()
-        x = kinds.given(method.input, digits, sweeps.rate_hz)
+        x = kinds.graph_input(method.input, digits, sweeps.rate_hz)
         labels.append(int(graph.run(None, {name: x[None]})[0][0].argmax()))
         times.append(time.perf_counter() - start)
     return 1e3 * float(np.median(times)), np.array(labels)

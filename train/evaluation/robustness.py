@@ -25,14 +25,14 @@ from appliance.inference.classifier import Classifier
 from appliance.io.trigger import Edge, EdgeKind
 from appliance.recording.sweep_window import SweepCutter
 from appliance.sim.rig import VirtualClock
-from train.data.sets import LabelledSweeps, digest
+from train.data.sets import Dataset, digest
 from train.evaluation import parallel
 from train.evaluation.corruptions import Corruption, usual
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
 from train.evaluation.robustness_data import EvaluationSweeps
 from train.models import methods
-from train.models.methods import USUAL, Effort, Method, Model, given
+from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -41,7 +41,7 @@ POINTS = 0.05
 
 
 def one(
-    method: Method, train: LabelledSweeps, trial: EvaluationSweeps, stresses: Sequence[Corruption] | None, seed: int
+    method: Method, train: Dataset, trial: EvaluationSweeps, stresses: Sequence[Corruption] | None, seed: int
 ) -> Json:
     """A task: train `method` and put it under stress; None stands for all stresses that make sense.
 
@@ -53,7 +53,7 @@ def one(
                           f"not of the kind of {train.source} ({train.format}, {len(train.materials)} materials); "
                           "test on what the methods are trained for")  # fmt: skip
     try:
-        model = method.train(train, given(method.input, train), seed)
+        model = method.train(train, model_inputs(method.input, train), seed)
     except FormatError as e:
         return {"method": method.name, "seed": seed, "set": trial.sweeps.source, "refused": str(e)}
     return score(method, model, trial, stresses, seed)
@@ -80,12 +80,12 @@ def score(
 
 def run(
     names: Sequence[str],
-    train: LabelledSweeps,
+    train: Dataset,
     trial: EvaluationSweeps,
     where: Where,
     *,
     seeds: Sequence[int] = (1,),
-    effort: Effort = USUAL,
+    effort: Effort = FULL_EFFORT,
     log: Callable[[str], None] = lambda line: None,
 ) -> Json:
     """All methods and seeds under all stresses that make sense, merged; tasks that are kept are not done again.
@@ -107,7 +107,7 @@ def run(
     return merge(done.values())
 
 
-def _one(task: tuple[str, int], train: LabelledSweeps, trial: EvaluationSweeps, effort: Effort) -> Json:
+def _one(task: tuple[str, int], train: Dataset, trial: EvaluationSweeps, effort: Effort) -> Json:
     (method,) = methods.find([task[0]], effort)
     return one(method, train, trial, None, task[1])
 
@@ -178,12 +178,10 @@ def trouble(method: Method, model: Model, trial: EvaluationSweeps) -> dict[str, 
     found = {}
     for name, taxels in _spoiled(trial.sweeps.format, trial.load).items():
         try:
-            spoiled = LabelledSweeps(
-                taxels[None], np.zeros(1, int), trial.sweeps.materials, trial.sweeps.rate_hz, {}, name
-            )
+            spoiled = Dataset(taxels[None], np.zeros(1, int), trial.sweeps.materials, trial.sweeps.rate_hz, {}, name)
             if spoiled.format != trial.sweeps.format:
                 raise FormatError(f"{spoiled.format} instead of {trial.sweeps.format}")
-            logits = model.logits(given(method.input, spoiled))
+            logits = model.logits(model_inputs(method.input, spoiled))
             found[name] = "finite" if np.isfinite(logits).all() else "not finite"
         except FormatError as e:
             found[name] = f"refused: {e}"
@@ -217,9 +215,9 @@ def answer(bundle: Bundle, taxels: Array) -> Verdict:
     return Classifier(bundle, clock)(sweep)
 
 
-def _right(method: Method, model: Model, sweeps: LabelledSweeps, samples: Array) -> tuple[int, int]:
+def _right(method: Method, model: Model, sweeps: Dataset, samples: Array) -> tuple[int, int]:
     """How many of `samples` are named rightly, and how many answers are no numbers (those are wrong)."""
-    logits = np.asarray(model.logits(given(method.input, replace(sweeps, samples=samples))))
+    logits = np.asarray(model.logits(model_inputs(method.input, replace(sweeps, samples=samples))))
     sane = np.isfinite(logits).all(axis=1)
     return int(np.sum(sane & (logits.argmax(axis=1) == sweeps.labels))), int(np.sum(~sane))
 

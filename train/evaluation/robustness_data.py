@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.sim import skin
 from train.data import sets
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 
 Array = NDArray[Any]
 USUAL_SWEEPS = 120
@@ -58,11 +58,11 @@ class SimulatedScene:
 class EvaluationSweeps:
     """What is put under stress: test sweeps and, where they are simulated, the scene that draws them anew."""
 
-    sweeps: LabelledSweeps
+    sweeps: Dataset
     scene: SimulatedScene | None = None
 
     @classmethod
-    def of(cls, sweeps: LabelledSweeps, most: int = USUAL_SWEEPS, seed: int = 0) -> EvaluationSweeps:
+    def of(cls, sweeps: Dataset, most: int = USUAL_SWEEPS, seed: int = 0) -> EvaluationSweeps:
         """About `most` of the `sweeps`, as many of each material as there are."""
         order = np.random.default_rng(seed).permutation(len(sweeps))
         rank = np.empty(len(sweeps), int)

@@ -49,7 +49,7 @@ PRINTED = np.array([figure.printed for figure in FIGURES])
 """[figures, methods]"""
 
 
-def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = None) -> sets.LabelledSweeps:
+def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = None) -> sets.Dataset:
     """T-LAB, T-REAL and ATTACHMENTS times T-HARD of one seed, joined in this order.
 
     Equal seeds draw the same places, attachments and noise in every world, so that worlds can be compared.
@@ -60,15 +60,13 @@ def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = N
     for name, its_seed in [("T-LAB", seed), ("T-REAL", seed), *hard]:
         samples, labels, position = skin.sweep_set(name, its_seed, per_material, world)
         groups = {"position": position}
-        parts.append(
-            sets.LabelledSweeps(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, f"{name}:{its_seed}")
-        )
+        parts.append(sets.Dataset(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, f"{name}:{its_seed}"))
     return sets.join(parts)
 
 
-def accuracies(sweeps: sets.LabelledSweeps, seed: int) -> Array:
+def accuracies(sweeps: sets.Dataset, seed: int) -> Array:
     """The share of right answers, float64 [figures, methods], on what `draw` drew. seed: of the random folds."""
-    given = {kind: methods.given(kind, sweeps) for kind in ("L", "H")}
+    given = {kind: methods.model_inputs(kind, sweeps) for kind in ("L", "H")}
     shares = np.zeros(PRINTED.shape)
     for i, figure in enumerate(FIGURES):
         inside = np.isin(sweeps.group("set"), figure.sets)

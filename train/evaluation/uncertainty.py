@@ -19,7 +19,7 @@ from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from appliance.inference.enrolment import joined
 from train.calibration.early_exit import LEVELS, decide
 from train.calibration.novelty import Embedding, auroc, embed
-from train.calibration.posthoc import Finish
+from train.calibration.posthoc import Posthoc
 from train.metrics.score import interval
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ DRAWS, ORDERS = 500, 20
 
 def figures(cases: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
     """All of it; what needs a material left out is missing where there are but two."""
-    done = [(case, case.finish()) for case in cases]
+    done = [(case, case.posthoc()) for case in cases]
     full = [one for one in done if one[0].left_out < 0]
     told = {"calibration": calibration(full), "sequence": sequence(full, seed), "early": early(full)}
     partial = [one for one in done if one[0].left_out >= 0]
@@ -49,7 +49,7 @@ def figures(cases: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
     return told
 
 
-def calibration(full: Sequence[tuple[Case, Finish]]) -> Json:
+def calibration(full: Sequence[tuple[Case, Posthoc]]) -> Json:
     """Expected calibration error and reliability before (LDA's own posteriors) and after the temperature."""
     labels, places = _joined(full, "labels"), _places(full)
     told: Json = {"n": len(labels), "temperature": [round(done.temperature, 2) for _, done in full]}
@@ -79,7 +79,7 @@ def reliability(sure: Array, right: Array) -> list[Json]:
             for i in some]  # fmt: skip
 
 
-def sequence(full: Sequence[tuple[Case, Finish]], seed: int) -> Json:
+def sequence(full: Sequence[tuple[Case, Posthoc]], seed: int) -> Json:
     """Mean sweeps against accuracy for wanted probabilities, sweeps of one object fused until then or to MOST_SWEEPS.
 
     "same place": all sweeps of one attachment, whose errors go together; "several places": from anywhere in the test.
@@ -114,7 +114,7 @@ def _stopped(fused: Array, truth: Array, clusters: Array, wanted: float) -> Json
             **_accuracy(right, clusters)}  # fmt: skip
 
 
-def early(full: Sequence[tuple[Case, Finish]]) -> Json:
+def early(full: Sequence[tuple[Case, Posthoc]]) -> Json:
     """Accuracy against the mean share of the sweep: by the rules as found in training, by others, always at a tenth."""
     labels, places = _joined(full, "labels"), _places(full)
     p = np.concatenate([done.probabilities(case.new) for case, done in full])
@@ -140,7 +140,7 @@ def early(full: Sequence[tuple[Case, Finish]]) -> Json:
     }  # fmt: skip
 
 
-def unknown(partial: Sequence[tuple[Case, Finish]], materials: Sequence[str]) -> Json:
+def unknown(partial: Sequence[tuple[Case, Posthoc]], materials: Sequence[str]) -> Json:
     """Leave one material out: AUROC of known test sweeps against those of the material, by several scores; what the
     limit found in training keeps, and what of the unknown it lets through as known."""
     told: Json = {"materials": {}}
@@ -167,14 +167,14 @@ def unknown(partial: Sequence[tuple[Case, Finish]], materials: Sequence[str]) ->
     return told
 
 
-def _of_trunk(case: Case, done: Finish) -> Array:
+def _of_trunk(case: Case, done: Posthoc) -> Array:
     """Squared distance in the trained features alone: all of them; the same for all where there are none."""
     if not (size := case.seen.shape[2] - case.fixed):
         return np.zeros(len(case.new))
     return embed(case.seen[:, -1, :size], case.seen_labels, size).strangeness(case.new[:, -1, :size])
 
 
-SCORES: dict[str, Callable[[Case, Finish], Array]] = {
+SCORES: dict[str, Callable[[Case, Posthoc], Array]] = {
     "distance": lambda case, done: done.embedding.strangeness(case.new[:, -1]) / done.limit,
     "distance, trained features only": _of_trunk,
     "distance, where trained materials differ": lambda case, done: embed(
@@ -186,7 +186,7 @@ the limit."""
 
 
 def enrolment(
-    full: Sequence[tuple[Case, Finish]], partial: Sequence[tuple[Case, Finish]], materials: Sequence[str], seed: int
+    full: Sequence[tuple[Case, Posthoc]], partial: Sequence[tuple[Case, Posthoc]], materials: Sequence[str], seed: int
 ) -> Json:
     """Leave a material out and enrol it from some sweeps of one place: accuracy of all classes (mean of each one's)
     there and elsewhere, as a share of what the model gets that was trained on all; what the old classes lose."""
@@ -212,7 +212,7 @@ def enrolment(
 
 
 def _enrolled(
-    case: Case, done: Finish, whole: Case, trained: Finish, rng: np.random.Generator
+    case: Case, done: Posthoc, whole: Case, trained: Posthoc, rng: np.random.Generator
 ) -> Iterator[tuple[int, str, tuple[float, float, float, float]]]:
     """(sweeps, where, (accuracy, that of the whole model, recall of the new one, what the old lose)) of random draws."""
     z, k = done.embedding(case.new[:, -1]), case.left_out
@@ -251,17 +251,17 @@ def _balanced(named: Array, labels: Array) -> float:
     return float(np.mean([np.mean(named[labels == k] == k) for k in np.unique(labels)]))
 
 
-def _joined(held: Sequence[tuple[Case, Finish]], name: str) -> Array:
+def _joined(held: Sequence[tuple[Case, Posthoc]], name: str) -> Array:
     return np.concatenate([getattr(case, name) for case, _ in held])
 
 
-def _places(held: Sequence[tuple[Case, Finish]]) -> Array:
+def _places(held: Sequence[tuple[Case, Posthoc]]) -> Array:
     """Where the skin sat, from 0 on."""
     places: Array = np.unique(_joined(held, "places"), return_inverse=True)[1]
     return places
 
 
-def _parted(rows: Array, held: Sequence[tuple[Case, Finish]]) -> list[Array]:
+def _parted(rows: Array, held: Sequence[tuple[Case, Posthoc]]) -> list[Array]:
     """`rows` of all cases, case by case."""
     return np.split(rows, np.cumsum([len(case.labels) for case, _ in held])[:-1])
 

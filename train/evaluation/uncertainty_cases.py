@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.calibration.completion import seen
-from train.calibration.posthoc import Copies, Finish, finish
-from train.data.sets import LabelledSweeps, digest, join
+from train.calibration.posthoc import AugmentedCopies, Posthoc, fit_posthoc, posthoc_inputs
+from train.data.sets import Dataset, digest, join
 from train.data.splitters import Protocol
 from train.evaluation import parallel, uncertainty
 from train.evaluation.evaluate import Where
@@ -79,10 +78,10 @@ class Case:
         """bool [n], the test sweeps of materials that were trained."""
         return self.labels != self.left_out
 
-    def finish(self) -> Finish:
+    def posthoc(self) -> Posthoc:
         """What is put on the trunk of this training."""
-        copies = Copies(self.copied, self.copied_labels, self.copied_groups)
-        return finish(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies)
+        copies = AugmentedCopies(self.copied, self.copied_labels, self.copied_groups)
+        return fit_posthoc(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies)
 
     def numbered(self) -> Array:
         """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out mean nothing."""
@@ -91,7 +90,7 @@ class Case:
         return self.labels - (self.labels > self.left_out)
 
 
-def learn(task: CaseTask, sweeps: LabelledSweeps) -> Case:
+def learn(task: CaseTask, sweeps: Dataset) -> Case:
     """Train, and look at every sweep with the trunk that came out.
 
     Raises FormatError where the method is none of the compact family, or cannot work with this set.
@@ -105,7 +104,7 @@ def learn(task: CaseTask, sweeps: LabelledSweeps) -> Case:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).made  # type: ignore[attr-defined]
-    *looked, fixed, copies = seen(made)
+    *looked, fixed, copies = posthoc_inputs(made)
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
         task.left_out, task.fold, fixed, *looked, copies.features, copies.labels, copies.groups,
@@ -114,18 +113,18 @@ def learn(task: CaseTask, sweeps: LabelledSweeps) -> Case:
 
 
 def tasks(
-    sweeps: LabelledSweeps, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int
+    sweeps: Dataset, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int
 ) -> list[CaseTask]:
     """Every fold with all materials, and without each of them in turn where at least two remain."""
     out = [NOBODY, *(range(len(sweeps.materials)) if len(sweeps.materials) > 2 else [])]
     return [CaseTask(method, effort, seed, i, *fold, left) for left in out for i, fold in enumerate(folds)]
 
 
-def cases(wanted: Sequence[CaseTask], sweeps: LabelledSweeps, where: Where, log: Log) -> list[Case]:
+def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -> list[Case]:
     """The Case of each task in their order: kept ones from the cache, the others trained. log: is told how far it is."""
     data, held = digest(sweeps), {}
     keys = [fingerprint([data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
-                        methods.module_of(t.method), "train.calibration.completion") for t in wanted]  # fmt: skip
+                        methods.module_of(t.method), "train.calibration.posthoc") for t in wanted]  # fmt: skip
     for i, key in enumerate(keys):
         if where.cache and (case := _load(where.cache / f"{key}.case.npz")):
             held[i] = replace(case, fold=wanted[i].fold)
@@ -143,8 +142,8 @@ def cases(wanted: Sequence[CaseTask], sweeps: LabelledSweeps, where: Where, log:
 
 
 def run(
-    sweeps: LabelledSweeps, test: LabelledSweeps | None, protocol: str, method: str, where: Where, log: Log,
-    effort: Effort = methods.USUAL, seed: int = 1,
+    sweeps: Dataset, test: Dataset | None, protocol: str, method: str, where: Where, log: Log,
+    effort: Effort = methods.FULL_EFFORT, seed: int = 1,
 ) -> dict[str, Any]:  # fmt: skip
     """All figures, as results.json holds them. test: tested on this set; else `protocol` says what is left out.
 
@@ -152,7 +151,7 @@ def run(
     """
     start = time.monotonic()
     if test is not None:
-        both = join([sweeps.of_several(), test])
+        both = join([sweeps.require_materials(), test])
         protocol, whole_set = "split:set=0->1", both
     else:
         whole_set = sweeps
@@ -170,7 +169,7 @@ def run(
     return about | provenance() | told
 
 
-def _learn(numbered: tuple[int, CaseTask], sweeps: LabelledSweeps) -> Case:
+def _learn(numbered: tuple[int, CaseTask], sweeps: Dataset) -> Case:
     return learn(numbered[1], sweeps)
 
 

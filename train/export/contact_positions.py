@@ -21,7 +21,7 @@ from appliance.inference.classifier import Classifier
 from appliance.signal.contact import MOST_POSITIONS, ContactPositions, centre
 from appliance.sim import skin
 from train.calibration import novelty
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.evaluation.robustness_data import EvaluationSweeps
 from train.metrics.score import interval, provenance
 
@@ -37,7 +37,7 @@ FALL = 0.05
 """Accuracy counts as lost where it is so far below that of a skin in its place."""
 
 
-def place_of(sweeps: LabelledSweeps, contact: float, pitch_mm: float | None = None) -> ContactPositions | None:
+def place_of(sweeps: Dataset, contact: float, pitch_mm: float | None = None) -> ContactPositions | None:
     """Where the contact lay at each position of a training set (else at each recording); None where nothing says how
     far apart the taxels are, or nothing touched them.
 

@@ -19,13 +19,13 @@ from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.sim import skin
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
 from train.models import networks
 from train.models.compact.fit import Fit
 from train.models.compact.network import Compact
-from train.models.methods import given
+from train.models.methods import model_inputs
 from train.models.neural_methods import PAPER_INT8
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import with_head
@@ -85,7 +85,7 @@ def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
         return content
     held = content.held
     found = parity.measure(
-        content.model, given(content.input, held), held.labels, reference, held.group(content.held_by)
+        content.model, model_inputs(content.input, held), held.labels, reference, held.group(content.held_by)
     )
     check(found)
     return replace(content, figures=content.figures | {"parity": found.summary()})
@@ -123,7 +123,7 @@ def check(found: Parity) -> None:
         )
 
 
-def compared(source: Path, sweeps: LabelledSweeps, file: Path | None = None) -> str:
+def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
     """The table of float against int8 on `sweeps`; source: a fit, or a bundle, which has no float form. file: JSON.
 
     Raises FormatError where formats or materials differ, or nothing is in int8.
@@ -141,7 +141,7 @@ def compared(source: Path, sweeps: LabelledSweeps, file: Path | None = None) -> 
             f"{source.name} is of {form} and {', '.join(materials)}; {sweeps.source} of {sweeps.format} and "
             f"{', '.join(sweeps.materials)}: name a set of the same kind"
         )
-    found = parity.measure(model, given(kind, sweeps), sweeps.labels, reference, sweeps.group("recording"))
+    found = parity.measure(model, model_inputs(kind, sweeps), sweeps.labels, reference, sweeps.group("recording"))
     if file:
         told = {"model": source.name, "set": sweeps.source} | found.json() | provenance()
         put(file, (json.dumps(told, indent=1) + "\n").encode(), parents=True)

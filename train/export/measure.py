@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from appliance.bundle import bundle
 from appliance.core.errors import BundleError
 from appliance.core.provenance import commit
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.export import measure_process, pack
 from train.models import minirocket
-from train.models.heads import hold_out
-from train.models.methods import Method, given
+from train.models.linear_head import hold_out
+from train.models.methods import Method, model_inputs
 from train.models.training import one_thread
 from train.onnx_tools import cost
 
@@ -70,7 +70,7 @@ class Packed:
         )
 
 
-def packed(method: Method, sweeps: LabelledSweeps, seed: int, folder: Path) -> list[Packed]:
+def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Packed]:
     """Train `method` on four fifths of `sweeps` and pack all its forms; what lies in `folder` is not made again.
 
     Raises FormatError where the method cannot work with the set, ExportRefused where it would be no model on the box.
@@ -87,10 +87,10 @@ def packed(method: Method, sweeps: LabelledSweeps, seed: int, folder: Path) -> l
     return [Packed(**one | {"method": method.name, "folder": folder / one["folder"]}) for one in told]
 
 
-def _made(method: Method, sweeps: LabelledSweeps, seed: int, work: Path) -> Iterator[dict[str, Any]]:
+def _made(method: Method, sweeps: Dataset, seed: int, work: Path) -> Iterator[dict[str, Any]]:
     """Each form packed in a folder of its own; then the method as its own library runs it, where it has one."""
     train, held, by = hold_out(sweeps, seed)
-    model = method.train(train, given(method.input, train), seed)
+    model = method.train(train, model_inputs(method.input, train), seed)
     ran = getattr(model, "ran", "")
     counted = {}
     for form, one in {"": model, **getattr(model, "forms", {})}.items():
@@ -114,21 +114,21 @@ def _made(method: Method, sweeps: LabelledSweeps, seed: int, work: Path) -> Iter
         yield counted[""] | {"runtime": runtime, "folder": runtime}
 
 
-def _torch(model: Any, train: LabelledSweeps, seed: int, folder: Path) -> None:
+def _torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
     """The network as TorchScript, which needs none of our code to be read."""
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.jit.trace(model.network.eval(), torch.from_numpy(train.samples[:1])).save(folder / measure_process.TORCH)
 
 
-def _aeon(model: Any, train: LabelledSweeps, seed: int, folder: Path) -> None:
+def _aeon(model: Any, train: Dataset, seed: int, folder: Path) -> None:
     """aeon's parameters, fitted to the same sweeps once more, and the head that was trained on its features."""
     named = {f"p{i}": p for i, p in enumerate(minirocket.fitted(train.samples, seed))}
     silence = np.zeros((1, train.format.rows * train.format.cols, train.format.window), np.float32)
     np.savez_compressed(folder / measure_process.AEON, silence=silence, weight=model.weight, bias=model.bias, **named)
 
 
-GUESTS: Mapping[str, tuple[str, Callable[[Any, LabelledSweeps, int, Path], None]]] = {
+GUESTS: Mapping[str, tuple[str, Callable[[Any, Dataset, int, Path], None]]] = {
     "paper-cnn-centred": ("torch", _torch),
     "minirocket": ("aeon", _aeon),
 }

@@ -26,13 +26,13 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier, softmax
-from train.calibration.completion import complete
-from train.data.sets import LabelledSweeps
+from train.calibration.posthoc import calibrate
+from train.data.sets import Dataset
 from train.export.contact_positions import place_of
 from train.metrics.score import figure
 from train.models.compact.fit import Fit
-from train.models.heads import hold_out
-from train.models.methods import Method, given
+from train.models.linear_head import hold_out
+from train.models.methods import Method, model_inputs
 from train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
@@ -61,8 +61,8 @@ class Content:
 
     model: onnx.ModelProto
     input: str
-    train: LabelledSweeps
-    held: LabelledSweeps
+    train: Dataset
+    held: Dataset
     held_by: str
     about: dict[str, Any]
     figures: dict[str, Any] = field(default_factory=dict)
@@ -85,7 +85,7 @@ def pack(
     """
     content = completed(content)
     train, held = content.train, content.held
-    logits = run(content.model, given(content.input, train))
+    logits = run(content.model, model_inputs(content.input, train))
     golden = golden_sweeps(train, logits, named_by_means(content, train) if content.known else logits)
     files = {bundle.MODEL: content.model.SerializeToString(), bundle.GOLDEN: golden}
     files |= {bundle.MEANS: content.means} if content.known else {}
@@ -100,14 +100,16 @@ def pack(
         for file, data in files.items():
             (folder / file).write_bytes(data)
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
-        figures = judge(folder, held, run(content.model, given(content.input, held)), f"held-out {content.held_by}")
+        figures = judge(
+            folder, held, run(content.model, model_inputs(content.input, held)), f"held-out {content.held_by}"
+        )
         manifest = replace(manifest, figures=figures | content.figures)
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         bundle.load(folder)
     return manifest
 
 
-def trained(method: Method, sweeps: LabelledSweeps, seed: int) -> Content:
+def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
     """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, which judge it.
 
     Raises FormatError for a method whose features the box does not compute.
@@ -118,7 +120,7 @@ def trained(method: Method, sweeps: LabelledSweeps, seed: int) -> Content:
             "compare it with evaluate, and pack another"
         )
     train, held, by = hold_out(sweeps, seed)
-    model = method.train(train, given(method.input, train), seed)
+    model = method.train(train, model_inputs(method.input, train), seed)
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
     forms = getattr(model, "forms", {})
     reference = forms["float"].graph() if "float" in forms else None
@@ -133,7 +135,7 @@ def completed(content: Content) -> Content:
     if made is None or made.train.materials != content.train.materials:
         return content
     try:
-        done = complete(made)
+        done = calibrate(made)
     except FormatError:  # too few groups: nothing could judge
         return content
     rule = done.rule
@@ -144,7 +146,7 @@ def completed(content: Content) -> Content:
     )  # fmt: skip
 
 
-def named_by_means(content: Content, sweeps: LabelledSweeps) -> Array:
+def named_by_means(content: Content, sweeps: Dataset) -> Array:
     """Logits [N, K] as the box computes them from class means where a label is enrolled, not cooled."""
     embedding = onnx.ModelProto()
     embedding.CopyFrom(content.model)
@@ -156,7 +158,7 @@ def named_by_means(content: Content, sweeps: LabelledSweeps) -> Array:
     return named
 
 
-def golden_sweeps(sweeps: LabelledSweeps, logits: Array, also: Array) -> bytes:
+def golden_sweeps(sweeps: Dataset, logits: Array, also: Array) -> bytes:
     """An .npz of one training sweep of the first and the last material, and their logits.
 
     Of those that are recognised, by the logits `also` too, it is the one whose probability is the median: neither so sure that a small fault does
@@ -174,7 +176,7 @@ def golden_sweeps(sweeps: LabelledSweeps, logits: Array, also: Array) -> bytes:
     return packed.getvalue()
 
 
-def thresholds(sweeps: LabelledSweeps, full_scale: float | None) -> bundle.Thresholds:
+def thresholds(sweeps: Dataset, full_scale: float | None) -> bundle.Thresholds:
     """What a window must reach: a tenth of the weakest contact in training, the strongest taxel's mean."""
     weakest = float(sweeps.samples.mean(axis=1, dtype=np.float64).max(axis=(1, 2)).min())
     kind = sweeps.samples.dtype
@@ -184,7 +186,7 @@ def thresholds(sweeps: LabelledSweeps, full_scale: float | None) -> bundle.Thres
     return bundle.Thresholds(contact=contact, full_scale=float(top if full_scale is None else full_scale))
 
 
-def score(classifier: Classifier, sweeps: LabelledSweeps, *, fused: bool = False) -> Array:
+def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> Array:
     """Labels that the box gives, int64 [N] into the bundle's, or REFUSED or UNKNOWN.
 
     fused: each sweep gets what the box says after all of its recording.
@@ -203,7 +205,7 @@ def score(classifier: Classifier, sweeps: LabelledSweeps, *, fused: bool = False
     return given
 
 
-def figures(classifier: Classifier, sweeps: LabelledSweeps, protocol: str) -> dict[str, Any]:
+def figures(classifier: Classifier, sweeps: Dataset, protocol: str) -> dict[str, Any]:
     """Accuracy by sweep, and by recording where one holds several; what the box refuses or does not know is wrong."""
     right = score(classifier, sweeps) == sweeps.labels
     told = {protocol: figure(int(right.sum()), len(sweeps))}
@@ -214,7 +216,7 @@ def figures(classifier: Classifier, sweeps: LabelledSweeps, protocol: str) -> di
     return told
 
 
-def judge(folder: Path, held: LabelledSweeps, logits: Array, protocol: str) -> dict[str, Any]:
+def judge(folder: Path, held: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
     """Figures of the bundle in `folder` on `held`, run as the box runs it; `logits` [N, K]: what export saw there.
 
     Raises ExportRefused where the box gives another label than export, or refuses too many sweeps.

@@ -30,6 +30,6 @@ def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float
     return features.compute(kind, taxels, rate_hz, KINDS)
 
 
-def given(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
+def graph_input(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
     """What a graph with the input `kind` is given of raw counts [T, R, C]: them where it is "raw", else `compute`."""
     return features.given(kind, taxels, rate_hz, KINDS)

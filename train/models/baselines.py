@@ -32,8 +32,8 @@ from sklearn.svm import SVC
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import LEAST_PROBABILITY
 from appliance.inference.session import session
-from train.data.sets import LabelledSweeps
-from train.models.heads import temperature
+from train.data.sets import Dataset
+from train.models.linear_head import temperature
 from train.models.methods import Method
 from train.onnx_tools.graph_builder import IR, OPSET, GraphBuilder
 
@@ -138,14 +138,14 @@ class FeatureModel:
         return np.array(rows, np.float32).reshape(-1, classes)
 
 
-def learn(make: Callable[[], Estimator], sweeps: LabelledSweeps, given: Array, seed: int) -> FeatureModel:
+def learn(make: Callable[[], Estimator], sweeps: Dataset, given: Array, seed: int) -> FeatureModel:
     """Train what `make` makes on features `given` float32 [N, F] of `sweeps`; nothing in it is random.
 
     The temperature is that of the sweeps held out in turn: by position, or by recording where there are not several or
     each position has its own materials; 1 where nothing can be held out.
     Raises FormatError where there are too few sweeps or only one material.
     """
-    if len(sweeps.of_several()) < NEIGHBOURS:
+    if len(sweeps.require_materials()) < NEIGHBOURS:
         raise FormatError(f"{sweeps.source}: {len(sweeps)} sweeps are too few to learn from; give {NEIGHBOURS} or more")
     seen, labels, classes = given.astype(np.float64), sweeps.labels, len(sweeps.materials)
     logits, truth = [np.empty((0, classes))], [labels[:0]]
@@ -158,7 +158,7 @@ def learn(make: Callable[[], Estimator], sweeps: LabelledSweeps, given: Array, s
     return FeatureModel(written(make().fit(seen, labels), classes, cooler))
 
 
-def _folds(sweeps: LabelledSweeps) -> Iterator[tuple[Array, Array]]:
+def _folds(sweeps: Dataset) -> Iterator[tuple[Array, Array]]:
     """(training, held-out) numbers of sweeps; held out are only sweeps whose material is in training."""
     names = ("position", "recording") if "position" in sweeps.groups else ("recording",)
     for group in map(sweeps.group, names):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.signal import features
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.features import kinds
 
 Array = NDArray[Any]
@@ -45,7 +45,7 @@ class Effort:
     bfloat16: bool = False
 
 
-USUAL = Effort()
+FULL_EFFORT = Effort()
 
 
 class Model(Protocol):
@@ -79,7 +79,7 @@ class Method:
     name: str
     about: str
     input: str
-    train: Callable[[LabelledSweeps, Array, int], Model]
+    train: Callable[[Dataset, Array, int], Model]
     extra: str = ""
     effort: str = ""
 
@@ -89,24 +89,24 @@ class Method:
         return self.input == "raw" or self.input in features.KINDS
 
 
-def given(kind: str, sweeps: LabelledSweeps) -> Array:
+def model_inputs(kind: str, sweeps: Dataset) -> Array:
     """What a method with the input `kind` is given of `sweeps`: their digits, or float32 [N, F] as the box computes."""
     if kind == "raw":
         return sweeps.samples
     return np.stack([kinds.compute(kind, digits, sweeps.rate_hz) for digits in sweeps.samples])
 
 
-def every(effort: Effort = USUAL) -> dict[str, Method]:
+def every(effort: Effort = FULL_EFFORT) -> dict[str, Method]:
     """All methods by name."""
     return {method.name: method for name in MODULES for method in _of(import_module(name), effort)}
 
 
 def module_of(name: str) -> str:
     """The full name of the module that holds the method `name`, which is known."""
-    return next(module for module in MODULES if name in {m.name for m in _of(import_module(module), USUAL)})
+    return next(module for module in MODULES if name in {m.name for m in _of(import_module(module), FULL_EFFORT)})
 
 
-def find(names: Sequence[str], effort: Effort = USUAL) -> list[Method]:
+def find(names: Sequence[str], effort: Effort = FULL_EFFORT) -> list[Method]:
     """The methods of these names. Raises FormatError naming one that is unknown."""
     known = every(effort)
     for name in names:

@@ -17,8 +17,8 @@ from sklearn.preprocessing import StandardScaler
 
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from train.data.sets import LabelledSweeps
-from train.models.linear_head import Headed, headed
+from train.data.sets import Dataset
+from train.models.linear_head import LinearHeadModel, train_linear_head
 from train.models.methods import Method
 from train.onnx_tools.graph_builder import GraphBuilder
 
@@ -31,12 +31,14 @@ ALPHAS = np.logspace(-3, 3, 10)
 """Ridge penalties that leave-one-out chooses from: what aeon's MiniRocketClassifier and the authors' code use."""
 
 
-def train(sweeps: LabelledSweeps, given: Array, seed: int) -> Headed:
+def train(sweeps: Dataset, given: Array, seed: int) -> LinearHeadModel:
     """MiniRocket and ridge on `given`, the digits [N, T, R, C] of `sweeps`.
 
     Raises FormatError where aeon is missing, a window is shorter than a kernel, or `sweeps` are too few.
     """
-    return headed(transform(sweeps.of_several().format, fitted(given, seed)), _ridge, sweeps, given, seed)
+    return train_linear_head(
+        transform(sweeps.require_materials().format, fitted(given, seed)), _ridge, sweeps, given, seed
+    )
 
 
 def fitted(given: Array, seed: int) -> tuple[Array, ...]:

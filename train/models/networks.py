@@ -21,7 +21,7 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from appliance.core.types import SweepFormat
-from train.models.heads import ABSENT
+from train.models.linear_head import ABSENT
 from train.onnx_tools.graph_builder import GraphBuilder, centred
 
 STATE, PATCHES, LEAST_PATCH = 64, 128, 8

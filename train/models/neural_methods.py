@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from train.data.sets import LabelledSweeps
-from train.models.heads import hold_out, temperature
-from train.models.methods import USUAL, Effort, Method, Model
+from train.data.sets import Dataset
+from train.models.linear_head import hold_out, temperature
+from train.models.methods import FULL_EFFORT, Effort, Method, Model
 from train.models.networks import PAPER, TACTNET2, ImageNetwork, Network, Recurrent, texture_scale
 from train.models.training import Cost, Log, TrainingRecipe, in_order, learn, one_thread, silent, tensors
-from train.onnx_tools.graph_builder import Graphed
+from train.onnx_tools.graph_builder import GraphModel
 from train.onnx_tools.quantize import quantize
 
 Array = NDArray[Any]
@@ -49,7 +49,7 @@ LEAST_STEPS = 2
 
 
 @dataclass(frozen=True)
-class Trained:
+class NetworkModel:
     """A trained network as a Model. ran: what was computed, and how. cost: (iteration, cross entropy) in training.
 
     forms: the same in other precisions.
@@ -108,7 +108,7 @@ def _statistics(samples: Array) -> tuple[float, float]:
 
 
 def train_network(
-    sweeps: LabelledSweeps,
+    sweeps: Dataset,
     given: Array,
     seed: int,
     *,
@@ -118,7 +118,7 @@ def train_network(
     bfloat16: bool,
     log: Log,
     int8: Sequence[str] = (),
-) -> Trained:
+) -> NetworkModel:
     """Train what `build` gives. calibrated: hold some groups out for the temperature; else all are trained on, with 1.
 
     int8: kinds of nodes that the form "int8" has in int8; where there are none there is no such form.
@@ -130,13 +130,13 @@ def train_network(
         half = bfloat16 and (device == "cuda" or bool(torch.cpu.get_capabilities().get("avx512_bf16")))
         network = build(train.format, len(train.materials), train.samples)
         network, cost = learn(network, train, recipe, seed, log, device, half)
-        trained = Trained(network, ran(recipe, device, half, bfloat16), cost)
+        trained = NetworkModel(network, ran(recipe, device, half, bfloat16), cost)
     cooler = temperature(trained.logits(held.samples), held.labels) if calibrated else 1.0
     network.spread(np.unique(sweeps.labels), len(sweeps.materials), cooler)
-    return replace(trained, forms={"int8": Graphed(quantize(network.graph(), train.samples, int8))} if int8 else {})
+    return replace(trained, forms={"int8": GraphModel(quantize(network.graph(), train.samples, int8))} if int8 else {})
 
 
-def parts(sweeps: LabelledSweeps, seed: int) -> tuple[LabelledSweeps, LabelledSweeps, str]:
+def parts(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
     """As heads.hold_out; too small a set is trained on whole, and there Platt's doubt alone bounds the temperature."""
     try:
         return hold_out(sweeps, seed)
@@ -164,7 +164,7 @@ def shortened(recipe: Rules, effort: Effort) -> Rules:
     return replace(recipe, steps=max(round(recipe.steps * effort.share), LEAST_STEPS))
 
 
-def methods(effort: Effort = USUAL, log: Log = silent) -> tuple[Method, ...]:
+def methods(effort: Effort = FULL_EFFORT, log: Log = silent) -> tuple[Method, ...]:
     """The neural methods, trained with this effort. log: is told of every iteration."""
     steps = effort.paper_steps
     if steps is None:

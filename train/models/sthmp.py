@@ -21,8 +21,8 @@ from sklearn.svm import LinearSVC
 
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from train.data.sets import LabelledSweeps
-from train.models.linear_head import Headed, headed
+from train.data.sets import Dataset
+from train.models.linear_head import LinearHeadModel, train_linear_head
 from train.models.methods import Method
 from train.onnx_tools.graph_builder import GraphBuilder, run
 
@@ -44,19 +44,19 @@ CONTRAST = 0.1
 """Added to a cell's squared length, as in HMP: a silent cell stays silent."""
 
 
-def train(sweeps: LabelledSweeps, given: Array, seed: int) -> Headed:
+def train(sweeps: Dataset, given: Array, seed: int) -> LinearHeadModel:
     """ST-HMP and a linear SVM on `given`, the digits [N, T, R, C] of `sweeps`.
 
     Raises FormatError where a window is too short, or `sweeps` are too few.
     """
-    form = sweeps.of_several().format
+    form = sweeps.require_materials().format
     if form.window < LEAST:
         raise FormatError(f"a window of {form.window} frames is too short for st-hmp; record at least {LEAST}")
     rng = np.random.default_rng(seed)
     patches = sampled(given, rng)
     scale = 1 / max(float(np.sqrt(np.mean(patches**2))), 1e-6)
     atoms = dictionary(patches * scale, rng)
-    return headed(pooled(form, atoms, scale), _svm, sweeps, given, seed)
+    return train_linear_head(pooled(form, atoms, scale), _svm, sweeps, given, seed)
 
 
 def sampled(given: Array, rng: np.random.Generator) -> Array:

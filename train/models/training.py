@@ -1,4 +1,4 @@
-"""The room of the training loop, one for all networks. In: a Network, a LabelledSweeps, a TrainingRecipe. Out: it trained, the cost.
+"""The room of the training loop, one for all networks. In: a Network, a Dataset, a TrainingRecipe. Out: it trained, the cost.
 
 Sweeps are drawn and augmented with a generator of their own; no random state outside is read or changed as long as the
 caller forks PyTorch's.
@@ -18,7 +18,7 @@ from torch import Generator, Tensor
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.models.networks import Network
 
 Array = NDArray[Any]
@@ -84,7 +84,7 @@ def unsettled(x: Tensor, recipe: TrainingRecipe, rng: Generator) -> Tensor:
 
 def learn(
     model: Net,
-    sweeps: LabelledSweeps,
+    sweeps: Dataset,
     recipe: TrainingRecipe,
     seed: int,
     log: Log = silent,

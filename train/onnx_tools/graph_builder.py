@@ -88,7 +88,7 @@ def with_head(trunk: onnx.ModelProto, weight: NDArray[Any], bias: NDArray[Any]) 
 
 
 @dataclass(frozen=True)
-class Graphed:
+class GraphModel:
     """A methods.Model that is nothing but its graph."""
 
     model: onnx.ModelProto

@@ -26,8 +26,8 @@ from train.export import measure
 from train.export.measure import Packed
 from train.metrics import score
 from train.models import methods
-from train.models.compact.architectures import LADDER
-from train.models.methods import USUAL, Effort
+from train.models.compact.architectures import ARCHITECTURES
+from train.models.methods import FULL_EFFORT, Effort
 from train.reports import chart_page, scatter
 
 Json = dict[str, Any]
@@ -63,7 +63,7 @@ class ChartPart:
     only: tuple[str, ...] = ()
     real: bool = False
 
-    def load(self, data: Path | None) -> sets.LabelledSweeps | None:
+    def load(self, data: Path | None) -> sets.Dataset | None:
         """Its sweeps; None where they are real and nobody said where."""
         if self.real and data is None:
             return None
@@ -87,7 +87,7 @@ class Chart:
     rounds: int = measure.ROUNDS
 
 
-RUNGS = ("compact", *(f"compact-{size}" for size in LADDER))
+RUNGS = ("compact", *(f"compact-{size}" for size in ARCHITECTURES))
 FULL = Chart(
     {
         "hard": ChartPart(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1"),
@@ -122,7 +122,7 @@ class Charting:
     where: Where
     log: Log
     data: Path | None = None
-    effort: Effort = USUAL
+    effort: Effort = FULL_EFFORT
     seeds: Sequence[int] = (1,)
     touch: Json = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)

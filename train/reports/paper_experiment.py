@@ -26,7 +26,7 @@ from train.evaluation.evaluate import Plan, Result, Where, evaluate
 from train.evaluation.parallel import spoken
 from train.metrics import score
 from train.models import methods, prior_work
-from train.models.methods import USUAL, Effort
+from train.models.methods import FULL_EFFORT, Effort
 from train.reports import paper_page, paper_printed
 
 Array = NDArray[Any]
@@ -54,7 +54,7 @@ class PaperPart:
     folds: int
     only: tuple[str, ...] = ()
 
-    def load(self, world: int) -> sets.LabelledSweeps:
+    def load(self, world: int) -> sets.Dataset:
         """Its sweeps."""
         last = ATTACHMENTS * world
         names = [name.format(w=world, a=last - ATTACHMENTS + 1, b=last) for name in self.sets]
@@ -149,7 +149,7 @@ class Outcome:
         return self.logits.argmax(1) == self.labels
 
 
-def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effort: Effort = USUAL) -> Path:
+def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effort: Effort = FULL_EFFORT) -> Path:
     """Train and test all of the plan, write results.json, the pictures and the page into `out`; the page's path.
 
     quick: a few sweeps and iterations of everything, whatever `effort` says. Raises FormatError as evaluate.
@@ -196,7 +196,7 @@ def _outcomes(
             pace = took / expected[i]
 
 
-def summary(outcomes: Sequence[Outcome], parts: dict[str, PaperPart], effort: Effort = USUAL) -> dict[str, Any]:
+def summary(outcomes: Sequence[Outcome], parts: dict[str, PaperPart], effort: Effort = FULL_EFFORT) -> dict[str, Any]:
     """All that the page tells, as plain numbers; see story.py, which reads it."""
     held: dict[tuple[str, str], list[Outcome]] = {}
     for outcome in outcomes:

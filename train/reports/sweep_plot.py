@@ -109,7 +109,7 @@ def _recorded(one: RecordedSweep) -> Look:
     )  # fmt: skip
 
 
-def _of_set(held: sets.LabelledSweeps, number: int) -> Look:
+def _of_set(held: sets.Dataset, number: int) -> Look:
     """A sweep of a set with its groups."""
     named = [held.materials[held.labels[number]], *(f"{by} {v[number]}" for by, v in sorted(held.groups.items()))]
     taxels = held.samples[number]

@@ -18,7 +18,7 @@ from scipy.stats import t as student
 
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
-from train.data.sets import LabelledSweeps, digest
+from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol
 from train.data.transforms import WHOLE, Change
 from train.evaluation import corruptions, parallel
@@ -51,7 +51,7 @@ class HeldOutPart:
     out: Array = field(repr=False)
 
 
-def parts(sweeps: LabelledSweeps, varies: Sequence[str], folds: int = 0) -> list[HeldOutPart]:
+def parts(sweeps: Dataset, varies: Sequence[str], folds: int = 0) -> list[HeldOutPart]:
     """The parts of all groups `varies`; of recordings, materials spread evenly, where nothing varies.
 
     Raises FormatError where a group has a single value, cuts recordings, or takes a material along when left out.
@@ -71,7 +71,7 @@ def parts(sweeps: LabelledSweeps, varies: Sequence[str], folds: int = 0) -> list
     return found
 
 
-def _part(sweeps: LabelledSweeps, name: str, values: Array) -> HeldOutPart:
+def _part(sweeps: Dataset, name: str, values: Array) -> HeldOutPart:
     told = ", ".join(map(str, sorted(values.tolist())[:5]))
     out = np.isin(sweeps.group(name), values)
     recording = sweeps.group("recording")
@@ -109,7 +109,7 @@ class Trials:
     """
 
     def __init__(
-        self, sweeps: LabelledSweeps, scene: Scene, effort: methods.Effort, where: Where, log: Callable[[str], None]
+        self, sweeps: Dataset, scene: Scene, effort: methods.Effort, where: Where, log: Callable[[str], None]
     ) -> None:
         self.sweeps, self._effort, self._where, self._log = sweeps, effort, where, log
         self.seeds = range(1, scene.seeds + 1)

@@ -25,7 +25,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.storage import put
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
-from train.data.sets import LabelledSweeps, digest
+from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
 from train.export import pack
@@ -81,7 +81,7 @@ def ladder(scene: Scene) -> list[str]:
 
 
 def prices(
-    names: Sequence[str], sweeps: LabelledSweeps, scene: Scene, effort: Effort, where: Where, log: Callable[[str], None]
+    names: Sequence[str], sweeps: Dataset, scene: Scene, effort: Effort, where: Where, log: Callable[[str], None]
 ) -> dict[str, Price]:
     """The price of each method, cheapest first and refused ones last. Measured one after another, and kept."""
     found, data = {}, digest(sweeps)
@@ -99,7 +99,7 @@ def prices(
     return dict(sorted(found.items(), key=lambda item: (bool(item[1].refused), item[1].cost(scene.budget))))
 
 
-def _price(method: Method, sweeps: LabelledSweeps, scene: Scene) -> Price:
+def _price(method: Method, sweeps: Dataset, scene: Scene) -> Price:
     try:
         with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
             content = pack.trained(method, sweeps, 1)
@@ -110,7 +110,7 @@ def _price(method: Method, sweeps: LabelledSweeps, scene: Scene) -> Price:
         return Price(refused=str(e))
 
 
-def measured(folder: Path, sweeps: LabelledSweeps) -> Price:
+def measured(folder: Path, sweeps: Dataset) -> Price:
     """The price of the bundle in `folder`, timed on `sweeps`."""
     box = Classifier(bundle.load(folder), SystemClock())
     form, n = sweeps.format, np.arange(sweeps.format.window)

@@ -20,7 +20,7 @@ import numpy as np
 from appliance.bundle.bundle import LABEL
 from appliance.core.errors import FormatError
 from train.data import sets
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.evaluation import corruptions
 from train.models import methods
 
@@ -124,7 +124,7 @@ class Scene:
     budget: Budget = Budget()
     path: Path = Path()
 
-    def sweeps(self) -> LabelledSweeps:
+    def sweeps(self) -> Dataset:
         """The sweeps at hand, narrowed and merged. Raises FormatError naming scene.toml and what does not fit the sets."""
         whole = sets.join([sets.load(self._place(spec), 1) for spec in self.sets]).select(self.only)
         known = whole.materials
@@ -141,7 +141,7 @@ class Scene:
                 )
         at = np.array([labels.index(new.get(m, m)) if m in kept else -1 for m in known])[whole.labels]
         part = whole.take(at >= 0)
-        part = replace(part, labels=at[at >= 0], materials=labels).of_several().of_whole_recordings()
+        part = replace(part, labels=at[at >= 0], materials=labels).require_materials().require_pure_recordings()
         for name in self.varies:
             if name not in {"recording", *part.groups}:
                 raise self._error("varies", name, (*sorted(part.groups), "recording"))

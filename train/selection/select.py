@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import ApplianceError, FormatError
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.evaluation.evaluate import Where
 from train.models import methods
 from train.selection import prices as rungs
@@ -174,7 +174,7 @@ class Selection:
         ]
 
 
-def choose(sweeps: LabelledSweeps, scene: Scene, effort: methods.Effort, where: Where, log: Log) -> Selection:
+def choose(sweeps: Dataset, scene: Scene, effort: methods.Effort, where: Where, log: Log) -> Selection:
     """Climb the ladder. Raises NothingFits where no rung can be taken, and FormatError where the scene cannot be judged."""
     trials = Trials(sweeps, scene, effort, where, log)
     alone = [p for p in range(len(trials.parts)) if not trials.seen_from(p)]

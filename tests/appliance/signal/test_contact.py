@@ -38,7 +38,7 @@ from appliance.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import SECOND, idle_world
 from train.data import sets
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.export import contact_positions
 from train.reports import contact_report
 
@@ -420,12 +420,12 @@ def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal
     assert text.count("reading the unloaded skin") >= 1
 
 
-def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> LabelledSweeps:
+def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> Dataset:
     """A set with `each` sweeps at each of these places, in taxels."""
     samples = np.stack([np.stack([patch(*at)] * 3) for at in places for _ in range(each)]).astype(np.float32)
     n = len(samples)
     numbers = {group: 7 + 2 * (np.arange(n) // each)}
-    return LabelledSweeps(samples, np.arange(n) % 2, ("a", "b"), 100.0, numbers, "recorded")
+    return Dataset(samples, np.arange(n) % 2, ("a", "b"), 100.0, numbers, "recorded")
 
 
 def test_the_places_of_a_training_set():

@@ -104,7 +104,7 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
 def test_temperatures_make_each_step_honest():
     """Crossed over places, the mean of the highest probability is what is right, at every step."""
     x, y, at = tenths(40)
-    done = posthoc.finish(x, y, at, np.ones(len(y), bool))
+    done = posthoc.fit_posthoc(x, y, at, np.ones(len(y), bool))
     new, labels, _ = tenths(60, seed=9)
     p = done.probabilities(new)
     right = (p.argmax(2) == labels[:, None]).mean(0)
@@ -115,7 +115,7 @@ def test_temperatures_make_each_step_honest():
 def test_each_step_has_its_own_temperature():
     """The last temperature is the whole sweep's, each other one its own step's."""
     x, y, at = tenths(10, seed=3)
-    done, every = posthoc.finish(x, y, at, np.ones(len(y), bool)), np.ones(len(y), bool)
+    done, every = posthoc.fit_posthoc(x, y, at, np.ones(len(y), bool)), np.ones(len(y), bool)
     logits, numbers = early_exit.crossed(x, y, at, every)
     cooler = early_exit.temperatures(logits, y[numbers])
     assert len(set(cooler)) > 2
@@ -128,16 +128,16 @@ def test_a_material_of_one_place_and_two_materials():
     """A material that only one place has is still learned; of two materials, too: nothing is NaN."""
     x, y, at = tenths(20)
     keep = (y != 2) | (at == 0)
-    done = posthoc.finish(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool))
+    done = posthoc.fit_posthoc(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool))
     assert np.isfinite(done.probabilities(x)).all()
     assert (done.logits(x[:, -1]).argmax(1) == y).mean() > 0.9
-    two = posthoc.finish(x[y < 2], y[y < 2], at[y < 2], at[y < 2] < 4)
+    two = posthoc.fit_posthoc(x[y < 2], y[y < 2], at[y < 2], at[y < 2] < 4)
     assert np.isfinite(two.probabilities(x[y < 2])).all()
 
 
 @pytest.fixture(scope="module")
 def made():
-    """A bundle's parts on the toy trunk, one of whose features nobody trained: Finish, model, digits, labels, whole Bundle."""
+    """A bundle's parts on the toy trunk, one of whose features nobody trained: Posthoc, model, digits, labels, whole Bundle."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(3), 4), 6)
     level = np.array([[[20, 60], [40, 40]], [[60, 20], [40, 40]], [[40, 40], [60, 20]]])
@@ -145,7 +145,7 @@ def made():
     digits = np.rint(digits + rng.normal(0, 5, digits.shape)).astype(np.int16)
     trunks = trunk(FORM, True)
     x, size = run(trunks, digits), 1
-    done = posthoc.finish(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
+    done = posthoc.fit_posthoc(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
     model = done.graph(trunks)
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: done.means()}
@@ -158,7 +158,7 @@ def made():
 
 
 def test_the_graph_gives_what_training_computed(made):
-    """Logits, embedding and the heads of all tenths in the box's classifier are those of Finish."""
+    """Logits, embedding and the heads of all tenths in the box's classifier are those of Posthoc."""
     done, x, digits, _, whole = made
     box = classifier.Classifier(whole, SystemClock())
     box.self_test()

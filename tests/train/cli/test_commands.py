@@ -18,9 +18,9 @@ from tests.factories.sweep_sets import easy
 from train.cli.main import main
 from train.data import sets
 from train.metrics import score
-from train.models import heads
+from train.models import linear_head
 from train.models.compact import architectures, fit, spectrum
-from train.models.compact.architectures import LADDER, USUAL
+from train.models.compact.architectures import ARCHITECTURES, DEFAULT
 from train.models.compact.fit import Fit, FitRecipe
 from train.models.compact.network import Compact
 
@@ -35,10 +35,10 @@ def fitted() -> Fit:
 
 def test_stages_follow_the_window():
     """The kernels of the two windows that are known; every window gets a last stage, or a message."""
-    assert [(s.kernel, s.stride) for s in USUAL.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
-    assert [(s.kernel, s.stride) for s in USUAL.stages(128)] == [(4, 1), (5, 2), (5, 2)]
-    assert USUAL.stages(1500)[-1] == architectures.Stage(5, 2, 89, 32 + 4 * 4 + 4 * 8, 16)
-    for shape in (shape for shape in LADDER.values() if shape.channels):
+    assert [(s.kernel, s.stride) for s in DEFAULT.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
+    assert [(s.kernel, s.stride) for s in DEFAULT.stages(128)] == [(4, 1), (5, 2), (5, 2)]
+    assert DEFAULT.stages(1500)[-1] == architectures.Stage(5, 2, 89, 32 + 4 * 4 + 4 * 8, 16)
+    for shape in (shape for shape in ARCHITECTURES.values() if shape.channels):
         for window in range(16, 3000):
             last = shape.stages(window)[-1]
             assert last.steps >= (architectures.LEAST_STEPS if window >= 108 else 1)
@@ -47,16 +47,16 @@ def test_stages_follow_the_window():
             assert shape.cut(0, spectrum=True).stages(window) == ()
         with pytest.raises(FormatError, match="a window of 15 frames is too short"):
             shape.stages(15)
-    assert LADDER["bands"].stages(1500) == ()
+    assert ARCHITECTURES["bands"].stages(1500) == ()
 
 
 @pytest.mark.parametrize(("size", "weights"), [("1k", 1_442), ("20k", 18_558)])
 def test_compact_is_as_small_as_it_says(size: str, weights: int):
     """For the skin of the paper with six classes; what a shape costs is what its network holds."""
-    model = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=LADDER[size])
-    assert sum(p.numel() for p in model.parameters()) == weights == LADDER[size].cost(skin.FORMAT, 6).weights
+    model = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=ARCHITECTURES[size])
+    assert sum(p.numel() for p in model.parameters()) == weights == ARCHITECTURES[size].cost(skin.FORMAT, 6).weights
     assert model(torch.zeros(2, 1500, 4, 4)).shape == (2, 6)
-    more = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=replace(LADDER[size], spectrum=True))
+    more = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=replace(ARCHITECTURES[size], spectrum=True))
     assert sum(p.numel() for p in more.parameters()) == weights + 6 * spectrum.count(skin.FORMAT)
 
 
@@ -88,9 +88,9 @@ def test_temperature_finds_how_sure_to_be():
     rng = np.random.default_rng(0)
     honest = 2 * rng.standard_normal((4000, 4))
     labels = np.array([rng.choice(4, p=p) for p in np.exp(honest) / np.exp(honest).sum(1, keepdims=True)])
-    assert heads.temperature(5 * honest, labels) == pytest.approx(5, rel=0.1)
+    assert linear_head.temperature(5 * honest, labels) == pytest.approx(5, rel=0.1)
     sure = 50 * np.eye(3)[np.arange(9) % 3]
-    assert 50 / heads.temperature(sure, np.arange(9) % 3) < 6
+    assert 50 / linear_head.temperature(sure, np.arange(9) % 3) < 6
 
 
 def test_a_head_of_two_classes_has_two_logits():
@@ -98,7 +98,7 @@ def test_a_head_of_two_classes_has_two_logits():
     rng = np.random.default_rng(0)
     labels = np.arange(200) % 2
     seen = rng.standard_normal((200, 5)) + labels[:, None] * np.array([2, 0, 0, 0, 0])
-    weight, bias = heads.closed_form_head(seen, labels, seen, labels)
+    weight, bias = linear_head.closed_form_head(seen, labels, seen, labels)
     assert weight.shape == (2, 5)
     assert np.mean((seen @ weight.T + bias).argmax(1) == labels) > 0.8
 
@@ -159,8 +159,8 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
 
 def test_the_rung_without_convolutions_learns_its_head_alone(tmp_path: Path):
     """No iteration, no cost; it tells what is easy apart, and comes back from its file."""
-    made = fit.fit(easy(), 1, QUICK, shape=LADDER["bands"])
-    assert (made.shape, made.bands, made.cost) == (LADDER["bands"], 5, [])
+    made = fit.fit(easy(), 1, QUICK, shape=ARCHITECTURES["bands"])
+    assert (made.shape, made.bands, made.cost) == (ARCHITECTURES["bands"], 5, [])
     assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]
     assert made.about["validation"]["accuracy"] > 0.9
     made.save(tmp_path / "fit.npz")
@@ -172,7 +172,7 @@ def test_the_rung_without_convolutions_learns_its_head_alone(tmp_path: Path):
 
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     """Weights that are not of the shape that the file names, and a file from before there were shapes."""
-    replace(fitted, shape=LADDER["1k"]).save(tmp_path / "fit.npz")
+    replace(fitted, shape=ARCHITECTURES["1k"]).save(tmp_path / "fit.npz")
     with pytest.raises(
         FormatError,
         match=r"^fit.npz: its weights are not those of its Architecture\(channels=\(2, 6, 8\).*; fit again$",

@@ -349,4 +349,4 @@ def test_a_recording_is_never_unpickled(tmp_path: Path):
     np.save(tmp_path / "1.npy", np.array([{}], object), allow_pickle=True)
     before_crc(tmp_path / "1.json")
     with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep .*allow_pickle"):
-        readers.read(tmp_path, sets.LabelledSweeps)
+        readers.read(tmp_path, sets.Dataset)

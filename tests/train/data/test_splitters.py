@@ -11,18 +11,16 @@ from sklearn.model_selection import cross_val_score
 from sklearn.naive_bayes import GaussianNB
 
 from appliance.core.errors import FormatError
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.data.splitters import Protocol
 
 
-def a_set(labels: list[int], **groups: list[int]) -> LabelledSweeps:
+def a_set(labels: list[int], **groups: list[int]) -> Dataset:
     """Sweeps of one frame whose digit is their number."""
     n = len(labels)
     samples = np.arange(n, dtype=np.int16).reshape(n, 1, 1, 1)
     names = tuple("abcdef"[: max(labels) + 1])
-    return LabelledSweeps(
-        samples, np.array(labels), names, 100.0, {k: np.array(v) for k, v in groups.items()}, "made up"
-    )
+    return Dataset(samples, np.array(labels), names, 100.0, {k: np.array(v) for k, v in groups.items()}, "made up")
 
 
 GRID = a_set([k for _ in range(3) for k in (0, 0, 1, 1)], position=[p for p in range(3) for _ in range(4)],

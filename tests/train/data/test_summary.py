@@ -16,7 +16,7 @@ from train.cli.main import parser
 from train.data import sets, summary
 
 
-def lines(s: sets.LabelledSweeps) -> list[str]:
+def lines(s: sets.Dataset) -> list[str]:
     """What is told of a set."""
     return summary.described(s, {})
 

@@ -7,16 +7,16 @@ import pytest
 
 from appliance.core.errors import FormatError
 from train.data import transforms
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.data.transforms import WHOLE, Change
 
 
-def counting(shape: tuple[int, ...] = (2, 12, 2, 3), kind: str = "int16") -> LabelledSweeps:
+def counting(shape: tuple[int, ...] = (2, 12, 2, 3), kind: str = "int16") -> Dataset:
     """Digits that name sweep, frame and taxel: 1000 i + 10 t + m."""
     n, frames, rows, cols = shape
     taxel = np.arange(rows * cols).reshape(rows, cols)
     x = 1000 * np.arange(n)[:, None, None, None] + 10 * np.arange(frames)[:, None, None] + taxel
-    return LabelledSweeps(x.astype(kind), np.arange(n) % 2, ("a", "b"), 60.0, {"day": np.arange(n)}, "counting")
+    return Dataset(x.astype(kind), np.arange(n) % 2, ("a", "b"), 60.0, {"day": np.arange(n)}, "counting")
 
 
 def test_nothing_left_out_is_the_set_itself():
@@ -49,10 +49,10 @@ def test_frames_are_averaged(kind: str, mean: list[int]):
 def test_low_bits_are_cut_off():
     """Of whole digits, negative ones too; a float set counts as eight bits of its range."""
     x = np.array([-5, -1, 0, 3, 4, 127], np.int16).reshape(1, 6, 1, 1).repeat(2, 0)
-    cut = Change(bits=2).of(LabelledSweeps(x, np.array([0, 1]), ("a", "b"), 1.0))
+    cut = Change(bits=2).of(Dataset(x, np.array([0, 1]), ("a", "b"), 1.0))
     assert cut.samples[0].ravel().tolist() == [-8, -4, 0, 0, 4, 124]
     ramp = np.linspace(-1, 1, 4096, dtype=np.float32).reshape(1, -1, 1, 1).repeat(2, 0)
-    coarse = Change(bits=4).of(LabelledSweeps(ramp, np.array([0, 1]), ("a", "b"), 1.0)).samples
+    coarse = Change(bits=4).of(Dataset(ramp, np.array([0, 1]), ("a", "b"), 1.0)).samples
     assert len(np.unique(coarse)) == 17  # sixteen steps and the very top
     assert np.abs(coarse - ramp).max() <= 2 / 16
 
@@ -75,7 +75,7 @@ def test_changes_add_up():
     assert str(both) == "window 0.5, rate 2, taxels 1"
 
 
-def textured(tells: dict[int, list[float]], taxels: int = 9, each: int = 12) -> LabelledSweeps:
+def textured(tells: dict[int, list[float]], taxels: int = 9, each: int = 12) -> Dataset:
     """White noise of strength 3 on every taxel; `tells`: by taxel, how much stronger it is with each material."""
     kinds = len(next(iter(tells.values())))
     labels = np.tile(np.arange(kinds), each)
@@ -85,7 +85,7 @@ def textured(tells: dict[int, list[float]], taxels: int = 9, each: int = 12) -> 
         strength[:, taxel] *= np.array(factors)[labels]
     x = 100 + strength[:, None] * rng.standard_normal((len(labels), 80, taxels))
     names = tuple("abcdef"[:kinds])
-    return LabelledSweeps(np.rint(x).astype(np.int16)[..., None], labels, names, 100.0, {}, "textured")
+    return Dataset(np.rint(x).astype(np.int16)[..., None], labels, names, 100.0, {}, "textured")
 
 
 def test_the_telling_taxels_come_first():
@@ -98,7 +98,7 @@ def test_one_of_two_that_tell_the_same_stays():
     sweeps = textured({4: [1, 4], 2: [1, 1.6]}, each=30)
     x = sweeps.samples.copy()
     x[:, :, 6] = x[:, :, 4]
-    first = transforms.order(LabelledSweeps(x, sweeps.labels, sweeps.materials, 100.0))
+    first = transforms.order(Dataset(x, sweeps.labels, sweeps.materials, 100.0))
     assert first[0] in (4, 6)
     assert first[1] == 2
 
@@ -108,5 +108,5 @@ def test_any_sweeps_have_an_order(kind: str):
     """Silent ones, one taxel, one frame: every taxel once."""
     shape = {"silent": (4, 20, 2, 2), "one taxel": (4, 20, 1, 1), "one frame": (4, 1, 2, 2)}[kind]
     x = np.zeros(shape, np.uint8) if kind == "silent" else np.random.default_rng(1).integers(0, 255, shape, np.uint8)
-    found = transforms.order(LabelledSweeps(x, np.array([0, 0, 1, 1]), ("a", "b"), 10.0))
+    found = transforms.order(Dataset(x, np.array([0, 0, 1, 1]), ("a", "b"), 10.0))
     assert sorted(found) == list(range(shape[2] * shape[3]))

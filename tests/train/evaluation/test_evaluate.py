@@ -13,7 +13,7 @@ from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
 from tests.factories.sweep_sets import tones
 from train.cli.main import main
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.evaluation import evaluate, fold
 from train.evaluation.evaluate import Plan, Where
 from train.models import methods
@@ -21,7 +21,7 @@ from train.models import methods
 KEYS = {"method", "protocol", "means_removed", "seed", "window", "recording", "interval", "fit_s", "ms_p50"}
 
 
-def every(sweeps: LabelledSweeps, where: Where, *names: str, **plan) -> list[evaluate.Result]:
+def every(sweeps: Dataset, where: Where, *names: str, **plan) -> list[evaluate.Result]:
     """All results of these methods."""
     given = {"protocols": ("leave:session",), **plan}
     return list(evaluate.evaluate(sweeps, Plan(names, **given), where))
@@ -45,7 +45,7 @@ def test_it_finds_nothing_where_there_is_nothing():
     """Labels drawn at random are guessed at about one in three: nothing leaks from the test."""
     sweeps = tones(recordings=20, windows=1)
     labels = np.random.default_rng(2).permutation(sweeps.labels)
-    shuffled = LabelledSweeps(sweeps.samples, labels, sweeps.materials, 100.0, sweeps.groups, "shuffled")
+    shuffled = Dataset(sweeps.samples, labels, sweeps.materials, 100.0, sweeps.groups, "shuffled")
     (result,) = every(shuffled, HERE, "L-svm")
     assert 8 <= result.json()["window"]["right"] <= 32
 
@@ -53,7 +53,7 @@ def test_it_finds_nothing_where_there_is_nothing():
 def test_removed_means_are_gone():
     """A material known by its offset alone is not known any more."""
     hidden = tones(offset=40.0, noise=60.0)
-    hidden = LabelledSweeps((hidden.samples - hidden.samples % 40).astype(np.int16), hidden.labels, hidden.materials, 100.0,
+    hidden = Dataset((hidden.samples - hidden.samples % 40).astype(np.int16), hidden.labels, hidden.materials, 100.0,
                       hidden.groups, "offsets")  # fmt: skip
     (with_means,), (without,) = (every(hidden, HERE, "static-svm", means_removed=gone) for gone in (False, True))
     assert with_means.json()["window"]["right"] > without.json()["window"]["right"] + 5
@@ -124,14 +124,14 @@ def test_a_broken_cache_file_is_done_again(tmp_path: Path):
 
 def test_a_fold_is_kept_under_all_that_it_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Data, method, effort, seed, split and code: another name for each of them."""
-    task = fold.FoldTask("L-svm", methods.USUAL, 1, np.arange(5), np.arange(5, 9))
+    task = fold.FoldTask("L-svm", methods.FULL_EFFORT, 1, np.arange(5), np.arange(5, 9))
     others = [
-        fold.FoldTask("L-knn", methods.USUAL, 1, task.train, task.test),
-        fold.FoldTask("recurrent", methods.USUAL, 1, task.train, task.test),
+        fold.FoldTask("L-knn", methods.FULL_EFFORT, 1, task.train, task.test),
+        fold.FoldTask("recurrent", methods.FULL_EFFORT, 1, task.train, task.test),
         fold.FoldTask("recurrent", methods.Effort(0.5), 1, task.train, task.test),
-        fold.FoldTask("L-svm", methods.USUAL, 2, task.train, task.test),
-        fold.FoldTask("L-svm", methods.USUAL, 1, task.train[:4], task.test),
-        fold.FoldTask("L-svm", methods.USUAL, 1, task.train, task.test[:3]),
+        fold.FoldTask("L-svm", methods.FULL_EFFORT, 2, task.train, task.test),
+        fold.FoldTask("L-svm", methods.FULL_EFFORT, 1, task.train[:4], task.test),
+        fold.FoldTask("L-svm", methods.FULL_EFFORT, 1, task.train, task.test[:3]),
     ]
     names = {fold.key(t, "data") for t in [task, *others]} | {fold.key(task, "other data")}
     assert len(names) == 8
@@ -149,9 +149,9 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
         """Without the packages' names."""
         return {name.split(".")[-1] for name in fold.reached((methods.module_of(method), "train.evaluation.fold"))}
 
-    assert {"neural_methods", "networks", "training", "graph_builder", "heads", "fold"} <= reached("paper-cnn")
+    assert {"neural_methods", "networks", "training", "graph_builder", "linear_head", "fold"} <= reached("paper-cnn")
     classical = reached("L-svm")
-    assert {"baselines", "heads", "graph_builder", "features", "time_series", "prior_work"} <= classical
+    assert {"baselines", "linear_head", "graph_builder", "features", "time_series", "prior_work"} <= classical
     assert not {"neural_methods", "networks", "network", "evaluate", "score", "main"} & classical
     assert all(methods.module_of(name) in methods.MODULES for name in methods.every())
 
@@ -203,7 +203,7 @@ def test_the_command_writes_what_scripts_rely_on(tmp_path: Path, capsys: pytest.
 def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
     """Every sweep stands for itself."""
     whole = tones(windows=1)
-    LabelledSweeps(whole.samples, whole.labels, whole.materials, 100.0, {"day": whole.groups["session"]}).save(
+    Dataset(whole.samples, whole.labels, whole.materials, 100.0, {"day": whole.groups["session"]}).save(
         tmp_path / "a.npz"
     )
     out = tmp_path / "r.json"
@@ -216,7 +216,7 @@ def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
 def test_a_method_that_cannot_work_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Windows too short for a spectrum over time: said with its reason and an exit code, after all else was done."""
     whole, out = tones(), tmp_path / "r.json"
-    short = LabelledSweeps(whole.samples[:, :7], whole.labels, whole.materials, 100.0, whole.groups, "short")
+    short = Dataset(whole.samples[:, :7], whole.labels, whole.materials, 100.0, whole.groups, "short")
     short.save(tmp_path / "short.npz")
     assert command("--set", str(tmp_path / "short.npz"), "--protocol", "leave:session", "--method", "minirocket,L-gauss",
                    "--json", str(out), cache=tmp_path) == FormatError.exit_code  # fmt: skip

@@ -18,23 +18,23 @@ from appliance.core.errors import FormatError
 from appliance.core.statistics import wilson
 from appliance.core.types import Status, SweepFormat
 from appliance.sim import skin
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.evaluation import corruptions, robustness
 from train.evaluation.evaluate import Where
 from train.evaluation.robustness_data import EvaluationSweeps
 from train.models import methods
-from train.models.methods import Method, given
+from train.models.methods import Method, model_inputs
 
 BY_NAME = {s.name: s for s in corruptions.STRESSES}
 DIGITAL = [s.name for s in corruptions.STRESSES if s.only != "simulated"]
 
 
-def small(kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0) -> LabelledSweeps:
+def small(kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0) -> Dataset:
     """Sweeps of two materials: the second is stronger and rougher."""
     labels = np.arange(shape[0]) % 2
     rough = np.random.default_rng(7).standard_normal(shape) * (3 + 3 * labels)[:, None, None, None]
     samples = (rough + (60 + 10 * labels)[:, None, None, None]).astype(kind)
-    return LabelledSweeps(samples, labels, ("smooth", "rough"), rate_hz, {}, "small")
+    return Dataset(samples, labels, ("smooth", "rough"), rate_hz, {}, "small")
 
 
 @cache
@@ -63,7 +63,7 @@ def _figures(given: np.ndarray) -> np.ndarray:
     return np.stack([x.mean(axis=(1, 2, 3)), x.std(axis=1).mean(axis=(1, 2))], axis=1)
 
 
-def learn(sweeps: LabelledSweeps, given: np.ndarray, seed: int) -> NearestMean:
+def learn(sweeps: Dataset, given: np.ndarray, seed: int) -> NearestMean:
     """Train the fake; refuses sweeps that are too short, as real methods do."""
     if given.shape[1] < 20:
         raise FormatError(f"a window of {given.shape[1]} frames is too short; use at least 20")
@@ -78,7 +78,7 @@ FAKE = Method("fake", "two figures, nearest mean", "raw", learn)
     "sweeps", [small(), small("float32", (4, 128, 16, 1), 35.6), small("uint8", (2, 40, 1, 1), 10)]
 )
 @pytest.mark.parametrize("name", DIGITAL)
-def test_digits_stay_digits(name: str, sweeps: LabelledSweeps):
+def test_digits_stay_digits(name: str, sweeps: Dataset):
     """For any grid, rate and type: none is bit for bit none, severe is another sweep of the same form, twice the same."""
     entry, trial = BY_NAME[name], EvaluationSweeps(sweeps)
     before = sweeps.samples.copy()
@@ -217,7 +217,7 @@ def test_lost_frames_lie_on_the_line():
 def test_stretching_moves_frequencies(name: str, share: float, hz: float):
     """A tone of 10 Hz becomes one of 5, 15 or 12 Hz, as strong as before."""
     tone = np.sin(2 * np.pi * 10 * np.arange(400) / 100).astype(np.float32).reshape(1, 400, 1, 1)
-    sweeps = LabelledSweeps(np.repeat(tone, 2, axis=0), np.arange(2), ("a", "b"), 100.0)
+    sweeps = Dataset(np.repeat(tone, 2, axis=0), np.arange(2), ("a", "b"), 100.0)
     got = BY_NAME[name].apply(EvaluationSweeps(sweeps), share, 0)[0, :, 0, 0]
     assert np.abs(np.fft.rfft(got)).argmax() / 4 == pytest.approx(hz, abs=0.26)
     assert got.std() == pytest.approx(tone.std(), rel=0.1)
@@ -408,7 +408,7 @@ def test_all_usual_stresses_by_default():
     assert seen[0].shape == (12, 3)
     first = corruptions.usual(trial)[0]
     mild = replace(small(), samples=first.apply(trial, first.severities[1], 6))
-    assert (seen[1] == given("L", mild)).all()
+    assert (seen[1] == model_inputs("L", mild)).all()
     assert (seen[1] != seen[0]).any()
 
 

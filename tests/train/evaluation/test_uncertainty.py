@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
-from train.calibration.posthoc import finish
-from train.data.sets import LabelledSweeps
+from train.calibration.posthoc import fit_posthoc
+from train.data.sets import Dataset
 from train.evaluation import uncertainty, uncertainty_cases
 from train.evaluation.evaluate import Where
 from train.evaluation.uncertainty_cases import NOBODY, Case
@@ -71,7 +71,7 @@ def test_an_overconfident_head_is_made_honest():
     moved = lambda x, at: x + 1.5 * rng.standard_normal((200, 1, 4))[at]  # noqa: E731
     one = replace(one, seen=moved(one.seen, one.seen_groups), new=moved(one.new, one.places))
     # sweeps of one place close together: their scatter says little of other places
-    figures = uncertainty.calibration([(one, finish(one.seen, one.seen_labels, one.seen_groups, one.judged))])
+    figures = uncertainty.calibration([(one, fit_posthoc(one.seen, one.seen_labels, one.seen_groups, one.judged))])
     assert figures["n"] == 288
     assert 0 < figures["accuracy"]["low"] < figures["accuracy"]["accuracy"] < figures["accuracy"]["high"] < 1
 
@@ -108,7 +108,7 @@ def test_strangers_six_deviations_away_are_seen(told):
 def test_a_stranger_that_is_no_stranger_is_not_seen():
     """Materials that do not differ: AUROC of a half."""
     held = [case(k, apart=0.0) for k in (0, 1)]
-    done = [(c, finish(c.seen, c.seen_labels, c.seen_groups, c.judged)) for c in held]
+    done = [(c, fit_posthoc(c.seen, c.seen_labels, c.seen_groups, c.judged)) for c in held]
     assert abs(uncertainty.unknown(done, NAMES)["mean"]["auroc"] - 0.5) < 0.06
 
 
@@ -162,7 +162,7 @@ def test_the_page_stands_alone(told):
     assert "nan" not in html.lower().replace("finance", "")
 
 
-def sweeps(materials: int = 3) -> LabelledSweeps:
+def sweeps(materials: int = 3) -> Dataset:
     """Hums of different pitch, four positions, 128 x 16 x 1 float32 at 36 Hz."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(materials), 6), 4)
@@ -170,7 +170,7 @@ def sweeps(materials: int = 3) -> LabelledSweeps:
     hum = np.stack([np.sin(2 * np.pi * (3 + 3 * k) * t + rng.uniform(0, 6)) * rng.uniform(0.8, 1.2) for k in labels])
     x = (hum[:, :, None] + rng.normal(0, 0.5, (len(labels), 128, 16, 1))).astype(np.float32)
     position = np.repeat(np.arange(4), 6 * materials)
-    return LabelledSweeps(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
+    return Dataset(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
 
 
 def test_from_set_to_page_and_again_from_the_cache(tmp_path):

@@ -30,24 +30,24 @@ from train.export import export, pack
 from train.export.pack import ExportRefused
 from train.models import methods, networks
 from train.models.compact import fit
-from train.models.compact.architectures import LADDER, USUAL
+from train.models.compact.architectures import ARCHITECTURES, DEFAULT
 from train.models.compact.fit import Fit, FitRecipe
 from train.models.compact.network import Compact
-from train.models.heads import closed_form_head, hold_out
+from train.models.linear_head import closed_form_head, hold_out
 from train.onnx_tools import graph_builder, parity
-from train.onnx_tools.layers import Layer
+from train.onnx_tools.parity import Layer
 
 
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on the easy set, two sweeps to a recording."""
-    return fit.fit(easy(pieces=2), 1, FitRecipe(steps=40), shape=LADDER["20k"])
+    return fit.fit(easy(pieces=2), 1, FitRecipe(steps=40), shape=ARCHITECTURES["20k"])
 
 
 @pytest.fixture(scope="module")
 def tight() -> Fit:
     """A fit on a set that takes all int8 has."""
-    return fit.fit(close(), 1, FitRecipe(steps=60), shape=LADDER["20k"])
+    return fit.fit(close(), 1, FitRecipe(steps=60), shape=ARCHITECTURES["20k"])
 
 
 @pytest.fixture(scope="module")
@@ -343,7 +343,7 @@ def test_references_are_what_they_are_called(tmp_path: Path):
         assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [("sweep", [1, 1500, 4, 4], "tensor(uint8)")]
         assert np.isfinite(run.run(["logits"], {"sweep": np.full((1, 1500, 4, 4), 7, np.uint8)})[0]).all()
         sizes[path.name] = path.stat().st_size
-    assert sizes["fp32.onnx"] > 4 * USUAL.cost(skin.FORMAT, 6).weights
+    assert sizes["fp32.onnx"] > 4 * DEFAULT.cost(skin.FORMAT, 6).weights
     assert 15_891_910 < sizes["paper_int8.onnx"] < 1.01 * 15_891_910
 
 
@@ -366,7 +366,7 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     """Nothing in it is int8: both forms are one, the box's labels are its network's, no tensor is told; what another
     head says is refused here as well."""
-    made = fit.fit(easy(), 1, FitRecipe(), shape=LADDER["bands"])
+    made = fit.fit(easy(), 1, FitRecipe(), shape=ARCHITECTURES["bands"])
     export.export(made, tmp_path / "b", "easy", "1", "0123abcd")
     it = box(tmp_path / "b")
     assert it.self_test() < 1e-6
@@ -431,7 +431,7 @@ def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
     level = whole.samples.mean(axis=1, keepdims=True) - np.array([60, 100, 140])[labels][:, None, None, None]
     offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
     try:
-        made = fit.fit(offset, 1, FitRecipe(steps=20, keep_means=keep), shape=LADDER["20k"])
+        made = fit.fit(offset, 1, FitRecipe(steps=20, keep_means=keep), shape=ARCHITECTURES["20k"])
         manifest = export.export(made, tmp_path / "b", "offset", "1", "0123abcd")
     except ExportRefused:  # what was never learnt may not survive int8 either
         assert not keep

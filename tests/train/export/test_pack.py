@@ -31,8 +31,8 @@ def test_the_box_says_what_the_desktop_says(name: str, tmp_path: Path):
     assert manifest.made["method"] == name
     it = Classifier(bundle.load(tmp_path / "b"), SystemClock())
     assert it.self_test() < 0.02
-    model = METHODS[name].train(content.train, methods.given(METHODS[name].input, content.train), 1)
-    want = model.logits(methods.given(METHODS[name].input, content.held)).argmax(1)
+    model = METHODS[name].train(content.train, methods.model_inputs(METHODS[name].input, content.train), 1)
+    want = model.logits(methods.model_inputs(METHODS[name].input, content.held)).argmax(1)
     assert (pack.score(it, content.held) == want).all()
 
 

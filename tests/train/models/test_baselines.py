@@ -19,7 +19,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import Classifier, softmax
 from train.data import sets
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.models import baselines, methods, prior_work
 from train.models.baselines import ABSENT, FeatureModel, Gauss, knn, svm, written
 from train.models.methods import Method
@@ -31,14 +31,14 @@ by_name = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 class World:
     """A set, its features by kind, and which of its sweeps are held out."""
 
-    def __init__(self, sweeps: LabelledSweeps, held: np.ndarray) -> None:
+    def __init__(self, sweeps: Dataset, held: np.ndarray) -> None:
         self.sweeps, self.held, self.kinds = sweeps, held, {}
         self.models: dict[str, FeatureModel] = {}
 
     def given(self, kind: str) -> np.ndarray:
         """Features of all sweeps."""
         if kind not in self.kinds:
-            self.kinds[kind] = methods.given(kind, self.sweeps)
+            self.kinds[kind] = methods.model_inputs(kind, self.sweeps)
         return self.kinds[kind]
 
     def model(self, method: Method) -> FeatureModel:
@@ -64,7 +64,7 @@ def tubes() -> World:
     return World(sweeps, np.isin(sweeps.groups["position"], np.unique(sweeps.groups["position"])[::3]))
 
 
-def ripples(frames: int, rows: int, cols: int, rate_hz: float, dtype: str) -> LabelledSweeps:
+def ripples(frames: int, rows: int, cols: int, rate_hz: float, dtype: str) -> Dataset:
     """Three materials of another skin: ripples of another frequency, strength and level each, in noise; 24 sweeps."""
     rng, labels = np.random.default_rng(5), np.arange(24) % 3
     t = np.arange(frames)[:, None, None] / rate_hz
@@ -74,7 +74,7 @@ def ripples(frames: int, rows: int, cols: int, rate_hz: float, dtype: str) -> La
         + 40 * (k + 1) * np.sin(2 * np.pi * rate_hz * (0.12 + 0.1 * k) * t + k * phase)
         for k in labels
     ]  # fmt: skip
-    return LabelledSweeps(np.array(samples).astype(dtype), labels, ("a", "b", "c"), rate_hz)
+    return Dataset(np.array(samples).astype(dtype), labels, ("a", "b", "c"), rate_hz)
 
 
 @by_name
@@ -198,7 +198,7 @@ def test_a_material_that_training_lacks_is_never_named(tubes: World):
         assert not (logits.argmax(1) == 2).any()
 
 
-def folds_of(sweeps: LabelledSweeps) -> list[tuple[np.ndarray, np.ndarray]]:
+def folds_of(sweeps: Dataset) -> list[tuple[np.ndarray, np.ndarray]]:
     """What the temperature is found on; a warning is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -234,7 +234,7 @@ def test_probabilities_are_honest():
     """Labels that are drawn by lot are believed to about one half of two; those that are clear nearly to one."""
     rng = np.random.default_rng(2)
     labels = np.arange(80) % 2
-    some = LabelledSweeps(np.zeros((80, 1, 1, 1), np.uint8), labels, ("a", "b"), 1.0)
+    some = Dataset(np.zeros((80, 1, 1, 1), np.uint8), labels, ("a", "b"), 1.0)
     noise = rng.normal(0, 1, (80, 3)).astype(np.float32)
     for make in (Gauss, knn, svm):
         vague = softmax(baselines.learn(make, some, noise, 0).logits(noise)).max(1).mean()

@@ -14,7 +14,7 @@ from appliance.core.types import SweepFormat
 from appliance.inference.classifier import softmax
 from appliance.inference.session import session
 from tests.factories.sweep_sets import easy
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.models import linear_head, minirocket
 from train.onnx_tools import graph_builder
 
@@ -95,10 +95,10 @@ def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_array_equal(logits.argmax(1), want)
 
 
-def head(sweeps: LabelledSweeps) -> linear_head.Headed:
+def head(sweeps: Dataset) -> linear_head.LinearHeadModel:
     """A ridge on made-up features, which need no aeon."""
     graph = minirocket.transform(sweeps.format, parameters(sweeps.format.window, 4))
-    return linear_head.headed(graph, minirocket._ridge, sweeps, sweeps.samples, 0)
+    return linear_head.train_linear_head(graph, minirocket._ridge, sweeps, sweeps.samples, 0)
 
 
 def test_the_box_gives_the_logits():
@@ -133,7 +133,7 @@ def test_the_temperature_comes_from_held_out_groups():
 
     sweeps = easy(20, pieces=4)
     graph = minirocket.transform(sweeps.format, parameters(64, 4))
-    linear_head.headed(graph, spy, sweeps, sweeps.samples, 0)
+    linear_head.train_linear_head(graph, spy, sweeps, sweeps.samples, 0)
     every = graph_builder.run(graph, sweeps.samples)
     there = np.array([(row == seen[0]).all(axis=1).any() for row in every])
     assert all(np.ptp(there[sweeps.group("recording") == r].astype(int)) == 0 for r in range(15))

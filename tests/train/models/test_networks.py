@@ -16,12 +16,12 @@ from appliance.core.types import SweepFormat
 from appliance.inference.classifier import softmax
 from appliance.sim import skin
 from tests.factories.sweep_sets import easy
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.evaluation import evaluate, fold
 from train.models import methods, networks, neural_methods, training
 from train.models.compact import fit, network
 from train.models.compact.fit import FitRecipe
-from train.models.heads import closed_form_head
+from train.models.linear_head import closed_form_head
 from train.models.methods import Effort, Method
 from train.onnx_tools import graph_builder
 
@@ -36,22 +36,20 @@ def method(name: str, effort: Effort = BRIEF) -> Method:
     return methods.find([name], effort)[0]
 
 
-def made(shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0) -> LabelledSweeps:
+def made(shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0) -> Dataset:
     """Sweeps [N, T, R, C] of noise, the class in its strength; two sweeps to a recording."""
     rng, labels = np.random.default_rng(seed), np.arange(shape[0]) // 2 % classes
     samples = 60 + (1 + 6 * labels)[:, None, None, None] * rng.standard_normal(shape)
     names = tuple(f"material {k}" for k in range(classes))
-    return LabelledSweeps(
-        samples.astype(dtype), labels, names, rate_hz, {"recording": np.arange(shape[0]) // 2}, "made"
-    )
+    return Dataset(samples.astype(dtype), labels, names, rate_hz, {"recording": np.arange(shape[0]) // 2}, "made")
 
 
-def train(name: str, s: LabelledSweeps, effort: Effort = BRIEF, seed: int = 1) -> neural_methods.Trained:
+def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> neural_methods.NetworkModel:
     """Train the method on everything."""
     return method(name, effort).train(s, s.samples, seed)
 
 
-def agrees(model: neural_methods.Trained, samples: np.ndarray) -> None:
+def agrees(model: neural_methods.NetworkModel, samples: np.ndarray) -> None:
     """The graph in the box's session gives the logits of the model, which are finite."""
     want = model.logits(samples)
     assert want.dtype == np.float32
@@ -159,7 +157,7 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
         torch.manual_seed(0)
         form, plain = skin.FORMAT, network.Compact(skin.FORMAT, 6, 0.1, norm=False)
         net = build(form, 6, digits) if build else plain
-    agrees(neural_methods.Trained(net.eval(), ""), digits)
+    agrees(neural_methods.NetworkModel(net.eval(), ""), digits)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -13,7 +13,7 @@ from appliance.core.types import SweepFormat
 from appliance.inference.classifier import softmax
 from appliance.inference.session import session
 from tests.factories.sweep_sets import easy
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.models import sthmp
 from train.onnx_tools import graph_builder
 
@@ -155,7 +155,7 @@ def test_any_set_can_be_trained_on(dtype: str):
     silent = np.full((12, window, rows, cols), 7, dtype)
     moving = silent + np.random.default_rng(1).integers(0, 9, silent.shape).astype(dtype)
     for samples in (silent, moving):
-        sweeps = LabelledSweeps(samples, labels, ("a", "b"), 35.6)
+        sweeps = Dataset(samples, labels, ("a", "b"), 35.6)
         logits = [sthmp.train(sweeps, samples, 3).logits(samples[:3]) for _ in range(2)]
         assert np.isfinite(logits[0]).all()
         np.testing.assert_array_equal(*logits)

@@ -17,8 +17,8 @@ from tests.factories.sweep_sets import easy
 from train.export import export
 from train.models.compact import fit
 from train.models.compact.fit import Fit, FitRecipe
-from train.onnx_tools import layers, parity
-from train.onnx_tools.layers import Layer
+from train.onnx_tools import parity
+from train.onnx_tools.parity import Layer
 from train.onnx_tools.quantize import quantize
 
 
@@ -100,7 +100,7 @@ def test_tensors_are_told_as_pytorch_has_them(fitted: Fit):
     stages = activations(found)
     assert len(stages) == len(responses)
     for layer, x in zip(stages, responses, strict=True):
-        np.testing.assert_allclose(layer.percentiles, np.percentile(x, layers.PERCENTILES), atol=1e-4)
+        np.testing.assert_allclose(layer.percentiles, np.percentile(x, parity.PERCENTILES), atol=1e-4)
         assert layer.low == 0
         assert layer.high == pytest.approx(255 * layer.step)
         assert layer.saturated == pytest.approx(np.mean(x > layer.high + layer.step / 2), abs=2e-4)
@@ -129,10 +129,10 @@ def test_a_tap_that_was_moved_is_found(fitted: Fit):
     taps = np.random.default_rng(0).integers(-4, 5, held.dims).astype(np.int8)
     taps[..., -1] -= taps.sum(axis=2).astype(np.int8)
     held.CopyFrom(numpy_helper.from_array(taps, held.name))
-    assert layers.tap_sum(int8) == 0
+    assert parity.tap_sum(int8) == 0
     taps[2, 1, 0] += 1
     held.CopyFrom(numpy_helper.from_array(taps, held.name))
-    assert layers.tap_sum(int8) == 1
+    assert parity.tap_sum(int8) == 1
 
 
 def test_any_quantized_graph_can_be_looked_at(fitted: Fit):

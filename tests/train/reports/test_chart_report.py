@@ -21,15 +21,15 @@ from appliance.core.types import SweepFormat
 from appliance.inference.classifier import Classifier
 from appliance.sim import skin
 from tests.factories.chart_data import DOTS, FRONT, dot
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.evaluation.evaluate import Where
 from train.export import measure, measure_process
 from train.models import methods, minirocket
 from train.models.compact import graph
-from train.models.compact.architectures import LADDER
+from train.models.compact.architectures import ARCHITECTURES
 from train.models.methods import Method
 from train.onnx_tools import cost
-from train.onnx_tools.graph_builder import GraphBuilder, Graphed, run
+from train.onnx_tools.graph_builder import GraphBuilder, GraphModel, run
 from train.onnx_tools.quantize import quantize
 from train.reports import chart_page, chart_report, pareto, scatter
 
@@ -38,12 +38,12 @@ KEYS = ("method", "precision", "weights", "macs", "file_kb", "rss_mb", "ms_p50",
 """What the issue asks of each dot, beside `accuracy`."""
 
 
-def sweeps(kind: str = "uint8", n: int = 24) -> LabelledSweeps:
+def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
     """Sweeps of two materials at six positions, the second louder."""
     labels = np.arange(n) % 2
     noise = np.random.default_rng(5).standard_normal((n, 40, 2, 2)) * (2 + 18 * labels)[:, None, None, None]
     groups = {"position": np.arange(n) // 4, "recording": np.arange(n)}
-    return LabelledSweeps((100 + noise).clip(0, 255).astype(kind), labels, ("soft", "loud"), 100.0, groups, "small")
+    return Dataset((100 + noise).clip(0, 255).astype(kind), labels, ("soft", "loud"), 100.0, groups, "small")
 
 
 def loudness(form: SweepFormat = FORM) -> onnx.ModelProto:
@@ -64,7 +64,7 @@ class Loud:
     """A model in two precisions."""
 
     model: onnx.ModelProto
-    forms: dict[str, Graphed] = field(default_factory=dict)
+    forms: dict[str, GraphModel] = field(default_factory=dict)
 
     def logits(self, given: np.ndarray) -> np.ndarray:
         """As the graph says."""
@@ -78,9 +78,9 @@ class Loud:
 def loud(calls: list[int]) -> Method:
     """A method that needs no training; `calls` counts how often it was asked to."""
 
-    def train(known: LabelledSweeps, given: np.ndarray, seed: int) -> Loud:
+    def train(known: Dataset, given: np.ndarray, seed: int) -> Loud:
         calls.append(seed)
-        return Loud(loudness(), {"int8": Graphed(quantize(loudness(), given))})
+        return Loud(loudness(), {"int8": GraphModel(quantize(loudness(), given))})
 
     return Method("L-gauss", "for tests", "raw", train)
 
@@ -123,7 +123,7 @@ def test_the_family_counts_its_costs_as_the_chart_does():
     known = sweeps()
     model = method.train(known, known.samples, 1)
     told, bands = model.made.shape.cost(known.format, 2), model.made.bands
-    alone = graph.trunk(known.format, model.made.scale, {}, LADDER["bands"])
+    alone = graph.trunk(known.format, model.made.scale, {}, ARCHITECTURES["bands"])
     more = [count(alone) + 2 * bands if bands else 0 for count in (cost.weights, cost.macs)]
     for one in (model, model.forms["float"]):
         assert cost.weights(one.graph()) == told.weights + more[0]

@@ -15,11 +15,11 @@ import pytest
 from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from train.cli.main import main
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.evaluation import evaluate
 from train.evaluation.evaluate import Where
 from train.models import methods
-from train.models.methods import USUAL, Method
+from train.models.methods import FULL_EFFORT, Method
 from train.onnx_tools.graph_builder import GraphBuilder, run
 from train.selection import nested_cv, reduction_curves, scene, select
 from train.selection import prices as rungs
@@ -34,7 +34,7 @@ class Powers:
 
     means: np.ndarray
     first: int
-    sweeps: LabelledSweeps
+    sweeps: Dataset
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits`."""
@@ -53,7 +53,7 @@ class Powers:
         return run(self.graph(), given)
 
 
-def learn(sweeps: LabelledSweeps, given: np.ndarray, seed: int, first: int = 99) -> Powers:
+def learn(sweeps: Dataset, given: np.ndarray, seed: int, first: int = 99) -> Powers:
     """Train the fake, which needs four frames."""
     if given.shape[1] < 4:
         raise FormatError(f"a window of {given.shape[1]} frames is too short; use at least 4")
@@ -63,13 +63,13 @@ def learn(sweeps: LabelledSweeps, given: np.ndarray, seed: int, first: int = 99)
     return Powers(np.stack(there).astype(np.float32), first, sweeps)
 
 
-def guess(sweeps: LabelledSweeps, given: np.ndarray, seed: int, number: int = 0) -> Powers:
+def guess(sweeps: Dataset, given: np.ndarray, seed: int, number: int = 0) -> Powers:
     """A method that knows nothing: its means are drawn."""
     drawn = np.random.default_rng(number).standard_normal((len(sweeps.materials), given[0, 0].size))
     return Powers(3 + drawn.astype(np.float32), 99, sweeps)
 
 
-def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise: float = 0.15) -> LabelledSweeps:
+def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise: float = 0.15) -> Dataset:
     """Four materials at several places: the taxels named tell half of it each, by the strength of what they feel."""
     labels = np.tile(np.arange(4), places * each)
     rng = np.random.default_rng(3)
@@ -79,7 +79,7 @@ def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise
         strength[:, taxel] *= 1 + 2 * bit
     x = 100 + strength[:, None] * rng.standard_normal((len(labels), 60, 6))
     groups = {"place": np.repeat(np.arange(places), 4 * each), "day": np.repeat(np.arange(places) % 4, 4 * each)}
-    return LabelledSweeps(np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c", "d"), 100.0, groups, "skin")
+    return Dataset(np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c", "d"), 100.0, groups, "skin")
 
 
 FAKES = {f"see-{n}": Method(f"see-{n}", f"{n} taxels", "raw", partial(learn, first=n)) for n in (1, 2, 4, 6)}
@@ -91,7 +91,7 @@ def fakes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Puts fake methods, at fixed prices, in the place of the real ones."""
 
     def put(known: dict[str, Method] = FAKES, prices: dict[str, Price] = COSTS) -> None:
-        monkeypatch.setattr(methods, "every", lambda effort=USUAL: known)
+        monkeypatch.setattr(methods, "every", lambda effort=FULL_EFFORT: known)
         monkeypatch.setattr(methods, "module_of", lambda name: "train.models.methods")
         monkeypatch.setattr(rungs, "ladder", lambda asked: list(known))
         monkeypatch.setattr(rungs, "prices", lambda *args: prices)
@@ -105,18 +105,18 @@ def asked(**more) -> scene.Scene:
     return scene.Scene(**{"name": "drawer", "varies": ("place",), "folds": 3, "path": Path("scene.toml"), **more})
 
 
-def chosen(sweeps: LabelledSweeps, where: Where = HERE, **more) -> select.Selection:
+def chosen(sweeps: Dataset, where: Where = HERE, **more) -> select.Selection:
     """The choice for a scene."""
-    return select.choose(sweeps, asked(**more), USUAL, where, lambda line: None)
+    return select.choose(sweeps, asked(**more), FULL_EFFORT, where, lambda line: None)
 
 
-def parts_of(sweeps: LabelledSweeps, **more) -> nested_cv.Trials:
+def parts_of(sweeps: Dataset, **more) -> nested_cv.Trials:
     """Trials of which none has been run."""
-    return nested_cv.Trials(sweeps, asked(**more), USUAL, HERE, lambda line: None)
+    return nested_cv.Trials(sweeps, asked(**more), FULL_EFFORT, HERE, lambda line: None)
 
 
 @cache
-def two() -> LabelledSweeps:
+def two() -> Dataset:
     """A skin of which the first two taxels tell everything."""
     return skin()
 
@@ -276,7 +276,7 @@ def test_stress_counts(fakes):
         (skin(places=1, each=2), (), "random:3 needs 3 recordings of each material"),
     ],
 )
-def test_a_scene_that_cannot_be_judged_is_refused(fakes, sweeps: LabelledSweeps, varies: tuple[str, ...], why: str):
+def test_a_scene_that_cannot_be_judged_is_refused(fakes, sweeps: Dataset, varies: tuple[str, ...], why: str):
     """Too few values of a group, or a material that goes with one of them; before anything is trained."""
     with pytest.raises(FormatError, match=why):
         chosen(sweeps, varies=varies)
@@ -293,7 +293,7 @@ def test_parts_are_whole_and_few():
     assert len(nested_cv.parts(two(), ())) == 5
 
 
-def reduced(sweeps: LabelledSweeps, **more) -> dict[str, dict]:
+def reduced(sweeps: Dataset, **more) -> dict[str, dict]:
     """The curves of a scene by what there is less of, and under "change" what would be left out of the bundle."""
     wish = asked(**more)
     told, change, accuracy = reduction_curves.curves(chosen(sweeps, **more), wish, lambda line: None)
@@ -311,7 +311,7 @@ def test_two_taxels_are_all_that_is_needed(fakes):
     assert found["accuracy"]["mean"] > 0.95
 
 
-def hum(slow: float, fast: float, places: int = 4) -> LabelledSweeps:
+def hum(slow: float, fast: float, places: int = 4) -> Dataset:
     """Two materials that differ by the strength of a swing of 40 frames, of one of two frames, or of both."""
     labels = np.tile([0, 1], places * 3)
     rng = np.random.default_rng(2)
@@ -322,7 +322,7 @@ def hum(slow: float, fast: float, places: int = 4) -> LabelledSweeps:
     edge = 9 * strength[1] * fast ** labels[:, None] * np.cumprod(-np.ones(160))
     x = 100 + swing + edge + 0.1 * rng.standard_normal((len(labels), 160))
     groups = {"place": np.repeat(np.arange(places), 6)}
-    return LabelledSweeps(x.astype(np.float32)[..., None, None], labels, ("a", "b"), 200.0, groups, "hum")
+    return Dataset(x.astype(np.float32)[..., None, None], labels, ("a", "b"), 200.0, groups, "hum")
 
 
 def test_a_low_rate_is_enough_for_slow_things(fakes):

@@ -12,7 +12,7 @@ import pytest
 
 from appliance.core.errors import FormatError
 from tests.factories.paths import ROOT
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.selection import prices, scene
 
 WHOLE = """
@@ -56,7 +56,7 @@ def three(folder: Path) -> Path:
         (2, 1), np.int16
     )
     groups = {"force": np.tile([100, 200], 6)}
-    LabelledSweeps(samples, labels, ("a", "b", "c"), 50.0, groups).save(folder / "a.npz")
+    Dataset(samples, labels, ("a", "b", "c"), 50.0, groups).save(folder / "a.npz")
     return folder
 
 
@@ -166,7 +166,7 @@ def test_what_does_not_fit_the_sweeps_is_named(text: str, why: str, tmp_path: Pa
 def test_a_label_that_the_box_cannot_send_is_refused_at_once(tmp_path: Path):
     """Before hours of training; [merge] gives it another name."""
     samples = np.arange(40, dtype=np.int16).reshape(4, 10, 1, 1)
-    LabelledSweeps(samples, np.array([0, 0, 1, 1]), ("wood, oiled", "b"), 50.0).save(tmp_path / "a.npz")
+    Dataset(samples, np.array([0, 0, 1, 1]), ("wood, oiled", "b"), 50.0).save(tmp_path / "a.npz")
     with pytest.raises(FormatError, match="label 'wood, oiled' cannot be sent by the box; name it anew in"):
         scene.read(written(tmp_path, 'sets = ["a.npz"]')).sweeps()
     renamed = scene.read(written(tmp_path, 'sets = ["a.npz"]\n[merge]\n"oiled wood" = ["wood, oiled"]')).sweeps()

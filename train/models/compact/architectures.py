@@ -107,7 +107,7 @@ class Architecture:
         return Cost(weights, macs)
 
 
-LADDER = {
+ARCHITECTURES = {
     "bands": Architecture((), planned=3, spectrum=True, fewest=0),
     "1k": Architecture((2, 6, 8), 32, 8),
     "4k": Architecture((5, 12, 16), 32, 8),
@@ -118,7 +118,7 @@ LADDER = {
 }
 """By about how many weights they have at most, for 1500 x 4 x 4 digits and six materials; the last is as large as its
 bundle may be, the first has nothing but the spectrum and a head."""
-USUAL = replace(LADDER["20k"], fewest=0)
+DEFAULT = replace(ARCHITECTURES["20k"], fewest=0)
 """Of the box's own method: no stage at all where the spectrum alone does as well."""
 
 

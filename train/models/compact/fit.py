@@ -1,4 +1,4 @@
-"""The room of training. In: a LabelledSweeps and a seed. Out: a Fit, which holds the network and the sweeps it saw.
+"""The room of training. In: a Dataset and a seed. Out: a Fit, which holds the network and the sweeps it saw.
 
 The convolutions are trained by gradient on sweeps that vary as the scene does; then shrinkage LDA in closed form
 replaces the head, one for the network and one for its int8 trunk. Groups that were held out tell how many stages the
@@ -25,14 +25,14 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import read
 from appliance.core.types import SweepFormat
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
-from train.data.sets import LabelledSweeps
+from train.data.sets import Dataset
 from train.metrics.score import figure
 from train.models import training
 from train.models.compact import graph, spectrum
-from train.models.compact.architectures import USUAL, Architecture
+from train.models.compact.architectures import DEFAULT, Architecture
 from train.models.compact.augment import SLOW, Augmentation, vary
 from train.models.compact.network import Compact
-from train.models.heads import closed_form_head, hold_out
+from train.models.linear_head import closed_form_head, hold_out
 from train.models.networks import Network, texture_scale
 from train.models.training import Cost, Log, Vary, in_order, learn, one_thread, silent, tensors
 from train.onnx_tools.graph_builder import run
@@ -72,8 +72,8 @@ class Fit:
     scale: float
     shape: Architecture
     reach: graph.Ranges
-    train: LabelledSweeps
-    held: LabelledSweeps
+    train: Dataset
+    held: Dataset
     about: dict[str, Any]
     cost: Cost = field(default_factory=list)
 
@@ -131,7 +131,7 @@ class Fit:
                 {k.removeprefix(p): v for k, v in held.items() if k.startswith(p)} for p in ("weight_", "group_")
             )
             samples, labels, materials = held["set_samples"], held["set_labels"], tuple(meta["materials"])
-            whole = LabelledSweeps(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
+            whole = Dataset(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
             first = np.arange(len(whole)) < meta["trained_on"]
             shape = Architecture(**meta["shape"] | {"channels": tuple(meta["shape"]["channels"])})
             reach = graph.Ranges(meta["reach"]["digits"], tuple(meta["reach"]["responses"]))
@@ -145,19 +145,19 @@ class Fit:
         return made
 
 
-def fit(sweeps: LabelledSweeps, seed: int, recipe: FitRecipe, log: Log = silent, shape: Architecture = USUAL) -> Fit:
+def fit(sweeps: Dataset, seed: int, recipe: FitRecipe, log: Log = silent, shape: Architecture = DEFAULT) -> Fit:
     """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it, and for windows too short."""
     return fit_on(*hold_out(sweeps, seed), seed, recipe, log, shape)
 
 
 def fit_on(
-    train: LabelledSweeps,
-    held: LabelledSweeps,
+    train: Dataset,
+    held: Dataset,
     by: str,
     seed: int,
     recipe: FitRecipe,
     log: Log = silent,
-    shape: Architecture = USUAL,
+    shape: Architecture = DEFAULT,
 ) -> Fit:
     """Train on `train`; `held` gives temperature and validation. by: how they were parted, for the story."""
     if not (shape.channels or spectrum.count(train.format)):
@@ -180,9 +180,7 @@ def fit_on(
     return Fit(weights, scale, model.shape, reach, train, held, about, cost)
 
 
-def _seen(
-    model: Compact, reach: graph.Ranges, train: LabelledSweeps, held: LabelledSweeps, more: Iterable[LabelledSweeps]
-) -> Seen:
+def _seen(model: Compact, reach: graph.Ranges, train: Dataset, held: Dataset, more: Iterable[Dataset]) -> Seen:
     """What the heads see of the training sweeps with their copies, and of those held out: (float, int8)."""
     trunk = graph.trunk(model.form, model.scale, model.weights(), model.shape, reach, keep_means=model.keep_means)
     asked = (partial(features, model), lambda sweeps: run(trunk, sweeps.samples))
@@ -232,7 +230,7 @@ def varied(x: Tensor, rng: Generator, rows: int, scene: Augmentation) -> Tensor:
     return vary(x, rows, scene, rng)
 
 
-def copies(model: Compact, sweeps: LabelledSweeps, change: Vary, seed: int) -> Iterator[LabelledSweeps]:
+def copies(model: Compact, sweeps: Dataset, change: Vary, seed: int) -> Iterator[Dataset]:
     """The sweeps again COPIES times as the scene might have given them: the head must know how materials vary, too."""
     rng, kind = torch.Generator().manual_seed(seed), sweeps.samples.dtype
     for _ in range(COPIES):
@@ -248,6 +246,6 @@ def copies(model: Compact, sweeps: LabelledSweeps, change: Vary, seed: int) -> I
 
 
 @torch.no_grad()
-def features(model: Network, sweeps: LabelledSweeps) -> Array:
+def features(model: Network, sweeps: Dataset) -> Array:
     """What the head sees of each sweep, float32 [N, F]."""
     return np.concatenate([model.seen(x).numpy() for x in tensors(sweeps.samples, in_order(len(sweeps)))])

@@ -1,6 +1,6 @@
 """The room of the box's own methods. In: an Effort. Out: the METHODS compact-1k to compact-100k, and compact.
 
-Trained as `palpate-train fit` does. The method is what the box runs, the int8 graph; its form "float" is the network it
+NetworkModel as `palpate-train fit` does. The method is what the box runs, the int8 graph; its form "float" is the network it
 was made of.
 """
 
@@ -15,13 +15,12 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from train.data.sets import LabelledSweeps
-from train.models.compact.architectures import LADDER, USUAL, Architecture
+from train.data.sets import Dataset
+from train.models.compact.architectures import ARCHITECTURES, DEFAULT, Architecture
 from train.models.compact.fit import Fit, FitRecipe, fit_on
-from train.models.heads import ABSENT
-from train.models.methods import USUAL as WHOLE
-from train.models.methods import Effort, Method, Model
-from train.models.neural_methods import Trained, parts, ran, shortened
+from train.models.linear_head import ABSENT
+from train.models.methods import FULL_EFFORT, Effort, Method, Model
+from train.models.neural_methods import NetworkModel, parts, ran, shortened
 from train.models.training import Cost, Log, silent
 from train.onnx_tools.graph_builder import run, with_head
 
@@ -31,7 +30,7 @@ SPECTRUM = "the spectrum that all taxels share, and a closed-form head: nothing 
 
 
 @dataclass(frozen=True)
-class Int8:
+class CompactModel:
     """A trained member of the family as the box runs it. forms: "float", the same before quantization.
 
     made: the fit it comes from, with the sweeps that were trained on and held out. weight [K, F], bias [K]: its head.
@@ -58,8 +57,8 @@ class Int8:
 
 
 def train_compact(
-    sweeps: LabelledSweeps, given: Array, seed: int, *, shape: Architecture, recipe: FitRecipe, log: Log
-) -> Int8:
+    sweeps: Dataset, given: Array, seed: int, *, shape: Architecture, recipe: FitRecipe, log: Log
+) -> CompactModel:
     """Train a network of this shape and its closed-form heads, as `palpate-train fit` does.
 
     Raises FormatError where only one material occurs, each only once, or a window is too short.
@@ -69,7 +68,7 @@ def train_compact(
     network, present, told = made.network(), np.unique(sweeps.labels), ran(recipe, "cpu", False, False)
     network.spread(present, len(sweeps.materials), 1.0)
     head = spread(*made.int8_head(), present, len(sweeps.materials))
-    return Int8(made, *head, told, made.cost, {"float": Trained(network, told, made.cost)})
+    return CompactModel(made, *head, told, made.cost, {"float": NetworkModel(network, told, made.cost)})
 
 
 def spread(weight: Array, bias: Array, present: Array, classes: int) -> tuple[Array, Array]:
@@ -79,7 +78,7 @@ def spread(weight: Array, bias: Array, present: Array, classes: int) -> tuple[Ar
     return all_weight, all_bias
 
 
-def methods(effort: Effort = WHOLE, log: Log = silent) -> tuple[Method, ...]:
+def methods(effort: Effort = FULL_EFFORT, log: Log = silent) -> tuple[Method, ...]:
     """The family, trained with this effort. log: is told of every iteration."""
     recipe = shortened(RECIPE, effort)
 
@@ -90,9 +89,9 @@ def methods(effort: Effort = WHOLE, log: Log = silent) -> tuple[Method, ...]:
     about = "strided convolutions, a spectrum and a closed-form head in int8, {},000 weights at most"
     ladder = (
         rung(f"compact-{size}", about.format(size[:-1]) if shape.channels else SPECTRUM, shape)
-        for size, shape in LADDER.items()
+        for size, shape in ARCHITECTURES.items()
     )
-    return (*ladder, rung("compact", "the box's own: as compact-20k, or less where held-out sweeps need less", USUAL))
+    return (*ladder, rung("compact", "the box's own: as compact-20k, or less where held-out sweeps need less", DEFAULT))
 
 
 METHODS = methods()

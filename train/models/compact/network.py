@@ -16,7 +16,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from appliance.core.types import SweepFormat
 from train.models.compact import graph, spectrum
-from train.models.compact.architectures import CAP, FLOOR, MAINS_HZ, USUAL, Architecture
+from train.models.compact.architectures import CAP, DEFAULT, FLOOR, MAINS_HZ, Architecture
 from train.models.networks import Network
 from train.models.training import in_order, tensors
 from train.onnx_tools.graph_builder import with_head
@@ -74,7 +74,7 @@ class Compact(Network):
         scale: float,
         norm: bool = True,
         keep_means: bool = False,
-        shape: Architecture = USUAL,
+        shape: Architecture = DEFAULT,
     ) -> None:
         super().__init__(form, scale)
         self.keep_means, self.shape = keep_means, shape

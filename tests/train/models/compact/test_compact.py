@@ -20,7 +20,7 @@ from tests.factories.sweep_sets import easy
 from train.models import methods
 from train.models.compact import fit, graph, network, spectrum
 from train.models.compact import methods as family
-from train.models.compact.architectures import LADDER, USUAL, Architecture
+from train.models.compact.architectures import ARCHITECTURES, DEFAULT, Architecture
 from train.models.compact.augment import Augmentation
 from train.models.compact.fit import Fit, FitRecipe
 from train.models.compact.network import Compact
@@ -30,7 +30,7 @@ from train.onnx_tools import graph_builder
 SMALL = Architecture((6, 8, 8), 8, 2)
 LIMITS = {"compact-10k": (1e6, 24), "compact-100k": (12e6, 96)}
 """Multiply-accumulates and kilobytes that the issue allows."""
-RUNGS = {name: shape for name, shape in LADDER.items() if shape.channels}
+RUNGS = {name: shape for name, shape in ARCHITECTURES.items() if shape.channels}
 """Those that have stages."""
 
 
@@ -193,9 +193,9 @@ def test_tenths_are_means_of_what_was_known():
 @pytest.mark.parametrize("name", RUNGS)
 def test_a_rung_costs_what_it_says(name: str):
     """Weights of the float graph, multiply-accumulates of its convolutions and head; within what the issue allows."""
-    cost = LADDER[name].cost(skin.FORMAT, 6)
+    cost = ARCHITECTURES[name].cost(skin.FORMAT, 6)
     assert cost.weights == pytest.approx(1000 * int(name[:-1]), rel=0.45)
-    plain = Compact(skin.FORMAT, 6, 0.1, norm=False, shape=LADDER[name]).eval().graph()
+    plain = Compact(skin.FORMAT, 6, 0.1, norm=False, shape=ARCHITECTURES[name]).eval().graph()
     assert graph_builder.weight_count(plain) == cost.weights
     inferred = onnx.shape_inference.infer_shapes(plain, strict_mode=True, data_prop=True).graph
     steps = {v.name: v.type.tensor_type.shape.dim[-1].dim_value for v in inferred.value_info}
@@ -204,7 +204,7 @@ def test_a_rung_costs_what_it_says(name: str):
     assert cost.macs == macs + np.prod(sizes["head.weight"])
     macs, kilobytes = LIMITS.get(f"compact-{name}", (12e6, 96))
     assert cost.macs <= macs
-    for shape, limit in ((LADDER[name], kilobytes), (replace(LADDER[name], spectrum=True), 96)):
+    for shape, limit in ((ARCHITECTURES[name], kilobytes), (replace(ARCHITECTURES[name], spectrum=True), 96)):
         _, _, int8 = trunks(skin.FORMAT, shape=shape)
         features = sum(shape.channels) + shape.spectrum * spectrum.count(skin.FORMAT)
         whole = graph_builder.with_head(int8, np.zeros((6, features)), np.zeros(6))
@@ -213,7 +213,7 @@ def test_a_rung_costs_what_it_says(name: str):
 
 def test_every_operator_of_int8_is_fused(tmp_path: Path):
     """onnxruntime runs whole-number convolutions on bytes in the order they come, integer sums, and turns nothing."""
-    _, _, int8 = trunks(skin.FORMAT, shape=LADDER["20k"])
+    _, _, int8 = trunks(skin.FORMAT, shape=ARCHITECTURES["20k"])
     options = onnxruntime.SessionOptions()
     options.optimized_model_filepath = str(tmp_path / "optimized.onnx")
     options.log_severity_level = 3
@@ -243,10 +243,12 @@ def test_the_method_is_its_int8_graph():
 def test_the_family_is_one_recipe_in_several_shapes():
     """Names in order of size; `compact` is one of the ladder that may lose all stages; effort reaches all."""
     made = {m.name: m for m in family.methods(Effort(share=0.01))}
-    assert list(made) == [*(f"compact-{size}" for size in LADDER), "compact"]
-    assert made["compact"].train.keywords["shape"] == replace(LADDER["20k"], fewest=0)
-    assert {name: shape.fewest for name, shape in LADDER.items()} == dict.fromkeys(LADDER, 1) | {"bands": 0}
-    assert LADDER["bands"].spectrum
+    assert list(made) == [*(f"compact-{size}" for size in ARCHITECTURES), "compact"]
+    assert made["compact"].train.keywords["shape"] == replace(ARCHITECTURES["20k"], fewest=0)
+    assert {name: shape.fewest for name, shape in ARCHITECTURES.items()} == dict.fromkeys(ARCHITECTURES, 1) | {
+        "bands": 0
+    }
+    assert ARCHITECTURES["bands"].spectrum
     assert {m.effort for m in made.values()} == {"6 iterations"}
 
 
@@ -302,7 +304,7 @@ def test_a_cut_network_gives_what_its_first_stages_gave():
 
 
 @pytest.fixture(scope="module")
-def bare() -> family.Int8:
+def bare() -> family.CompactModel:
     """The box's own method where its stages tell nothing of what was held out."""
 
     def blind(model: Compact, *others: object) -> fit.Seen:
@@ -317,9 +319,9 @@ def bare() -> family.Int8:
         return methods.find(["compact"], Effort(share=0.01))[0].train(s, s.samples, 1)
 
 
-def test_the_box_s_own_may_end_without_a_convolution(bare: family.Int8):
+def test_the_box_s_own_may_end_without_a_convolution(bare: family.CompactModel):
     """Then nothing in its graph is int8, its float form says the same, and it learns what is easy."""
-    assert bare.made.shape == USUAL.cut(0, spectrum=True)
+    assert bare.made.shape == DEFAULT.cut(0, spectrum=True)
     assert bare.made.reach.responses == ()
     done = {n.op_type for n in bare.graph().graph.node}
     assert not {"Conv", "QuantizeLinear", "DequantizeLinear", "MatMulInteger"} & done
@@ -332,7 +334,7 @@ def test_the_box_s_own_may_end_without_a_convolution(bare: family.Int8):
     assert bare.features(other[:2], tenths=True).shape == (2, 10, bare.made.bands)
 
 
-def test_a_fit_without_a_convolution_survives_its_file(bare: family.Int8, tmp_path: Path):
+def test_a_fit_without_a_convolution_survives_its_file(bare: family.CompactModel, tmp_path: Path):
     """It says the same, to the bit, in PyTorch and in its graphs."""
     bare.made.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")

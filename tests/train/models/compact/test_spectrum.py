@@ -18,13 +18,13 @@ from appliance.core.types import SweepFormat
 from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.models.compact import fit, graph, methods, spectrum
-from train.models.compact.architectures import LADDER, Architecture
+from train.models.compact.architectures import ARCHITECTURES, Architecture
 from train.models.compact.fit import FitRecipe
 from train.models.compact.network import Compact
 from train.models.methods import Effort
 from train.onnx_tools import graph_builder
 
-BARE = LADDER["bands"]
+BARE = ARCHITECTURES["bands"]
 SMALL = Architecture((6, 8, 8), 8, 2)
 ODD = SweepFormat(2, 2, 100.0, 163, "int16")
 FORMS = {
