@@ -71,8 +71,8 @@ def _role(sha: str, current: str, ledger: StoreState, how: StoreConfig) -> tuple
         return "current", ""
     if sha == current:
         return "on trial", (
-            f"start {standing.starts} of {MOST_STARTS}, {standing.sweeps} of {how.probation_sweeps} sweeps, "
-            f"{standing.streamed_s:.0f} of {how.probation_s:.0f} s, as of its last start or end"
+            f"start {standing.starts} of {MOST_STARTS}, {standing.sweeps} of {how.trial_sweeps} sweeps, "
+            f"{standing.streamed_s:.0f} of {how.trial_s:.0f} s, as of its last start or end"
         )
     if sha == ledger.of(current).previous:
         return "previous", ""

@@ -80,13 +80,13 @@ class OutputConfig:
 
 @dataclass(frozen=True, slots=True)
 class SweepConfig:
-    """What may be a sweep. longest_s: without a stop edge for so long the sweep is answered `long`.
+    """What may be a sweep. max_duration_s: without a stop edge for so long the sweep is answered `long`.
 
     late_ms: how long frames of the window may come after the stop edge. lead_ms: from the start edge to the first frame
     of the window of early answers (500 is the middle of the paper's three seconds).
     """
 
-    longest_s: float = number(12.0, 0.1, 3600.0)
+    max_duration_s: float = number(12.0, 0.1, 3600.0)
     late_ms: int = number(500, 1, 60_000)
     lead_ms: int = number(500, 0, 60_000)
 
@@ -109,15 +109,15 @@ class ClassifierConfig:
     """The network. bundle: a bundle's path; "" for the one that was deployed last, or else the packaged one.
 
     fuse: how the sweeps of one object become one answer; "none": they do not. early: answer while the finger still
-    slides, as soon as the bundle is sure. sure: least probability for status ok; 0 takes the bundle's own threshold.
-    most_sweeps: fused sweeps of one object without `sure` after which the answer is `undecided`; 0 is no limit.
+    slides, as soon as the bundle's rule allows. min_probability: least probability for status ok; 0 takes the bundle's threshold.
+    max_sweeps: fused sweeps of one object below `min_probability` after which the answer is `undecided`; 0 is no limit.
     """
 
     bundle: str = ""
     fuse: Literal["product", "vote", "none"] = "product"
     early: bool = False
-    sure: float = number(0.0, 0.0, 1.0)
-    most_sweeps: int = number(0, 0, 1000)
+    min_probability: float = number(0.0, 0.0, 1.0)
+    max_sweeps: int = number(0, 0, 1000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,15 +125,15 @@ class StoreConfig:
     """What the box keeps. folder: bundles, recordings, the black box (store.py says what lies where).
 
     signers: whose bundles are taken, in the form of ssh-keygen's ALLOWED SIGNERS. status: the file that `palpate status`
-    reads, "" for none. probation_sweeps, probation_s: a new bundle stays once it has named so many sweeps, or the skin has
+    reads, "" for none. trial_sweeps, trial_s: a new bundle stays once it has named so many sweeps, or the skin has
     streamed for so long. black_box: so many of the latest sweeps are kept, 0 for none.
     """
 
     folder: str = "/var/lib/palpate"
     signers: str = "/etc/palpate/allowed_signers"
     status: str = "/run/palpate/status.json"
-    probation_sweeps: int = number(20, 1, 100_000)
-    probation_s: float = number(600.0, 1.0, 1e6)
+    trial_sweeps: int = number(20, 1, 100_000)
+    trial_s: float = number(600.0, 1.0, 1e6)
     black_box: int = number(0, 0, 100_000)
 
 

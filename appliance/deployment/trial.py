@@ -45,8 +45,8 @@ class Trial:
             return ""
         how = self._store.how
         return (
-            f"on trial: {self._sweeps} of {how.probation_sweeps} sweeps, "
-            f"{self._streamed_ns / 1e9:.0f} of {how.probation_s:.0f} s"
+            f"on trial: {self._sweeps} of {how.trial_sweeps} sweeps, "
+            f"{self._streamed_ns / 1e9:.0f} of {how.trial_s:.0f} s"
         )
 
     def send(self, verdict: Verdict) -> None:
@@ -79,7 +79,7 @@ class Trial:
     def _written(self, health: Health) -> bool:
         """Whether the ledger holds what it should; a sweep that is open is not disturbed for the commit."""
         how = self._store.how
-        if self._sweeps >= how.probation_sweeps or self._streamed_ns >= how.probation_s * 1e9:
+        if self._sweeps >= how.trial_sweeps or self._streamed_ns >= how.trial_s * 1e9:
             return health.sweeping or self._try(self._commit)
         return health.streams == self._counted or self._try(lambda: self._note(health.streams))
 

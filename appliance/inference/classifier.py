@@ -97,22 +97,22 @@ class Classifier:
     """Runs one bundle in one thread.
 
     Sweeps with the same `object` number above 0 are fused: a robot that never says NEW OBJECT gets each by itself.
-    They are a sequential test: `unsure` asks for one more sweep of the object, until the probability is at least `sure`
-    (ok) or `most_sweeps` were fused (undecided: the answer is final). A robot that sweeps on all the same is answered
+    They are a sequential test: `unsure` asks for one more sweep of the object, until the probability is at least
+    `min_probability` (ok) or `max_sweeps` were fused (undecided: the answer is final). A robot that sweeps on all the same is answered
     by the same rule, with all sweeps of the object in it: more evidence is never thrown away.
     An unknown sweep takes no part in this. It has no probabilities that could be fused, and one touch beside the object
     must not undo what the object's other sweeps said.
 
-    sure: 0 stands for the bundle's thresholds.unsure. most_sweeps: 0 for no limit.
+    min_probability: 0 stands for the bundle's thresholds.unsure. max_sweeps: 0 for no limit.
     Raises BundleError where onnxruntime refuses the model; bundle.load has compared its input and outputs with the manifest.
     """
 
     def __init__(
-        self, bundle: Bundle, clock: Clock, how: str = "product", sure: float = 0.0, most_sweeps: int = 0
+        self, bundle: Bundle, clock: Clock, how: str = "product", min_probability: float = 0.0, max_sweeps: int = 0
     ) -> None:
         self.bundle = bundle
-        self.sure = sure or bundle.manifest.thresholds.unsure
-        self._clock, self._how, self._most = clock, how, most_sweeps
+        self.min_probability = min_probability or bundle.manifest.thresholds.unsure
+        self._clock, self._how, self._max_sweeps = clock, how, max_sweeps
         self._object = 0
         self._scores: list[NDArray[np.float64]] = []  # of the object's sweeps so far
         f = bundle.format
@@ -127,7 +127,7 @@ class Classifier:
     @property
     def rule(self) -> dict[str, Any]:
         """What the constructor was told, so that a recorded sweep is judged by it again."""
-        return {"how": self._how, "sure": self.sure, "most_sweeps": self._most}
+        return {"how": self._how, "sure": self.min_probability, "most_sweeps": self._max_sweeps}
 
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window [T, R, C] of digits."""
@@ -195,8 +195,8 @@ class Classifier:
         if fused > 1:
             scores = fuse(self._scores, self._how)
         status = Status.OK
-        if scores.max() < self.sure:
-            status = Status.UNDECIDED if 0 < self._most <= fused else Status.UNSURE
+        if scores.max() < self.min_probability:
+            status = Status.UNDECIDED if 0 < self._max_sweeps <= fused else Status.UNSURE
         return self._verdict(sweep, Finding(status), scores, fused, own)
 
     def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:

@@ -38,13 +38,13 @@ class _Open:
 
 
 class SweepCutter:
-    """Holds the last `longest_s` (and a little more) of frames, and the sweeps that have not been answered yet."""
+    """Holds the last `max_duration_s` (and a little more) of frames, and the sweeps that have not been answered yet."""
 
     def __init__(self, fmt: SweepFormat, config: SweepConfig) -> None:
         self._format = fmt
-        self._longest_ns = round(config.longest_s * 1e9)
+        self._max_duration_ns = round(config.max_duration_s * 1e9)
         self._late_ns, self._lead_ns = config.late_ms * 1_000_000, config.lead_ms * 1_000_000
-        self._size = fmt.window + 2 * MAX_GAP + int((config.longest_s + config.late_ms / 1000 + 1) * fmt.rate_hz)
+        self._size = fmt.window + 2 * MAX_GAP + int((config.max_duration_s + config.late_ms / 1000 + 1) * fmt.rate_hz)
         # slot = seq % size: a frame's place is known without searching, and what was not overwritten is not lost
         self._seq = np.full(self._size, -1, np.int64)
         self._t_ns = np.zeros(self._size, np.int64)
@@ -102,7 +102,7 @@ class SweepCutter:
 
     def finished(self, now_ns: int) -> list[Sweep]:
         """The sweeps that can be answered at `now_ns`, in the order of their numbers."""
-        if self._open and not self._open.answered and now_ns - self._open.start_ns > self._longest_ns:
+        if self._open and not self._open.answered and now_ns - self._open.start_ns > self._max_duration_ns:
             self._answer(self._open, now_ns, Status.LONG, now_ns)
         waiting = []
         for item in self._closing:
@@ -170,7 +170,7 @@ class SweepCutter:
             length_ns = t_ns - sweep.start_ns
             if length_ns < self._format.window * self._format.period_ns:
                 self._answer(sweep, t_ns, Status.SHORT, now_ns)
-            elif length_ns > self._longest_ns:
+            elif length_ns > self._max_duration_ns:
                 self._answer(sweep, t_ns, Status.LONG, now_ns)
             else:
                 self._closing.append((sweep, t_ns))

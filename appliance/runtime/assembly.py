@@ -67,7 +67,7 @@ def box(
 def classifier(settings: Config, model: Bundle, clock: Clock) -> Classifier:
     """The classifier as the settings want it."""
     how = settings.classifier
-    return Classifier(model, clock, how.fuse, how.sure, how.most_sweeps)
+    return Classifier(model, clock, how.fuse, how.min_probability, how.max_sweeps)
 
 
 def early(settings: Config, run: Classifier) -> Decider | None:

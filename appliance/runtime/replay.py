@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -56,7 +56,7 @@ def replay(path: Path, settings: Config, model: Bundle, out: Callable[[str], obj
 
 @dataclass(frozen=True, slots=True)
 class ReplayRule:
-    """How a classifier makes answers of probabilities: what it was made with."""
+    """How a classifier makes answers of probabilities, under the names that sidecars have."""
 
     how: str
     sure: float
@@ -168,7 +168,7 @@ class Judge:
         if self._classifier is None or made != self._made:
             self._made = made
             if kept.rule:
-                self._classifier = Classifier(self._model, self._clock, **asdict(kept.rule))
+                self._classifier = Classifier(self._model, self._clock, *astuple(kept.rule))
             else:
                 self._classifier = assembly.classifier(self._settings, self._model, self._clock)
         self._classifier.tare = kept.tare

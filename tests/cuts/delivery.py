@@ -72,7 +72,7 @@ class Shop:
         """A command of the box in `folder`. @: where bundles are copied to."""
         said = [str(word).replace("@", f"{folder / INCOMING}/") for word in words]
         where = f"store.folder={folder / STORE}", f"store.signers={self.folder / 'signers'}"
-        how = "store.status=", f"store.probation_sweeps={PROBATION}"
+        how = "store.status=", f"store.trial_sweeps={PROBATION}"
         return said + [word for value in (*where, *how) for word in ("--set", value)]
 
     def palpate(self, name: str, *words: str, way: str = "") -> Step:

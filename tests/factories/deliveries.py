@@ -63,7 +63,7 @@ class Delivery:
     def __init__(self, folder: Path, prove: Callable[[Bundle], object] = lambda bundle: None) -> None:
         self.folder = folder
         self.key = key(folder / "keys")
-        self.how = StoreConfig(str(folder / "store"), str(folder / "allowed_signers"), probation_sweeps=5)
+        self.how = StoreConfig(str(folder / "store"), str(folder / "allowed_signers"), trial_sweeps=5)
         Path(self.how.folder).mkdir()
         Path(self.how.signers).write_text(line(self.key))
         self.store, self.logged = Store(self.how, prove), list[str]()

@@ -71,7 +71,7 @@ def settings() -> list[bytes]:
     files = sorted((ROOT / "firmware_config").glob("*.toml"))
     values = ["".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files]
     whole = config.describe(config.load(None, site=Path("/dev/null")))
-    return [text.encode() for text in (*values, whole, 'board = "a"\n[sweep]\nlongest_s = 3\n')]
+    return [text.encode() for text in (*values, whole, 'board = "a"\n[sweep]\nmax_duration_s = 3\n')]
 
 
 def manifest() -> list[bytes]:

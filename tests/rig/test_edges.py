@@ -36,7 +36,7 @@ decided = "CLASS-1"
 [classifier]
 early = true
 [sweep]
-longest_s = 4.0
+max_duration_s = 4.0
 [serial]
 port = "/dev/palpate-robot"
 """
@@ -168,7 +168,7 @@ def test_stop_without_start(cell: Cell, note: Note) -> None:
 
 
 def test_stop_is_stuck(cell: Cell, count: Count, note: Note) -> None:
-    """With STOP stuck, low or high, a sweep is answered `long` after sweep.longest_s; the next is right by itself."""
+    """With STOP stuck, low or high, a sweep is answered `long` after sweep.max_duration_s; the next is right by itself."""
     levels = [False, True][: count(0, 2)]
     if not levels:
         pytest.skip("twelve seconds each; in the full run")

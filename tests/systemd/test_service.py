@@ -145,12 +145,12 @@ def test_a_killed_process_is_started_again(machine: Machine, service: Service, s
 def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service):
     """Exit 78: named once, and no start after it; mended, it starts."""
     service.start()
-    machine.put(SITE, "[sweep]\nlongest_s = 'for ever'\n")
+    machine.put(SITE, "[sweep]\nmax_duration_s = 'for ever'\n")
     service.kill("SIGKILL")
     service.until("ActiveState", "failed")
     time.sleep(2.5)  # longer than RestartSec
     assert (service["NRestarts"], service["ExecMainStatus"], service["SubState"]) == ("1", "78", "failed")
-    named = f"palpate: {SITE}: sweep.longest_s = 'for ever'"
+    named = f"palpate: {SITE}: sweep.max_duration_s = 'for ever'"
     assert sum(line.startswith(named) for line in service.told()) == 1
     machine.get("rm", SITE)
     machine.get("systemctl", "start", "palpate")

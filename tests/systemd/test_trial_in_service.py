@@ -128,7 +128,7 @@ def serves(service: Service, sha: str) -> None:
 def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Service, store: Store):
     """On trial at its first start, which `palpate status` tells; after its sweeps committed, with a line in the journal."""
     new = store.deploy()
-    machine.put(SITE, "[store]\nprobation_sweeps = 1\n")
+    machine.put(SITE, "[store]\ntrial_sweeps = 1\n")
     service.start(RUN)
     serves(service, new)
     end = time.monotonic() + 30

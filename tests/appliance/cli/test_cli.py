@@ -172,13 +172,20 @@ def test_replay_of_a_sweep_set(
 def test_the_sequential_test_is_configured(
     tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
 ):
-    """classifier.sure and classifier.most_sweeps reach the classifier, in `run` and in `replay`."""
+    """classifier.min_probability and classifier.max_sweeps reach the classifier, in `run` and in `replay`."""
     samples = default_bundle.golden[:1].repeat(3, axis=0)
     np.savez(
         tmp_path / "set.npz", samples=samples, labels=np.zeros(3, int), materials=np.array(["a"]), rate_hz=750.0,
         group_recording=np.zeros(3, int),
     )  # fmt: skip
-    never = ["--set", "classifier.sure=1", "--set", "classifier.most_sweeps=2", "--set", "classifier.fuse=product"]
+    never = [
+        "--set",
+        "classifier.min_probability=1",
+        "--set",
+        "classifier.max_sweeps=2",
+        "--set",
+        "classifier.fuse=product",
+    ]
     played = ["record", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
     kept = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
 
@@ -247,9 +254,9 @@ def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
     """Each value with the file it comes from."""
-    assert main(["config", "--board", "rpi5", "--set", "sweep.longest_s=9"]) == 0
+    assert main(["config", "--board", "rpi5", "--set", "sweep.max_duration_s=9"]) == 0
     out = capsys.readouterr().out
-    assert "# --set" in next(line for line in out.splitlines() if line.startswith("sweep.longest_s"))
+    assert "# --set" in next(line for line in out.splitlines() if line.startswith("sweep.max_duration_s"))
     assert "board-rpi5.toml" in out
 
 
@@ -265,7 +272,7 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (["run", "--virtual"], ConfigError, "--virtual needs --sim"),
         (["run", "--sim", "world"], ConfigError, "--sim world is unknown"),
         (["run", "--board", "toaster"], ConfigError, "rpi5"),
-        (["run", "--set", "sweep.longets_s=1"], ConfigError, "longest_s"),
+        (["run", "--set", "sweep.max_durtion_s=1"], ConfigError, "max_duration_s"),
         (["run", "--sim", "skin", "--set", "classifier.bundle=/nowhere"], BundleError, "no bundle at /nowhere"),
         (["run", "--sim", "replay:/nowhere.npz"], FormatError, "nowhere.npz: not a sweep set"),
         (["run", "--board", "rpi5"], LineError, "gpiochip"),

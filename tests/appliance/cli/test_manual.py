@@ -267,8 +267,8 @@ def test_the_trial_is_told_as_it_is():
     """How many starts, sweeps and seconds: the ledger's and the settings' defaults."""
     how = config.StoreConfig()
     text = SECTIONS["Record, train, sign, deliver"]
-    assert f"`store.probation_sweeps` ({how.probation_sweeps})" in text.replace("\n", " ")
-    assert f"`store.probation_s` ({how.probation_s:.0f} s)" in text.replace("\n", " ")
+    assert f"`store.trial_sweeps` ({how.trial_sweeps})" in text.replace("\n", " ")
+    assert f"`store.trial_s` ({how.trial_s:.0f} s)" in text.replace("\n", " ")
     assert f" {state.MOST_STARTS} starts " in text.replace("\n", " ")
 
 

@@ -102,7 +102,7 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
         ('[trigger]\nstart = "a\\u0000"', "trigger.start = 'a\\x00'", "without control characters"),
         ("[output]\nclass_bits = 'GPIO16'", "output.class_bits = 'GPIO16'", 'names such as ["GPIO16"]'),
         ("[output]\nclass_bits = ['A', '']", "output.class_bits = ['A', '']", 'names such as ["GPIO16"]'),
-        ("[sweep]\nlongest_s = nan", "sweep.longest_s = nan", "a number from 0.1 to 3600.0"),
+        ("[sweep]\nmax_duration_s = nan", "sweep.max_duration_s = nan", "a number from 0.1 to 3600.0"),
         ("[sensor]\nread_bytes = 1000", "sensor.read_bytes = 1000", "a multiple of 512 from 512 to 1048576"),
         ("[sensor]\nproduct_id = 0x10000", "sensor.product_id = 65536", "a whole number from 1 to 65535"),
         ("[sensor\nserial = 1", "not TOML", "line 1"),
@@ -143,7 +143,7 @@ def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint:
         ("trigger.start=GPIO5", "trigger", "start", "GPIO5"),
         ("trigger.start=", "trigger", "start", ""),
         ('sensor.serial="1234"', "sensor", "serial", "1234"),
-        ("sweep.longest_s=3", "sweep", "longest_s", 3.0),
+        ("sweep.max_duration_s=3", "sweep", "max_duration_s", 3.0),
         ('output.class_bits=["A", "B"]', "output", "class_bits", ("A", "B")),
         ("serial.port=/dev/ttyS0 # not a comment", "serial", "port", "/dev/ttyS0 # not a comment"),
         ('serial.port="a" x=1', "serial", "port", '"a" x=1'),
@@ -206,7 +206,7 @@ def test_any_set_text_is_a_value_or_a_config_error(text: str, name: str) -> None
 
 def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path) -> None:
     """The printed text is a palpate.toml with the same settings."""
-    sets = ["output.class_bits=['A', 'B']", "sensor.serial=Ü𝄞 \\", "sweep.longest_s=3", "trigger.active_low=true"]
+    sets = ["output.class_bits=['A', 'B']", "sensor.serial=Ü𝄞 \\", "sweep.max_duration_s=3", "trigger.active_low=true"]
     c = _load(folder, "a", *sets)
     lines = config.describe(c).splitlines()
     assert len(lines) == len(c.sources)

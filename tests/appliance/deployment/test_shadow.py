@@ -149,7 +149,7 @@ def test_no_more_are_kept_than_its_limit(side, monkeypatch: pytest.MonkeyPatch):
 
 def test_it_fuses_by_the_same_rule(side):
     """Sweeps of one object are fused by the candidate, too: neither asks for a third one."""
-    pair = side(sure=0.9)
+    pair = side(min_probability=0.9)
     pair.judge(
         toy_bundle.sweep(2.5, 0, 1, object=1),
         toy_bundle.sweep(2.5, 0, 2, object=1),

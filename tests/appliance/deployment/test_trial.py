@@ -105,7 +105,7 @@ def test_nothing_is_written_while_nothing_is_new(box: Trying):
 def test_enough_sweeps_commit(box: Trying):
     """Those that got a label, and not while a sweep is open; from then on older bundles are refused."""
     trial = box.tried()
-    for _ in range(box.how.probation_sweeps - 1):
+    for _ in range(box.how.trial_sweeps - 1):
         trial.send(verdict())
     for _ in range(10):
         trial.send(verdict(label=""))

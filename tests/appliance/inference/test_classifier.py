@@ -477,7 +477,7 @@ def borderline(**more) -> tuple[Sweep, float]:
 
 def test_sweeps_are_asked_for_until_one_is_sure(tmp_path: Path):
     """Unsure, unsure, ok: after n sweeps the odds are those of one to the power n. A further one is fused too."""
-    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), sure=0.85, most_sweeps=5)
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=5)
     given = [it(borderline(object=1)[0]) for _ in range(4)]
     p = borderline()[1]
     assert [v.status for v in given] == [Status.UNSURE, Status.UNSURE, Status.OK, Status.OK]
@@ -491,7 +491,7 @@ def test_sweeps_are_asked_for_until_one_is_sure(tmp_path: Path):
 
 def test_at_the_limit_the_answer_is_final(tmp_path: Path):
     """Undecided with label and probability; a robot that goes on is answered by the same rule, and may become sure."""
-    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), sure=0.85, most_sweeps=2)
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=2)
     given = [it(borderline(object=1)[0]) for _ in range(3)]
     assert [v.status for v in given] == [Status.UNSURE, Status.UNDECIDED, Status.OK]
     assert given[1].label == "a"
@@ -504,24 +504,24 @@ def test_at_the_limit_the_answer_is_final(tmp_path: Path):
 def test_sweeps_that_stand_alone_never_reach_the_limit(tmp_path: Path, more: dict):
     """Without NEW OBJECT, or with fusing off, each sweep is one; a limit of one makes it final."""
     how = more.pop("how", "product")
-    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), how, sure=0.85, most_sweeps=2)
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), how, min_probability=0.85, max_sweeps=2)
     assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNSURE] * 3
-    it = Classifier(it.bundle, VirtualClock(), how, sure=0.85, most_sweeps=1)
+    it = Classifier(it.bundle, VirtualClock(), how, min_probability=0.85, max_sweeps=1)
     assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNDECIDED] * 3
 
 
 def test_sure_is_the_bundles_where_none_is_given(tmp_path: Path):
     """0 stands for thresholds.unsure; without a limit nothing is ever undecided."""
     it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
-    assert it.sure == toy_bundle.LIMITS.unsure
+    assert it.min_probability == toy_bundle.LIMITS.unsure
     assert it(borderline()[0]).status is Status.OK
-    it = Classifier(it.bundle, VirtualClock(), sure=1.1)
+    it = Classifier(it.bundle, VirtualClock(), min_probability=1.1)
     assert {it(borderline(object=1)[0]).status for _ in range(20)} == {Status.UNSURE}
 
 
 def test_what_is_not_ok_need_not_count(tmp_path: Path):
     """An early answer that would not be ok is none, and leaves the object as it was."""
-    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), sure=0.85)
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85)
     first = it(borderline(object=1)[0])
     for object in (1, 2):
         half = replace(toy_bundle.sweep(0, 0), object=object, share=0.5)

@@ -389,9 +389,9 @@ def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Callable[...,
 
 
 def test_what_would_be_unsure_goes_on(rigged: Callable[..., Rigged]):
-    """`sure` is not reached by one sweep: no early answer, the whole one asks for another; fused it comes early."""
+    """`min_probability` is not reached by one sweep: no early answer, the whole one asks for another; fused it comes early."""
     world = world_of(slid(30), slid(30), new_object=(0,))
-    verdicts = all_of(rigged(world, (*SETS, "classifier.sure=0.99"), toy()))
+    verdicts = all_of(rigged(world, (*SETS, "classifier.min_probability=0.99"), toy()))
     assert [(str(v.status), v.fused, v.share) for v in verdicts] == [("unsure", 1, 1.0), ("ok", 2, 0.2)]
 
 

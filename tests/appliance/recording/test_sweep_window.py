@@ -176,8 +176,8 @@ def test_short():
 
 
 def test_start_without_stop():
-    """No stop edge within `longest_s`: `long`, once; the late stop edge closes it silently, the next sweep is fine."""
-    bench = Bench(longest_s=4)
+    """No stop edge within `max_duration_s`: `long`, once; the late stop edge closes it silently, the next sweep is fine."""
+    bench = Bench(max_duration_s=4)
     bench.put(frames(0, 3000))
     bench.edge(EdgeKind.START, 100)
     assert bench.done() == []
@@ -192,7 +192,7 @@ def test_start_without_stop():
 
 def test_longer_than_the_limit():
     """Both edges come at once, but lie too far apart: `long`."""
-    bench = Bench(longest_s=3)
+    bench = Bench(max_duration_s=3)
     bench.put(frames(0, 3000))
     bench.edge(EdgeKind.START, 0)
     bench.recorder.trigger([Edge(EdgeKind.STOP, t_ns(2999))], True, bench.now)
@@ -280,7 +280,7 @@ def test_objects_are_counted():
 
 def test_the_ring_forgets_what_is_old_and_nothing_else():
     """After many turns of the ring a window is still cut right; one that has been overwritten is a `gap`."""
-    bench = Bench(longest_s=4)
+    bench = Bench(max_duration_s=4)
     for first in range(0, 30_000, 750):
         bench.put(frames(first, 750))
     bench.edge(EdgeKind.START, 27_000)
@@ -400,7 +400,7 @@ def test_steps_begin_with_a_new_enumeration():
 )
 def test_every_start_gets_exactly_one_answer(script):
     """Whatever edges come in whatever order, some sweeps settled at a step: each number is answered once."""
-    bench = Bench(longest_s=5, lead_ms=0)
+    bench = Bench(max_duration_s=5, lead_ms=0)
     frame = starts = 0
     answers: list[Sweep] = []
     for kind, ready, step, settled in script:

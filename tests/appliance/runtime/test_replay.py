@@ -30,7 +30,7 @@ from tests.factories.simulated_box import Rigged
 SWEEPS = 30
 PER_OBJECT = 3
 HERE = config.load(None, site=NO_SITE)
-OTHERWISE = config.load(None, ("classifier.fuse=vote", "classifier.sure=1"), site=NO_SITE)
+OTHERWISE = config.load(None, ("classifier.fuse=vote", "classifier.min_probability=1"), site=NO_SITE)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def in_service(run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Pat
         world = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "replay")
         box: Rigged
         keeper = BlackBox(run["folder"], skin.FORMAT, SWEEPS, circumstances=lambda: box.box.circumstances(), log=print)
-        box = rigged(world, sets=("classifier.early=true", "classifier.sure=0.97"), keepers=[keeper.keep])
+        box = rigged(world, sets=("classifier.early=true", "classifier.min_probability=0.97"), keepers=[keeper.keep])
         box.until(lambda: world.finished(box.box.answered), limit_s=300)
         keeper.close()
         run["heard"] = [line for line in box.heard if ",RES," in line]
@@ -114,7 +114,7 @@ def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, d
 def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
     """By itself it would not have been given: its own scores are compared all the same, and no sentence is made up."""
     model = toy_bundle.load(tmp_path / "bundle", early=Early((0.5,) * 3, 1), outputs=("logits", "embedding", "early"))
-    classifier = Classifier(model, rig.VirtualClock(), sure=0.97)
+    classifier = Classifier(model, rig.VirtualClock(), min_probability=0.97)
     whole = toy_bundle.sweep(2.5, 0.5, object=1)
     frames = Frames(*(values[:10] for values in (whole.frames.t_ns, whole.frames.seq, whole.frames.taxels)))
     early = replace(whole, id=2, frames=frames, share=0.5)
