@@ -1,6 +1,6 @@
 """Altered bundles, all of them. In: a signed bundle. Out: how many of its alterations a box has accepted: none, or it fails.
 
-`PYTHONPATH=tests python -m flips --out build/flips.json` flips every bit of a manifest, random bits of the other files,
+`python -m tests.campaigns.flips --out build/flips.json` flips every bit of a manifest, random bits of the other files,
 swaps each file with that of another signed bundle, and tries bundles that are unsigned, wrongly signed, cut or older.
 Each one goes the way of a delivered bundle, `Store.install`. Bits of the signature's own file are not counted: some of its
 line ends, say, may be others, and it is the same signature of the same manifest.
@@ -160,12 +160,15 @@ def campaign(folder: Path, manifest_bits: int | None, seed: int, every: int = 0)
 
 def main() -> int:
     """Run the campaign and write its figures; 1 where anything was accepted."""
-    parser = argparse.ArgumentParser(prog="flips", description="Counts the altered bundles that a box accepts.")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.campaigns.flips", description="Counts the altered bundles that a box accepts."
+    )
     parser.add_argument("--out", type=Path, default=Path("build/flips.json"))
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--bits", type=int, help="flip this many random bits of the manifest (all of them)")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = campaign(Path(folder), None, args.seed, every=1000)
+        found = campaign(Path(folder), args.bits, args.seed, every=1000)
     total = {
         name: sum(count[name] for count in found.values()) for name in ("tried", "accepted", "believed", "changed")
     }

@@ -1,6 +1,6 @@
 """The campaign of fuzzed models: our own, changed at random, through the box's check, onnxruntime and a run.
 
-`PYTHONPATH=tests python tests/hostile_fuzz.py --count 10000 --seed 1 --out FILE.json` (make it `nice`; a stopped one goes
+`python -m tests.campaigns.hostile_fuzz --count 10000 --seed 1 --out FILE.json` (make it `nice`; a stopped one goes
 on where it was). Each model is opened in a child that may take 256 MB more than it had and ten seconds; what matters is
 how many hung it, killed it, or went beyond that memory. Seed and number name a model for ever.
 """

@@ -1,4 +1,4 @@
-"""What is left on the disk by a kill, or a loss of power, at any moment: a small part of `python -m cuts`, and whether that
+"""What is left on the disk by a kill, or a loss of power, at any moment: a small part of `python -m tests.cuts`, and whether that
 finds what is wrong on purpose.
 """
 

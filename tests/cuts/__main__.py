@@ -1,4 +1,4 @@
-"""Cuts every scene at every moment: `python -m cuts [SCENE ...]`. In: scenes by name. Out: a line for each command, and in
+"""Cuts every scene at every moment: `python -m tests.cuts [SCENE ...]`. In: scenes by name. Out: a line for each command, and in
 build/cuts.jsonl one for each point, with the machine and the commit.
 
 It goes on where it was broken off, as long as neither the box nor the scenes have changed. 1 where anything is wrong.
@@ -33,7 +33,7 @@ HOWS = ("kill", "power", "kill_then_power")
 
 def main() -> int:
     """Cut the named scenes, or all."""
-    parser = argparse.ArgumentParser(prog="cuts", description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.cuts", description=__doc__.split("\n\n")[0])
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"from {', '.join(SCENES)}; all by default")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "cuts.jsonl", help="points (%(default)s)")
     parser.add_argument(

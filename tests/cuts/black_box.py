@@ -1,7 +1,7 @@
 """The black box, cut short. In: a program that keeps the last sweeps in service. Out: a scene, whose judge finds what is
 lost of these beyond the sweep in progress.
 
-`python -m cuts.black_box FOLDER` is that program: it goes on in the folder, and says of each sweep when it is kept.
+`python -m tests.cuts.black_box FOLDER` is that program: it goes on in the folder, and says of each sweep when it is kept.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Delivery, cut short. In: signed bundles that are copied to the box, taken, started, committed and left again. Out: a
 scene, whose judge finds each box that does not come back with the old bundle or the new one, whole.
 
-`python -m cuts.delivery WAY ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is wrong on purpose.
+`python -m tests.cuts.delivery WAY ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is wrong on purpose.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Shop:
 
     def palpate(self, name: str, *words: str, way: str = "") -> Step:
         """A command of the box, in one of WAYS or as it is."""
-        program = ["cuts.delivery", way] if way else ["appliance"]
+        program = ["tests.cuts.delivery", way] if way else ["appliance"]
         code = DIED if way == "crash" else 0
         return Step(name, lambda folder: [sys.executable, "-m", *program, *self.words(folder, *words)], code)
 

@@ -1,7 +1,7 @@
 """Recording, cut short. In: programs that record sweeps, the box's own and some that are wrong on purpose. Out: scenes,
 whose judge finds what is lost beyond the sweep in progress.
 
-`python -m cuts.recording WAY FOLDER SESSION` is such a program: it goes on in the folder, says what a robot would hear,
+`python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it goes on in the folder, says what a robot would hear,
 and which sweep it is told to discard.
 """
 
@@ -151,7 +151,7 @@ def _goes_on(folder: Path) -> list[str]:
 
 def scene(way: str = "right") -> Scene:
     """Two runs that record, the second one in what the first has left."""
-    return _sessions("recording", lambda kept, name: ["cuts.recording", way, kept, name])
+    return _sessions("recording", lambda kept, name: ["tests.cuts.recording", way, kept, name])
 
 
 def palpate() -> Scene:

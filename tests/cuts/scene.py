@@ -24,7 +24,7 @@ MEMORY = Path("/dev/shm")
 """Where scenes are best played: what a sync does is known here, and on a real disk it takes its time."""
 BETWEEN = "\n"
 """Said before each command, so that the last line is its own."""
-ENVIRONMENT = {"PYTHONPATH": f"{ROOT / 'tests'}:{ROOT}"}
+ENVIRONMENT = {"PYTHONPATH": str(ROOT)}
 
 
 def stage() -> TemporaryDirectory[str]:

@@ -1,8 +1,8 @@
 """The room of other processors. In: folders with bundles and sweeps. Out: what the box's classifier says of them there.
 
-`python tests/machines.py` gets what an arm64 userland needs, once, into ~/.cache/palpate/machines: Debian's packages
+`python -m tests.factories.emulated_machines` gets what an arm64 userland needs, once, into ~/.cache/palpate/machines: Debian's packages
 unpacked, the wheels of appliance/requirements.lock beside them. qemu's user mode runs it, and x86 processors older than
-this one; nothing needs root, and nothing outside that folder is changed. `python tests/machines.py FROM TO` is what
+this one; nothing needs root, and nothing outside that folder is changed. `python -m tests.factories.emulated_machines FROM TO` is what
 then runs on each machine, this one too.
 """
 
@@ -60,7 +60,9 @@ def qemu(kind: str) -> str:
     for name in (f"qemu-{kind}-static", f"qemu-{kind}"):
         if found := shutil.which(name, path=f"{os.environ['PATH']}:{folder() / 'qemu' / 'usr' / 'bin'}"):
             return found
-    raise Missing(f"no qemu-{kind} here; apt-get install qemu-user-static, or run python tests/machines.py")
+    raise Missing(
+        f"no qemu-{kind} here; apt-get install qemu-user-static, or run python -m tests.factories.emulated_machines"
+    )
 
 
 def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
@@ -74,7 +76,9 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
         return [*run, sys.executable, __file__, *map(str, args)], env
     usr = folder() / "root" / "usr"
     if not usr.exists():
-        raise Missing("no arm64 userland here; run python tests/machines.py (30 s, 300 MB in ~/.cache/palpate)")
+        raise Missing(
+            "no arm64 userland here; run python -m tests.factories.emulated_machines (30 s, 300 MB in ~/.cache/palpate)"
+        )
     env |= {"PYTHONPATH": f"{folder() / 'site'}:{ROOT}", "PYTHONHOME": str(usr)}
     return [*run, "-L", str(usr.parent), str(usr / "bin" / PYTHON), __file__, *map(str, args)], env
 

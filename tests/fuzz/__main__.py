@@ -1,4 +1,4 @@
-"""Runs the fuzzing: `python -m fuzz [TARGET ...] --minutes N`. In: targets, CPU minutes for each, a seed. Out: a line
+"""Runs the fuzzing: `python -m tests.fuzz [TARGET ...] --minutes N`. In: targets, CPU minutes for each, a seed. Out: a line
 of figures for each target, the smallest corpus that covers as much, and in crashes/ whatever broke a promise.
 
 What it learns lies in build/fuzz/ and is taken up again by the next run, also by one after an interruption.
@@ -40,7 +40,7 @@ class Run:
 
 def main() -> int:
     """Fuzz the named targets, or all, one after another; 1 where a promise was broken."""
-    parser = argparse.ArgumentParser(prog="fuzz", description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.split("\n\n")[0])
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"from {', '.join(TARGETS)}; all by default")
     parser.add_argument(
         "--minutes", type=float, default=10, help="processor time for each target, 0 only to merge (%(default)s)"
@@ -69,6 +69,8 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
     smallest.mkdir()
     _engine(target, 0, "-merge=1", smallest, inputs)
     kept = [file.read_bytes() for file in smallest.iterdir() if file.stat().st_size <= LONGEST_SAVED]
+    if not kept:
+        raise SystemExit(f"{target}: the merge kept no input; see {place / 'log'}; the saved corpus stays as it is")
     corpus.save(target, kept)
     print(
         f"{target}: {run.executions} executions in {run.cpu_s:.0f} s of processor time, {run.executions / run.cpu_s:.0f}/s; "
@@ -77,7 +79,10 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
         flush=True,
     )
     for crash in run.crashes:
-        print(f"{target}: a promise was broken by {crash}; mend it, name the file, add it to tests/test_fuzz.py")
+        print(
+            f"{target}: {crash} breaks a promise; mend it, name the file, and explain it in BROKE of "
+            "tests/appliance/bundle/test_fuzzed_input.py"
+        )
     return 1 if run.crashes else 0
 
 

@@ -39,7 +39,7 @@ def main(name: str, seconds: float, *options: str) -> None:
             if 0 < seconds < time.process_time():  # not by the clock: a busy machine takes nothing away
                 os.kill(os.getpid(), signal.SIGUSR1)  # libFuzzer's clean end
 
-        again = f"{sys.executable} -m fuzz.engine {name} {seconds}"  # how libFuzzer starts itself to merge
+        again = f"{sys.executable} -m tests.fuzz.engine {name} {seconds}"  # how libFuzzer starts itself to merge
         atheris.Setup([again, *options], once, custom_mutator=mutator)
         atheris.Fuzz()
 

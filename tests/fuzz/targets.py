@@ -163,14 +163,15 @@ def command(data: bytes, folder: Path) -> None:
 def _is_command(line: bytes, name: str) -> bool:
     """Whether a line is a command by PROTOCOL.md, and this one."""
     body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
-    said, comma, _ = body.removeprefix(b"PPLP,").decode("ascii", "replace").partition(",")
+    said, comma, text = body.removeprefix(b"PPLP,").decode("ascii", "replace").partition(",")
     known = (
         body.startswith(b"PPLP,")
         and said == name
         and name in robot_link.COMMANDS
         and bool(comma) == (name in robot_link.TOLD)
     )
-    known = known and not re.search(rb"[^ -~]|[!\\~^]", body)  # what a sentence may not hold (PROTOCOL.md)
+    # what a sentence may not hold (PROTOCOL.md); a command has one field
+    known = known and "," not in text and not re.search(rb"[^ -~]|[!\\~^]", body)
     sealed = not star or given.upper() == b"%02X" % reduce(xor, body, 0)
     return known and sealed and len(line) <= LINE
 

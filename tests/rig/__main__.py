@@ -1,4 +1,4 @@
-"""`python -m rig build|show|shell`: makes the virtual box, shows it at work, or opens a shell in it.
+"""`python -m tests.rig build|show|shell`: makes the virtual box, shows it at work, or opens a shell in it.
 
 `ground` makes the part of it that is the same for every commit, `lacking` tells which Debian packages all that takes,
 `table` what became of the faults that the tests have made.
@@ -51,7 +51,7 @@ def shell(cell: Cell) -> None:
 
 def main() -> int:
     """Read the arguments and do it; the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.rig", description=__doc__)
     parser.add_argument("what", choices=["build", "show", "shell", "ground", "lacking", "table"])
     parser.add_argument("--sweeps", type=int, default=6)
     args = parser.parse_args()

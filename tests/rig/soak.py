@@ -1,4 +1,4 @@
-"""`python -m rig.soak --hours 1`: boxes sweep without pause, and everything they say is judged. In: hours, a seed.
+"""`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and everything they say is judged. In: hours, a seed.
 Out: one record for each box, a page with four charts, and 1 where a target was not reached.
 
 Each box has a process of its own that records it. A soak that was interrupted goes on where it was.
@@ -252,7 +252,7 @@ def draw(work: Path, out: Path) -> bool:
 def main() -> int:
     """Run what the arguments say; its exit code."""
     parser = argparse.ArgumentParser(
-        "python -m rig.soak", description="Has boxes sweep without pause, and judges them."
+        "python -m tests.rig.soak", description="Has boxes sweep without pause, and judges them."
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--hours", type=float, default=1.0, help="how long in all (default 1)")
@@ -283,7 +283,7 @@ def _together(arguments: list[str]) -> bool:
             print(f"{name}: left out, {missing}", flush=True)
         else:
             command = [sys.executable, "-m", "tests.rig.soak", "--box", name, *arguments]
-            children.append(subprocess.Popen(command, cwd=ROOT / "tests", start_new_session=True))
+            children.append(subprocess.Popen(command, cwd=ROOT, start_new_session=True))
 
     def pass_on(number: int, frame: object) -> None:
         for child in children:
