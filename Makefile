@@ -45,7 +45,7 @@ soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box
 
 test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/board-checklist.md)
 	$(PIP) install -e '.[board]'
-	PALPATE_UNDERSIDE=wired $(BIN)/python -m pytest -q -rs tests/appliance/io/test_backends.py
+	PALPATE_BACKEND=wired $(BIN)/python -m pytest -q -rs tests/appliance/io/test_backends.py
 
 rig-ground: rig-tools
 	$(RIG) ground

@@ -1,4 +1,4 @@
-"""The room of undersides: what can lie below the box's drivers. In: PALPATE_UNDERSIDE. Out: an Underside, or Missing.
+"""The room of backends: what can lie below the box's drivers. In: PALPATE_BACKEND. Out: a Backend, or Missing.
 
 tests/test_contract.py says once what Sensor, Trigger, Lines and SerialSink hold, and runs over any of them.
 """
@@ -18,7 +18,7 @@ from appliance.core.types import SweepFormat
 from appliance.io import packets
 from appliance.sim import skin
 
-VARIABLE = "PALPATE_UNDERSIDE"
+VARIABLE = "PALPATE_BACKEND"
 NAMES = {
     "simulated": "the simulator, in virtual time",
     "mocked": "libusb and libgpiod over umockdev",
@@ -29,11 +29,11 @@ NAMES = {
 ALL = frozenset(
     ("skin", "numbered", "plug", "garble", "silence", "hold", "deny", "lines", "overrun", "serial", "stall", "pull")
 )
-"""What an underside can at most; `Underside` says what each is."""
+"""What a backend can at most; `Backend` says what each is."""
 
 
-class Missing(Exception):
-    """What an underside needs is not here; the message says how to get it."""
+class BackendMissing(Exception):
+    """What a backend needs is not here; the message says how to get it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Skin:
     dtype: str = skin.FORMAT.dtype
 
 
-class Underside(Protocol):
+class Backend(Protocol):
     """The world below the drivers: what they are given, and what a test can do out there.
 
     can: "skin": one is there. "numbered": its digits are known (`skins.digits`). "plug": it is unplugged, plugged in and
@@ -139,14 +139,14 @@ class Underside(Protocol):
 
 
 def chosen() -> str:
-    """The name in PALPATE_UNDERSIDE; the simulator where it is not set. Raises Missing for an unknown one."""
+    """The name in PALPATE_BACKEND; the simulator where it is not set. Raises BackendMissing for an unknown one."""
     name = os.environ.get(VARIABLE) or "simulated"
     if name not in NAMES:
-        raise Missing(f"{VARIABLE} = {name!r} is unknown; known are {', '.join(NAMES)}")
+        raise BackendMissing(f"{VARIABLE} = {name!r} is unknown; known are {', '.join(NAMES)}")
     return name
 
 
-def opened(name: str) -> AbstractContextManager[Underside]:
-    """The underside of that name, to be used in a `with`. Raises Missing where this machine has not got it."""
-    made: AbstractContextManager[Underside] = import_module(f"{__name__}.{name}").opened()
+def opened(name: str) -> AbstractContextManager[Backend]:
+    """The backend of that name, to be used in a `with`. Raises BackendMissing where this machine has not got it."""
+    made: AbstractContextManager[Backend] = import_module(f"{__name__}.{name}").opened()
     return made

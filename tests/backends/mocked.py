@@ -1,4 +1,4 @@
-"""umockdev as an underside: unmodified libusb, pyusb, libgpiod and gpiod over mocked device nodes, in real time.
+"""umockdev as a backend: unmodified libusb, pyusb, libgpiod and gpiod over mocked device nodes, in real time.
 
 In: a process under umockdev-wrapper. Out: the skins of `skins`, a GPIO chip, and a pseudo-terminal.
 """
@@ -23,20 +23,20 @@ class Mocked(real.Real):
     name = "mocked"
     can = backends.ALL
 
-    def __init__(self, stack: ExitStack, bench: mocks.Bench) -> None:
+    def __init__(self, stack: ExitStack, bench: mocks.MockedDevices) -> None:
         super().__init__(stack)
         settings = config.load(BOARD, site=NO_SITE)
         self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
         self._inputs = [self.trigger.start, self.trigger.stop, self.trigger.new_object]
         self._bench, self._socket = bench, mocked_usb.Socket(bench)
         self._chip = mocked_gpio.Chip(bench, [f"GPIO{i}" for i in range(28)])
-        self._far = tty.FarEnd(stack)
+        self._far = tty.PseudoTerminalEnd(stack)
         self.serial = replace(settings.serial, port=str(self._far.path))
         self.put, self.pull, self.say, self.hear = self._far.put, self._far.pull, self._far.say, self._far.hear
         self.drive, self.unplug = self._chip.drive, self._socket.unplug
 
     def reset(self) -> None:
-        """See Underside; the same below."""
+        """See Backend; the same below."""
         self.settle()
         self.deny(False)
         self.plug(Skin())
@@ -75,8 +75,8 @@ class Mocked(real.Real):
 
 @contextmanager
 def opened() -> Iterator[Mocked]:
-    """A mocked machine. Raises Missing where umockdev is not there, or not below this process."""
+    """A mocked machine. Raises BackendMissing where umockdev is not there, or not below this process."""
     with ExitStack() as stack:
-        bench = mocks.Bench()
+        bench = mocks.MockedDevices()
         stack.callback(bench.close)
         yield Mocked(stack, bench)

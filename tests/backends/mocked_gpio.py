@@ -45,7 +45,7 @@ class Held:
 class Chip:
     """A chip with these lines, at /dev/gpiochip0."""
 
-    def __init__(self, bench: mocks.Bench, names: Sequence[str]) -> None:
+    def __init__(self, bench: mocks.MockedDevices, names: Sequence[str]) -> None:
         self._levels = dict.fromkeys(names, False)
         self._names = list(names)
         self._held: dict[int, Held] = {}

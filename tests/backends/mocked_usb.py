@@ -168,7 +168,7 @@ class Device:
 class Socket:
     """Where skins are plugged in; each gets the next number on the bus, as Linux does it."""
 
-    def __init__(self, bench: mocks.Bench) -> None:
+    def __init__(self, bench: mocks.MockedDevices) -> None:
         self.device: Device | None = None
         self._bench, self._number = bench, 1
 

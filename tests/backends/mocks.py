@@ -1,4 +1,4 @@
-"""umockdev for undersides: devices that open, read and ioctl of this process meet, answered by handlers in one thread.
+"""umockdev for backends: devices that open, read and ioctl of this process meet, answered by handlers in one thread.
 
 In: `umockdev-wrapper` around the process, and Debian's python3-gi. Out: a Bench with a testbed and its thread.
 """
@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.backends import Missing
+from tests.backends import BackendMissing
 
 DEBIAN = "/usr/lib/python3/dist-packages"
 PACKAGES = "umockdev gir1.2-umockdev-1.0 python3-gi"
@@ -47,14 +47,14 @@ def introspection() -> tuple[Any, Any]:
     return UMockdev, GLib
 
 
-class Bench:
+class MockedDevices:
     """A testbed, and the thread in which all handlers of its devices run."""
 
     def __init__(self) -> None:
         if missing := lacking():
-            raise Missing(missing)
+            raise BackendMissing(missing)
         if "libumockdev-preload" not in os.environ.get("LD_PRELOAD", ""):
-            raise Missing("umockdev is not below this process; start it with umockdev-wrapper")
+            raise BackendMissing("umockdev is not below this process; start it with umockdev-wrapper")
         umockdev, self._glib = introspection()
         self._base = umockdev.IoctlBase
         self.testbed = umockdev.Testbed.new()

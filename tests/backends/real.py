@@ -1,4 +1,4 @@
-"""What undersides in real time share: the machine's clock and libraries. In: a skin's ids. Out: time, and a rival."""
+"""What backends in real time share: the machine's clock and libraries. In: a skin's ids. Out: time, and a rival."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The virtual box as an underside: the drivers run in the guest, over its kernel; what is outside is asked for by wire.
+"""The virtual box as a backend: the drivers run in the guest, over its kernel; what is outside is asked for by wire.
 
 In: the guest's own settings, and JSON lines over a character device: one request, one reply. Outside, `serve` answers
-them with a bench, which has the controls of an Underside that are in CONTROLS; `able` gives what it can, as in `can`, and
+them with a bench, which has the controls of a Backend that are in CONTROLS; `able` gives what it can, as in `can`, and
 `reset` leaves the cable alone.
 """
 
@@ -19,7 +19,7 @@ from typing import IO, Any
 import usb.core
 
 from appliance.core import config
-from tests.backends import Missing, Skin, real
+from tests.backends import BackendMissing, Skin, real
 
 PORT = "/dev/virtio-ports/palpate.bench"
 CONTROLS = [
@@ -106,7 +106,7 @@ class Remote(real.Real):
         self.can = frozenset(self._ask("able")) | {"hold"}
 
     def reset(self) -> None:
-        """See Underside; the same below."""
+        """See Backend; the same below."""
         self.settle()
         self._ask("reset")
         self.plug(Skin())
@@ -168,11 +168,11 @@ class Remote(real.Real):
 
 @contextmanager
 def opened() -> Iterator[Remote]:
-    """The machine that this runs in. Raises Missing where it has no bench outside."""
+    """The machine that this runs in. Raises BackendMissing where it has no bench outside."""
     try:
         file = os.open(PORT, os.O_RDWR)
     except OSError as e:
-        raise Missing(f"no bench at {PORT} ({e.strerror}); this runs in the virtual box: make test-rig") from e
+        raise BackendMissing(f"no bench at {PORT} ({e.strerror}); this runs in the virtual box: make test-rig") from e
     with ExitStack() as stack:
         stack.callback(os.close, file)
         yield Remote(stack, Asker(file))

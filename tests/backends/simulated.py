@@ -1,4 +1,4 @@
-"""The simulator as an underside: appliance.sim below the drivers, a pseudo-terminal, and a clock that skips all waits."""
+"""The simulator as a backend: appliance.sim below the drivers, a pseudo-terminal, and a clock that skips all waits."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class Simulated:
         settings = world.wire(config.load(None, site=NO_SITE))
         self.gpio, self.backend = world.gpio, world.backend
         self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
-        self._far = tty.FarEnd(stack)
+        self._far = tty.PseudoTerminalEnd(stack)
         self.serial = replace(settings.serial, port=str(self._far.path))
         self.put, self.pull, self.say, self.hear = self._far.put, self._far.pull, self._far.say, self._far.hear
 
     def reset(self) -> None:
-        """See Underside; the same below."""
+        """See Backend; the same below."""
         self.backend.errors.clear()
         self.garble(False)
         self.plug(Skin())

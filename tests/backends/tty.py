@@ -1,4 +1,4 @@
-"""The serial line of undersides without one: a pseudo-terminal under a name that stays. In: bytes. Out: bytes."""
+"""The serial line of backends without one: a pseudo-terminal under a name that stays. In: bytes. Out: bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DELIVERY_S = 0.02
 """The kernel passes on what one end wrote in its own time; under a virtual clock that has to be waited for."""
 
 
-class FarEnd:
+class PseudoTerminalEnd:
     """The robot's end. path: the name that the box opens, there while the port is put in."""
 
     def __init__(self, stack: ExitStack) -> None:

@@ -1,4 +1,4 @@
-"""A real board as an underside, wired to itself: the box's inputs are driven, and its outputs seen, by spare pins.
+"""A real board as a backend, wired to itself: the box's inputs are driven, and its outputs seen, by spare pins.
 
 In: a Raspberry Pi with these loops, and a skin on its USB where there is one. Run on it, as root or in the groups gpio,
 dialout and plugdev, with the service stopped: `systemctl stop palpate; make test-hw`.
@@ -36,7 +36,7 @@ import usb.core
 from gpiod.line import Bias, Direction, Value
 
 from appliance.core import config
-from tests.backends import Missing, real
+from tests.backends import BackendMissing, real
 
 DRIVERS = {"GPIO17": "GPIO18", "GPIO27": "GPIO9", "GPIO22": "GPIO10"}
 WATCHERS = {
@@ -71,7 +71,7 @@ class Wired(real.Real):
         self.can = frozenset(can)
 
     def reset(self) -> None:
-        """See Underside; the same below."""
+        """See Backend; the same below."""
         self.settle()
         for line in DRIVERS:
             self.drive(line, False)
@@ -102,7 +102,7 @@ class Wired(real.Real):
 
 
 def _request(names: Any, settings: gpiod.LineSettings) -> gpiod.LineRequest:
-    """These spare lines, all on one chip. Raises Missing where no chip has them, or somebody holds them."""
+    """These spare lines, all on one chip. Raises BackendMissing where no chip has them, or somebody holds them."""
     names = tuple(names)
     for path in sorted(map(str, Path("/dev").glob("gpiochip*"))):
         try:
@@ -112,12 +112,14 @@ def _request(names: Any, settings: gpiod.LineSettings) -> gpiod.LineRequest:
             return gpiod.request_lines(path, {names: settings}, consumer="palpate-loops")
         except OSError as e:
             if e.errno in (errno.EACCES, errno.EBUSY):
-                raise Missing(f"{path}: {e.strerror}; join group gpio, stop the service and turn SPI off") from e
-    raise Missing(f"no gpio chip has {', '.join(names)}; run this on a board wired as tests/undersides/wired.py draws")
+                raise BackendMissing(f"{path}: {e.strerror}; join group gpio, stop the service and turn SPI off") from e
+    raise BackendMissing(
+        f"no gpio chip has {', '.join(names)}; run this on a board wired as tests/backends/wired.py draws"
+    )
 
 
 @contextmanager
 def opened() -> Iterator[Wired]:
-    """This board. Raises Missing where it is none, or not wired."""
+    """This board. Raises BackendMissing where it is none, or not wired."""
     with ExitStack() as stack:
         yield Wired(stack)

@@ -16,11 +16,11 @@ import pytest
 from tests.cuts import __main__ as campaign
 from tests.cuts import black_box, calls, delivery, recording, scene, tree
 from tests.cuts.calls import NotFollowed
-from tests.cuts.scene import Found, Play, Point, Scene, Step
+from tests.cuts.scene import CrashPoint, CutScene, Found, ScenePlay, SceneStep
 
 pytestmark = pytest.mark.skipif(bool(calls.lacking()), reason=f"needs {calls.lacking()}")
 
-Makes = Callable[..., Play]
+Makes = Callable[..., ScenePlay]
 
 
 @pytest.fixture
@@ -34,24 +34,24 @@ def work() -> Iterator[Path]:
 def play(work: Path) -> Makes:
     """Plays lines of Python, which find the folder in `f`, after others that have prepared it."""
 
-    def make(does: str, before: str = "", judge: Callable[[Found], list[str]] = lambda found: []) -> Play:
+    def make(does: str, before: str = "", judge: Callable[[Found], list[str]] = lambda found: []) -> ScenePlay:
         code = "import os, sys; from pathlib import Path; from appliance.core import storage; f = Path(sys.argv[1])\n"
 
         def prepare(folder: Path) -> None:
             exec(code.replace("sys.argv[1]", repr(str(folder))) + before, {})
 
-        step = Step("it", lambda folder: [sys.executable, "-S", "-c", code + does, folder])
-        return Play(Scene("lines", prepare, (step,), judge), work)
+        step = SceneStep("it", lambda folder: [sys.executable, "-S", "-c", code + does, folder])
+        return ScenePlay(CutScene("lines", prepare, (step,), judge), work)
 
     return make
 
 
-def left(play: Play, call: str | None) -> list[tree.Tree]:
+def left(play: ScenePlay, call: str | None) -> list[tree.Tree]:
     """What a loss of power may leave before the first call of this name; None: at the end."""
     return next(list(m.disk.left()) for m in play.moments() if (m.call.name if m.call else None) == call)
 
 
-def wrong(points: list[Point]) -> list[str]:
+def wrong(points: list[CrashPoint]) -> list[str]:
     """All that was found wrong."""
     return [f"{p.step}, {p.how} before {p.call}: {text}" for p in points for text in p.wrong]
 
@@ -143,7 +143,7 @@ def test_what_cannot_be_followed_is_told(play: Makes, does: str):
 
 def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
     """The power is cut at every moment of two runs, and some kills: all that was told as stored is there."""
-    played = Play(recording.scene(), work)
+    played = ScenePlay(recording.scene(), work)
     points = [played.power(moment) for moment in played.moments()]
     points += [played.kill(moment) for moment in list(played.moments())[8:60:10]]
     assert wrong(points) == []
@@ -152,7 +152,7 @@ def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
 
 def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
     """Killed once it has made the folder and before it has synced that; the next run must not rely on it."""
-    played = Play(recording.scene(), work)
+    played = ScenePlay(recording.scene(), work)
     made = next(m for m in played.moments() if m.call and m.call.name == "fsync")
     assert wrong([played.kill_then_power(made)]) == []
 
@@ -160,20 +160,20 @@ def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
 @pytest.mark.parametrize("way", [way for way in recording.WAYS if way != "right"])
 def test_ways_that_are_wrong_are_found(work: Path, way: str):
     """Files that get onto the disk in a way that loses some: the judge says so of each."""
-    played = Play(recording.scene(way), work)
+    played = ScenePlay(recording.scene(way), work)
     assert any(played.power(moment).wrong for moment in played.moments())
 
 
 def test_a_kill_finds_what_is_written_under_its_own_name(work: Path):
     """No loss of power is needed for that; and the judge sees it in what a killed program has left."""
-    played = Play(recording.scene("under its own name"), work)
+    played = ScenePlay(recording.scene("under its own name"), work)
     half = next(m for m in played.moments() if m.call.name == "write" and m.call.paths[0].endswith(".npy"))
     assert "not a recorded sweep" in str(played.kill(half).wrong)
 
 
 def test_the_black_box_loses_no_more_than_the_sweep_in_progress(work: Path):
     """The power is cut at every moment of two runs: the last sweeps are there, and never many more."""
-    played = Play(black_box.scene(), work)
+    played = ScenePlay(black_box.scene(), work)
     assert wrong([played.power(moment) for moment in played.moments()]) == []
 
 
@@ -189,7 +189,7 @@ def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: del
     """Killed before it names the bundle's folder and the ledger, and without power before the link is swapped: the box
     starts, answers, and takes the next bundle.
     """
-    played = Play(shop.alone("right"), work)
+    played = ScenePlay(shop.alone("right"), work)
     points = []
     for moment in played.moments():
         if moment.call and moment.call.name.startswith("rename"):
@@ -208,7 +208,7 @@ def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: del
 )
 def test_deliveries_that_are_wrong_are_found(shop: delivery.Shop, work: Path, way: str, call: str, what: str):
     """A store that is neither old nor new for a moment: a kill there finds it."""
-    played = Play(shop.alone(way), work)
+    played = ScenePlay(shop.alone(way), work)
     (moment,) = [
         m for m in played.moments()
         if m.call and m.call.name == call and m.call.paths[0].endswith(("/current", "/ledger.json"))
@@ -219,21 +219,21 @@ def test_deliveries_that_are_wrong_are_found(shop: delivery.Shop, work: Path, wa
 def test_a_campaign_goes_on_where_it_was_broken_off(work: Path, monkeypatch: pytest.MonkeyPatch):
     """Points that are in the file are not cut again, half a line there is; after a change of the box all of them are."""
     code = "import sys; from pathlib import Path; (Path(sys.argv[1]) / 'a').write_bytes(b'1')"
-    step = Step("it", lambda folder: [sys.executable, "-S", "-c", code, folder])
-    lines = Scene(
+    step = SceneStep("it", lambda folder: [sys.executable, "-S", "-c", code, folder])
+    lines = CutScene(
         "lines", lambda folder: None, (step,), lambda found: ["empty"] if not any(found.folder.iterdir()) else []
     )
     file = work / "cuts.jsonl"
-    points = list(campaign.cut(lines, campaign.Ledger(file)))
+    points = list(campaign.cut(lines, campaign.CrashPointLog(file)))
     assert [(p.how, p.moment, p.states, bool(p.wrong)) for p in points] == [
         ("kill", 0, 1, True), ("kill", 1, 1, False), ("power", 0, 1, True), ("power", 1, 2, True), ("power", 2, 4, True),
         ("kill_then_power", 0, 7, True), ("kill_then_power", 1, 6, True),
     ]  # fmt: skip
-    assert list(campaign.cut(lines, campaign.Ledger(file))) == []
-    assert campaign.Ledger(file).points() == points
+    assert list(campaign.cut(lines, campaign.CrashPointLog(file))) == []
+    assert campaign.CrashPointLog(file).points() == points
     file.write_text(file.read_text()[:-9])
-    assert list(campaign.cut(lines, campaign.Ledger(file))) == points[-1:]
-    assert campaign.Ledger(file).points() == points
+    assert list(campaign.cut(lines, campaign.CrashPointLog(file))) == points[-1:]
+    assert campaign.CrashPointLog(file).points() == points
     monkeypatch.setattr(campaign, "_head", lambda: {"source": "another"})
-    assert campaign.Ledger(file).points() == []
+    assert campaign.CrashPointLog(file).points() == []
     assert list(campaign.figures(points))[-1].startswith("all: kill at 2 moments, 2 folders, wrong 1; power at 3")

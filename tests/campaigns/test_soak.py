@@ -106,14 +106,14 @@ class FakeBox:
         self.closed += 1
 
 
-def soaked(box: FakeBox, length_s: float = 150) -> soak_judge.Run:
+def soaked(box: FakeBox, length_s: float = 150) -> soak_judge.SoakRun:
     """A run of a box."""
-    run = soak_judge.Run(seed=1)
+    run = soak_judge.SoakRun(seed=1)
     soak.record(box, run, length_s, lambda: None, clock=box.clock, log=lambda line: None)
     return run
 
 
-def sums(run: soak_judge.Run) -> dict:
+def sums(run: soak_judge.SoakRun) -> dict:
     """Its sums, through a file's form."""
     return soak_judge.sums(json.loads(json.dumps({"runs": [soak.asdict(run)]})))
 
@@ -135,7 +135,7 @@ def renumbered(line: str, number: int) -> str:
 
 
 @pytest.fixture(scope="module")
-def clean() -> soak_judge.Run:
+def clean() -> soak_judge.SoakRun:
     """A run in which nothing is wrong."""
     return soaked(FakeBox())
 
@@ -300,7 +300,7 @@ def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
     """After a minute without a word the run ends; what was recorded is saved, and the box closed."""
     box, saved = FakeBox(), []
     box.mute_s = box.now_s + 40
-    run = soak_judge.Run(seed=1)
+    run = soak_judge.SoakRun(seed=1)
     soak.record(box, run, 3600, lambda: saved.append(len(run.answers)), clock=box.clock, log=lambda line: None)
     assert run.ended == "gone"
     assert "nothing for 60 s" in run.faults[-1][1]
@@ -330,7 +330,7 @@ def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
 
 def test_a_soak_that_is_killed_leaves_a_whole_record():
     """At any moment the sweeps that are due have their answers, though the run has not ended and one may be open."""
-    box, run = FakeBox(), soak_judge.Run(seed=1)
+    box, run = FakeBox(), soak_judge.SoakRun(seed=1)
     recorder = soak.Recorder(box, run, Script(1), box.clock)
     recorder.start()
     for _ in range(60):

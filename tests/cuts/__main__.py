@@ -19,9 +19,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from tests.cuts import black_box, calls, delivery, recording, tree
-from tests.cuts.scene import ROOT, Play, Point, Scene, stage
+from tests.cuts.scene import ROOT, CrashPoint, CutScene, ScenePlay, stage
 
-SCENES: dict[str, Callable[[Path], Scene]] = {
+SCENES: dict[str, Callable[[Path], CutScene]] = {
     "recording": lambda beside: recording.scene(),
     "palpate-record": lambda beside: recording.palpate(),
     "black-box": lambda beside: black_box.scene(),
@@ -44,7 +44,7 @@ def main() -> int:
         parser.error(f"no scene {', '.join(sorted(wrong))}; there are {', '.join(SCENES)}")
     if lack := calls.lacking():
         sys.exit(f"cuts: needs {lack}")
-    ledger = Ledger(given.out)
+    ledger = CrashPointLog(given.out)
     for name in given.scenes or SCENES:
         with TemporaryDirectory(prefix="cuts-") as beside:
             for point in cut(SCENES[name](Path(beside)), ledger, HOWS if given.twice else HOWS[:2]):
@@ -55,7 +55,7 @@ def main() -> int:
     return 1 if any(point.wrong for point in ledger.points()) else 0
 
 
-class Ledger:
+class CrashPointLog:
     """Points by their moments; one line of a file each, under a first line that says what was cut, where."""
 
     def __init__(self, path: Path) -> None:
@@ -66,19 +66,19 @@ class Ledger:
         path.write_text("".join(f"{line}\n" for line in (head, *lines)))
         self._points = [_point(json.loads(line)) for line in lines]
 
-    def points(self, scene: str = "") -> list[Point]:
+    def points(self, scene: str = "") -> list[CrashPoint]:
         """Those of a scene, or all."""
         return [point for point in self._points if scene in ("", point.scene)]
 
-    def add(self, point: Point) -> None:
+    def add(self, point: CrashPoint) -> None:
         """Write a point down."""
         self._points.append(point)
         with self._path.open("a") as file:
             file.write(json.dumps(asdict(point)) + "\n")
 
 
-def _point(told: dict[str, Any]) -> Point:
-    return Point(**told | {"wrong": tuple(told["wrong"])})
+def _point(told: dict[str, Any]) -> CrashPoint:
+    return CrashPoint(**told | {"wrong": tuple(told["wrong"])})
 
 
 def _head() -> dict[str, str]:
@@ -93,11 +93,11 @@ def _head() -> dict[str, str]:
     }  # fmt: skip
 
 
-def cut(scene: Scene, ledger: Ledger, hows: Sequence[str] = HOWS) -> Iterator[Point]:
+def cut(scene: CutScene, ledger: CrashPointLog, hows: Sequence[str] = HOWS) -> Iterator[CrashPoint]:
     """All points of a scene that are not in the ledger yet, cut in these ways; each is written down."""
     done = {(point.step, point.how, point.moment) for point in ledger.points(scene.name)}
     with stage() as work:
-        play = Play(scene, Path(work))
+        play = ScenePlay(scene, Path(work))
         for how in hows:
             for moment in play.moments():
                 at = scene.steps[moment.step].name, how, moment.number
@@ -106,9 +106,9 @@ def cut(scene: Scene, ledger: Ledger, hows: Sequence[str] = HOWS) -> Iterator[Po
                     yield point
 
 
-def figures(points: Iterable[Point]) -> Iterator[str]:
+def figures(points: Iterable[CrashPoint]) -> Iterator[str]:
     """A line for each command, and one for all."""
-    steps: dict[str, list[Point]] = {}
+    steps: dict[str, list[CrashPoint]] = {}
     for point in points:
         for name in (f"{point.scene}: {point.step}", "all"):
             steps.setdefault(name, []).append(point)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from appliance.recording.black_box import BlackBox
 from tests.cuts import recording
-from tests.cuts.scene import Found, Scene, Step
+from tests.cuts.scene import CutScene, Found, SceneStep
 
 MOST = 2
 """Sweeps that are kept: so few that each run takes old ones away."""
@@ -51,13 +51,13 @@ def _goes_on(folder: Path, last: str) -> list[str]:
     return wrong + broken
 
 
-def scene() -> Scene:
+def scene() -> CutScene:
     """Two runs that keep sweeps, the second one in what the first has left."""
 
-    def step(name: str) -> Step:
-        return Step(name, lambda folder: [sys.executable, "-m", "tests.cuts.black_box", folder / recording.KEPT])
+    def step(name: str) -> SceneStep:
+        return SceneStep(name, lambda folder: [sys.executable, "-m", "tests.cuts.black_box", folder / recording.KEPT])
 
-    return Scene("black-box", lambda folder: None, (step("first"), step("second")), judge)
+    return CutScene("black-box", lambda folder: None, (step("first"), step("second")), judge)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ class NotFollowed(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class SystemCall:
     """One system call. nth: which one of its name in its process, from 1, as strace counts. paths: what it is about,
     absolute. data: what it writes, or where a symlink leads. words: its arguments as strace shows them. result: None
     where the process was killed in it.
@@ -59,10 +59,10 @@ class Call:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class TracedRun:
     """How a command went: its calls, all that it wrote to standard output and standard error, its exit code."""
 
-    calls: tuple[Call, ...]
+    calls: tuple[SystemCall, ...]
     said: str
     code: int
 
@@ -75,7 +75,9 @@ def lacking() -> str:
     return "" if tried.returncode == 0 else "permission to trace a process (CAP_SYS_PTRACE, or ptrace_scope 0 or 1)"
 
 
-def run(command: Sequence[str | Path], log: Path, at: Call | None = None, env: dict[str, str] | None = None) -> Run:
+def run(
+    command: Sequence[str | Path], log: Path, at: SystemCall | None = None, env: dict[str, str] | None = None
+) -> TracedRun:
     """Run a command under strace, in the folder of the log; `at`: kill it when it enters this call.
 
     env: what is added to the environment. Raises NotFollowed, and subprocess.TimeoutExpired.
@@ -90,16 +92,16 @@ def run(command: Sequence[str | Path], log: Path, at: Call | None = None, env: d
     calls = tuple(_calls(log.read_text("ascii").splitlines(), str(log.parent)))
     if at and not any(c.result is None and (c.process, c.name, c.nth) == (at.process, at.name, at.nth) for c in calls):
         raise NotFollowed(f"was not killed at its {at.name} number {at.nth}: it ended with {done.returncode}")
-    return Run(calls, "".join(map(said, calls)), done.returncode)
+    return TracedRun(calls, "".join(map(said, calls)), done.returncode)
 
 
-def said(call: Call) -> str:
+def said(call: SystemCall) -> str:
     """What the command writes to standard output or standard error by this call; its children do not count."""
     heard = call.process == 0 and call.name in ("write", "writev") and call.descriptor in (1, 2) and call.result
     return call.data[: call.result].decode("utf-8", "replace") if heard else ""
 
 
-def _calls(lines: list[str], folder: str) -> Iterator[Call]:
+def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
     """The calls in the order in which they ended; last those that did not, since the process was killed in them."""
     counts: Counter[tuple[str, str]] = Counter()
     ranks: dict[str, int] = {}
@@ -111,7 +113,7 @@ def _calls(lines: list[str], folder: str) -> Iterator[Call]:
         counts[process, name] += 1
         rank = ranks.setdefault(process, len(ranks))
         paths, data = _arguments(name, words, folder)
-        yield Call(rank, name, counts[process, name], paths, data, words, None if result == "?" else int(result))
+        yield SystemCall(rank, name, counts[process, name], paths, data, words, None if result == "?" else int(result))
 
 
 def _joined(lines: list[str]) -> Iterator[str]:

@@ -24,7 +24,7 @@ from appliance.deployment import signature
 from appliance.deployment.shelf import SHA
 from appliance.deployment.trial import Trial
 from tests.cuts.calls import DEADLINE_S, NotFollowed
-from tests.cuts.scene import Found, Scene, Step
+from tests.cuts.scene import CutScene, Found, SceneStep
 
 STORE, INCOMING = "store", "store/incoming"
 APART = re.compile(r"store/(incoming/.+|bundles/\.[^/]+/.+)")
@@ -75,18 +75,18 @@ class Shop:
         how = "store.status=", f"store.trial_sweeps={PROBATION}"
         return said + [word for value in (*where, *how) for word in ("--set", value)]
 
-    def palpate(self, name: str, *words: str, way: str = "") -> Step:
+    def palpate(self, name: str, *words: str, way: str = "") -> SceneStep:
         """A command of the box, in one of WAYS or as it is."""
         program = ["tests.cuts.delivery", way] if way else ["appliance"]
         code = DIED if way == "crash" else 0
-        return Step(name, lambda folder: [sys.executable, "-m", *program, *self.words(folder, *words)], code)
+        return SceneStep(name, lambda folder: [sys.executable, "-m", *program, *self.words(folder, *words)], code)
 
-    def copy(self, name: str) -> Step:
+    def copy(self, name: str) -> SceneStep:
         """Somebody copies a bundle to the box."""
         command = [sys.executable, "-S", "-c", COPY, self.at(name)]
-        return Step(f"copy {name}", lambda folder: [*command, folder / INCOMING / name])
+        return SceneStep(f"copy {name}", lambda folder: [*command, folder / INCOMING / name])
 
-    def story(self) -> Iterator[tuple[str, Step]]:
+    def story(self) -> Iterator[tuple[str, SceneStep]]:
         """What happens to a box; before each command, which bundles may run if that is cut short."""
         do = self.palpate
         yield "packaged", self.copy("first")
@@ -114,16 +114,16 @@ class Shop:
         yield "second fifth", do("install it again", "install", "@fifth")
         yield "fifth", do("commit it by hand", "commit")
 
-    def scene(self) -> Scene:
+    def scene(self) -> CutScene:
         """The story, each command of which is cut short."""
         return self._scene(_bare, list(self.story()))
 
-    def alone(self, way: str) -> Scene:
+    def alone(self, way: str) -> CutScene:
         """Nothing but an install, in one of WAYS, on a box that runs the first bundle."""
         step = self.palpate("install another", "install", str(self.at("second")), way=way)
         return self._scene(self._delivered, [("first second", step)])
 
-    def _scene(self, prepare: Callable[[Path], None], told: list[tuple[str, Step]]) -> Scene:
+    def _scene(self, prepare: Callable[[Path], None], told: list[tuple[str, SceneStep]]) -> CutScene:
         may = {step.name: names.split() for names, step in told}
         ids = {name: bundle.load(self.at(name)).id for name in NAMES}
 
@@ -131,7 +131,7 @@ class Shop:
             ran = {found.heard} if found.heard else {ids[name] for name in may[found.step]}
             return self._comes_back(found.folder, ran) or self._takes_another(found.folder, ids["last"])
 
-        return Scene("delivery", prepare, tuple(step for _, step in told), judge, APART, _promised)
+        return CutScene("delivery", prepare, tuple(step for _, step in told), judge, APART, _promised)
 
     def _delivered(self, folder: Path) -> None:
         """A box that runs the first bundle."""

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from tests.cuts.calls import Call, NotFollowed
+from tests.cuts.calls import NotFollowed, SystemCall
 from tests.cuts.tree import NOTHING, Tree, digest
 
 MOST_STATES = 4096
@@ -71,13 +71,13 @@ class Disk:
             above, last, _ = self._find(str(self._path / name))
             above.names[last] = above.synced[last] = inode
 
-    def follow(self, calls: Iterable[Call]) -> None:
+    def follow(self, calls: Iterable[SystemCall]) -> None:
         """All this happens to the folder. Raises NotFollowed."""
         for call in calls:
             if effect := self.effect(call):
                 effect()
 
-    def effect(self, call: Call) -> Callable[[], None] | None:
+    def effect(self, call: SystemCall) -> Callable[[], None] | None:
         """What this call does to the folder; None for nothing. Raises NotFollowed."""
         if call.result is None or call.result < 0:
             return None
@@ -89,7 +89,7 @@ class Disk:
             raise NotFollowed(f"a process that the command started calls {call.name} on {call.paths}")
         return self._effect(call)
 
-    def _effect(self, call: Call) -> Callable[[], None] | None:
+    def _effect(self, call: SystemCall) -> Callable[[], None] | None:
         match call.name:
             case "open" | "openat" | "creat":
                 return self._opened(call)
@@ -112,7 +112,7 @@ class Disk:
             case _:
                 return self._renamed(call)
 
-    def _renamed(self, call: Call) -> Callable[[], None]:
+    def _renamed(self, call: SystemCall) -> Callable[[], None]:
         """A call that changes names."""
         here, name, there = self._find(call.paths[0])
         match call.name:
@@ -130,7 +130,7 @@ class Disk:
                 return lambda: self._change((here, name, back), (to, new, there))
         raise NotFollowed(f"{call.name} of {call.paths[0]} is not followed here; teach it here")
 
-    def _opened(self, call: Call) -> Callable[[], None] | None:
+    def _opened(self, call: SystemCall) -> Callable[[], None] | None:
         above, name, there = self._find(call.paths[0], follow="O_NOFOLLOW" not in call.words)
         if call.name != "creat" and not any(flag in call.words for flag in ("O_CREAT", "O_WRONLY", "O_RDWR")):
             return None
@@ -144,7 +144,7 @@ class Disk:
             return lambda: setattr(there, "data", b"")
         return None
 
-    def _written(self, call: Call) -> Callable[[], None] | None:
+    def _written(self, call: SystemCall) -> Callable[[], None] | None:
         file, n = self._at(call.paths[0]), call.result
         assert n is not None
         if not isinstance(file, File) or not n:
@@ -159,7 +159,7 @@ class Disk:
 
         return write
 
-    def _resized(self, call: Call) -> Callable[[], None] | None:
+    def _resized(self, call: SystemCall) -> Callable[[], None] | None:
         file, size = self._at(call.paths[0]), int(call.words.rsplit(", ", 1)[1])
         return (lambda: setattr(file, "data", file.data[:size].ljust(size, b"\0"))) if isinstance(file, File) else None
 

@@ -20,7 +20,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load
 from appliance.recording.recording import Labels, RecordingSession
-from tests.cuts.scene import Found, Scene, Step
+from tests.cuts.scene import CutScene, Found, SceneStep
 
 FORMAT = SweepFormat(4, 4, 750, 40, "uint8")
 KEPT = "kept/sweeps"
@@ -149,22 +149,22 @@ def _goes_on(folder: Path) -> list[str]:
     return wrong
 
 
-def scene(way: str = "right") -> Scene:
+def scene(way: str = "right") -> CutScene:
     """Two runs that record, the second one in what the first has left."""
     return _sessions("recording", lambda kept, name: ["tests.cuts.recording", way, kept, name])
 
 
-def palpate() -> Scene:
+def palpate() -> CutScene:
     """The same with the box's command."""
     words = ("appliance", "record", "--sim", "skin", "--virtual", "--sweeps", "2", "--out")
     return _sessions("palpate-record", lambda kept, name: [*words, kept, "--session", name])
 
 
-def _sessions(title: str, words: Callable[[Path, str], list[str | Path]]) -> Scene:
-    def session(name: str) -> Step:
-        return Step(name, lambda folder: [sys.executable, "-m", *words(folder / KEPT, name)])
+def _sessions(title: str, words: Callable[[Path, str], list[str | Path]]) -> CutScene:
+    def session(name: str) -> SceneStep:
+        return SceneStep(name, lambda folder: [sys.executable, "-m", *words(folder / KEPT, name)])
 
-    return Scene(title, lambda folder: None, (session("first"), session("second")), judge)
+    return CutScene(title, lambda folder: None, (session("first"), session("second")), judge)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tests.cuts import calls, tree
-from tests.cuts.calls import Call, NotFollowed, Run
+from tests.cuts.calls import NotFollowed, SystemCall, TracedRun
 from tests.cuts.disk import Disk
 from tests.factories.paths import ROOT
 
@@ -42,7 +42,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class SceneStep:
     """A command, for the folder that it gets. code: how it ends, None for any way. killed: the call that it does not get
     beyond.
     """
@@ -50,25 +50,25 @@ class Step:
     name: str
     command: Callable[[Path], Sequence[str | Path]]
     code: int | None = 0
-    killed: Call | None = None
+    killed: SystemCall | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class CutScene:
     """prepare: makes the folder as it is before the first command. judge: what is wrong. apart: paths that it does not
     look at. hears: what it needs of what was said.
     """
 
     name: str
     prepare: Callable[[Path], None]
-    steps: tuple[Step, ...]
+    steps: tuple[SceneStep, ...]
     judge: Callable[[Found], list[str]]
     apart: re.Pattern[str] = tree.NOTHING
     hears: Callable[[str], str] = str
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class CrashPoint:
     """A scene that was cut at one moment. how: a method of Play. call: the one that was not carried out any more. states:
     how many different folders it may have left. wrong: what the judge said of them.
     """
@@ -88,22 +88,22 @@ class Moment:
 
     step: int
     number: int
-    call: Call | None
+    call: SystemCall | None
     said: str
     disk: Disk
 
 
 @dataclass(slots=True)
-class Play:
+class ScenePlay:
     """A scene that was played to its end in `work`. said: what had been said before. before: what was in the folder before
     each command. runs: how these went. Raises NotFollowed where the folder is not what the calls must have made of it.
     """
 
-    scene: Scene
+    scene: CutScene
     work: Path
     said: str = ""
     before: list[tree.Tree] = field(default_factory=list)
-    runs: list[Run] = field(default_factory=list)
+    runs: list[TracedRun] = field(default_factory=list)
     judged: dict[tuple[str, str, str], tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -138,7 +138,7 @@ class Play:
                     number += 1
             yield Moment(i, number, None, said, disk)
 
-    def power(self, moment: Moment) -> Point:
+    def power(self, moment: Moment) -> CrashPoint:
         """The power goes: each folder that may be left is judged."""
         step, wrong, states = self.scene.steps[moment.step], [], 0
         for left in moment.disk.left():
@@ -146,7 +146,7 @@ class Play:
             wrong += self._judged(left, step, moment.said)
         return self._point("power", moment, states, wrong)
 
-    def kill(self, moment: Moment) -> Point:
+    def kill(self, moment: Moment) -> CrashPoint:
         """The command is killed as it enters the moment's call. Raises NotFollowed."""
         step = self.scene.steps[moment.step]
         self._restore(self.before[moment.step])
@@ -154,7 +154,7 @@ class Play:
         said = "".join(BETWEEN + run.said for run in (*self.runs[: moment.step], run))
         return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, said))
 
-    def kill_then_power(self, moment: Moment) -> Point:
+    def kill_then_power(self, moment: Moment) -> CrashPoint:
         """The command is killed there, and started again: it goes on with what is left, and at each of its moments the
         power goes. Raises NotFollowed.
         """
@@ -163,7 +163,7 @@ class Play:
         twice = replace(self.scene, prepare=lambda folder: tree.write(before, folder), steps=steps)
         wrong, states = [], 0
         with stage() as work:
-            play = Play(
+            play = ScenePlay(
                 twice,
                 Path(work),
                 said="".join(BETWEEN + run.said for run in self.runs[: moment.step]),
@@ -174,7 +174,7 @@ class Play:
                 wrong += [f"{text} (before its {point.call}, when it was started again)" for text in point.wrong]
         return self._point("kill_then_power", moment, states, wrong)
 
-    def _run(self, step: Step, at: Call | None) -> Run:
+    def _run(self, step: SceneStep, at: SystemCall | None) -> TracedRun:
         """Run a command, and compare what it leaves with what its calls must have made of the folder."""
         disk = Disk(self.folder, tree.read(self.folder))
         run = calls.run(step.command(self.folder), self.work / "log", at, ENVIRONMENT)
@@ -189,7 +189,7 @@ class Play:
         self.folder.mkdir()
         tree.write(held, self.folder)
 
-    def _judged(self, left: tree.Tree, step: Step, said: str) -> tuple[str, ...]:
+    def _judged(self, left: tree.Tree, step: SceneStep, said: str) -> tuple[str, ...]:
         """What is wrong with a folder; each is looked at once."""
         heard = self.scene.hears(said)
         key = tree.digest(left, self.scene.apart), step.name, heard
@@ -201,9 +201,9 @@ class Play:
                 self.judged[key] = tuple(self.scene.judge(Found(folder, step.name, heard)))
         return self.judged[key]
 
-    def _point(self, how: str, moment: Moment, states: int, wrong: Sequence[str]) -> Point:
+    def _point(self, how: str, moment: Moment, states: int, wrong: Sequence[str]) -> CrashPoint:
         call = moment.call
         names = [str(Path(path).relative_to(self.folder)) for path in call.paths] if call else []
         told = " ".join([call.name, *names]) if call else "the end"
         step = self.scene.steps[moment.step].name
-        return Point(self.scene.name, step, how, moment.number, told, states, tuple(dict.fromkeys(wrong)))
+        return CrashPoint(self.scene.name, step, how, moment.number, told, states, tuple(dict.fromkeys(wrong)))

@@ -28,7 +28,7 @@ OPTIONS = (f"-max_len={LONGEST_INPUT}", "-timeout=10", "-print_final_stats=1", "
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class FuzzRun:
     """What one run of libFuzzer said. coverage: places of the instrumented code. features: places with their counts."""
 
     executions: int
@@ -86,7 +86,7 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
     return 1 if run.crashes else 0
 
 
-def _engine(target: str, seconds: float, *options: object) -> Run:
+def _engine(target: str, seconds: float, *options: object) -> FuzzRun:
     """One fuzzing process, to its end; seconds: of its processor time, 0 for no limit."""
     found = WORK / target / "found"
     rmtree(found, ignore_errors=True)
@@ -103,7 +103,7 @@ def _engine(target: str, seconds: float, *options: object) -> Run:
     states = re.findall(r"cov: (\d+) ft: (\d+)", text) or [("0", "0")]
     count = re.findall(r"number_of_executed_units: (\d+)|^#(\d+)", text, re.MULTILINE) or [("0", "0")]
     executions = max(int(a or b) for a, b in count)
-    return Run(executions, *map(int, states[-1]), _cpu_s() - begin, broke)
+    return FuzzRun(executions, *map(int, states[-1]), _cpu_s() - begin, broke)
 
 
 def _cpu_s() -> float:

@@ -16,7 +16,7 @@ from tests.factories.emulated_machines import Missing
 from tests.rig import notes
 from tests.rig.cell import Cell
 from tests.rig.image import ground, image, lacking
-from tests.rig.machine import Machine
+from tests.rig.machine import Guest
 
 
 def show(cell: Cell, sweeps: int) -> None:
@@ -78,7 +78,7 @@ def main() -> int:
         return 0
     with tempfile.TemporaryDirectory() as folder:
         begun = time.monotonic()
-        with Machine(made, Path(folder), snapshot=True) as machine:
+        with Guest(made, Path(folder), snapshot=True) as machine:
             machine.ready(60)
             print(f"the virtual box goes on from its snapshot: {time.monotonic() - begun:.1f} s", flush=True)
             cell = Cell(machine)

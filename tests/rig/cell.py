@@ -16,7 +16,7 @@ import numpy as np
 from appliance.core.clock import SystemClock
 from appliance.sim import rig, script, skin
 from appliance.tools.score import Answer
-from tests.rig.machine import Machine
+from tests.rig.machine import Guest
 
 FIFO = 22_500
 """Frames that a board holds: half a minute, so that what is lost was lost by the box and not by an emulator that stood
@@ -52,7 +52,7 @@ class Touch:
     played: threading.Event = field(default_factory=threading.Event)
 
 
-class Hand:
+class CellRobot:
     """The script that a board plays: an empty skin, and a touch whenever one is asked for (see sim.rig.Robot)."""
 
     def __init__(self, lines: rig.EdgeLines, seed: int) -> None:
@@ -82,10 +82,10 @@ class Cell:
     more of them in a packet spare an emulator half of its work.
     """
 
-    def __init__(self, machine: Machine, seed: int = 1) -> None:
+    def __init__(self, machine: Guest, seed: int = 1) -> None:
         self.machine, self.lines, self.serial, self.cable = machine, machine.lines, machine.serial, machine.skin
         self.clock = SystemClock()
-        self.hand = Hand(machine.lines, seed)
+        self.hand = CellRobot(machine.lines, seed)
         self.acts = script.tubes(seed)
         self.packet_frames = 6
 

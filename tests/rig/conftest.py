@@ -14,7 +14,7 @@ from tests.rig import notes
 from tests.rig.cell import Cell
 from tests.rig.image import Image
 from tests.rig.image import image as make_image
-from tests.rig.machine import Machine
+from tests.rig.machine import Guest
 from tests.rig.notes import HOW
 
 
@@ -43,7 +43,7 @@ def count() -> Callable[[int, int], int]:
 @pytest.fixture
 def fresh(image: Image, tmp_path: Path) -> Iterator[Cell]:
     """A guest for one test, from the snapshot; the skin is plugged in and the box is READY."""
-    with Machine(image, tmp_path, snapshot=True) as machine:
+    with Guest(image, tmp_path, snapshot=True) as machine:
         cell = Cell(machine)
         cell.plug()
         cell.until_ready()
@@ -53,7 +53,7 @@ def fresh(image: Image, tmp_path: Path) -> Iterator[Cell]:
 @pytest.fixture(scope="module")
 def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
     """A guest for a whole file of tests."""
-    with Machine(image, tmp_path_factory.mktemp("guest"), snapshot=True) as machine:
+    with Guest(image, tmp_path_factory.mktemp("guest"), snapshot=True) as machine:
         yield Cell(machine)
 
 

@@ -220,7 +220,7 @@ def _make_tree(path: Path) -> None:
 
 
 def _make_box(part: Path, on: Path) -> None:
-    from tests.rig.machine import Machine
+    from tests.rig.machine import Guest
 
     code, source = part / "code", part / "source"
     code.mkdir()
@@ -232,7 +232,7 @@ def _make_box(part: Path, on: Path) -> None:
         shutil.copy(GUEST / file, code)
     disk = part / "disk.qcow2"
     run("qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", on / "disk.img", disk)
-    with Machine(Image(on, disk), part, code=code) as guest:
+    with Guest(Image(on, disk), part, code=code) as guest:
         guest.ready(180)
         guest.run("mkdir -p /code && mount -o ro /dev/vdb /code", check=True)
         guest.run("sh /code/install.sh /code", timeout_s=180, check=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 from appliance.core.clock import SystemClock
 from tests.backends import Skin, skins
 from tests.factories.emulated_machines import ROOT
-from tests.rig.machine import Machine
+from tests.rig.machine import Guest
 
 RUNNER = ("pytest", "pluggy", "iniconfig", "pygments")
 """Pure Python, so this machine's installation serves the guest; `packaging` is in the box's lock."""
@@ -38,18 +38,18 @@ def pack(folder: Path, tests: Iterable[str]) -> None:
                 shutil.copy(made.locate_file(file), place)
 
 
-class Bench:
-    """The controls of an Underside, done to a guest from outside."""
+class GuestControls:
+    """The controls of a Backend, done to a guest from outside."""
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: Guest) -> None:
         self._machine, self._clock, self._told = machine, SystemClock(), 0
 
     def able(self) -> list[str]:
-        """What can be done, as an Underside has it in `can`."""
+        """What can be done, as a Backend has it in `can`."""
         return ["skin", "numbered", "plug", "garble", "silence", "lines", "serial", "stall"]
 
     def reset(self) -> None:
-        """See Underside; the same below. The cable stays as it is."""
+        """See Backend; the same below. The cable stays as it is."""
         self.garble(False)
         for line in ("START", "STOP"):
             self.drive(line, False)

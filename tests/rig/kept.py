@@ -20,7 +20,7 @@ from typing import Any
 from appliance.core.types import Status, Sweep, load
 from appliance.io.robot_link import checksum
 from tests.factories.emulated_machines import ROOT
-from tests.rig.machine import Machine
+from tests.rig.machine import Guest
 
 KEPT = "/var/lib/palpate/kept"
 DROP_IN = "/etc/systemd/system/palpate.service.d/arguments.conf"
@@ -40,7 +40,7 @@ class Heard:
         return kept.id == self.sweep and abs(kept.complete_ns / 1e9 - self.complete_s) < 0.005
 
 
-def runs_with(machine: Machine, arguments: str, more: str = "") -> None:
+def runs_with(machine: Guest, arguments: str, more: str = "") -> None:
     """From the next start on the service runs with these arguments. more: further lines of its drop-in."""
     folder = DROP_IN.rpartition("/")[0]
     machine.run(f"mkdir -p {folder}", check=True)
@@ -96,7 +96,7 @@ def lost(heard: Iterable[tuple[int, str]], kept: list[Sweep]) -> dict[str, int]:
     return {"answered": len(must) + len(may), "owed": len(must), "lost": len(gone), "unfinished": len(unfinished)}
 
 
-class Ledger:
+class CampaignLog:
     """build/rig/NAME.jsonl: one line an event of a campaign on this box."""
 
     def __init__(self, name: str, box: Path) -> None:

@@ -20,13 +20,13 @@ from tests.factories.emulated_machines import run
 from tests.rig.far_end import FarEnd
 from tests.rig.image import LINES, MACHINE, Image
 from tests.rig.lines import GuestLines
-from tests.rig.usbredir import Peer
+from tests.rig.usbredir import UsbRedirPeer
 
 START_S = 20
 """Longest wait for QEMU to open its sockets, or to load a snapshot."""
 
 
-class Failed(AssertionError):
+class GuestFailed(AssertionError):
     """The guest did not do what it was asked to."""
 
 
@@ -38,7 +38,7 @@ class Done:
     out: str
 
 
-class Machine:
+class Guest:
     """A guest that runs until `close`, `cut`, or it powers off.
 
     image: what it runs. folder: where its sockets and its disk go. snapshot: go on from there, instead of booting.
@@ -119,7 +119,7 @@ class Machine:
                 s.close()
                 if self._process.poll() is not None or time.monotonic() > end:
                     log = (self._folder / "qemu.log").read_text(errors="replace")
-                    raise Failed(f"qemu opened no {name} socket: {log[-800:] or e}") from e
+                    raise GuestFailed(f"qemu opened no {name} socket: {log[-800:] or e}") from e
                 time.sleep(0.02)
 
     def _find(self, kind: str) -> str:
@@ -127,13 +127,13 @@ class Machine:
         devices = self.qmp("qom-list", path="/machine/unattached")
         return next(f"/machine/unattached/{d['name']}" for d in devices if d["type"] == f"child<{kind}>")
 
-    def _plug_cable(self, listener: socket.socket) -> Peer:
+    def _plug_cable(self, listener: socket.socket) -> UsbRedirPeer:
         """Put the far end of a USB cable on the guest's port; nothing hangs on it yet."""
         address = {"type": "unix", "data": {"path": str(self._folder / "skin")}}
         self.qmp("chardev-add", id="skin", backend={"type": "socket", "data": {"addr": address, "server": False}})
         self.qmp("device_add", driver="usb-redir", id="cable", chardev="skin", bus="xhci.0")
         listener.settimeout(START_S)
-        return Peer(listener.accept()[0])
+        return UsbRedirPeer(listener.accept()[0])
 
     def qmp(self, execute: str, **arguments: Any) -> Any:
         """Ask QEMU's monitor; what it returns. Raises Failed where it refuses."""
@@ -142,10 +142,10 @@ class Machine:
         for line in self._qmp:
             reply = json.loads(line)
             if "error" in reply:
-                raise Failed(f"qemu: {execute}: {reply['error']['desc']}")
+                raise GuestFailed(f"qemu: {execute}: {reply['error']['desc']}")
             if "return" in reply:
                 return reply["return"]
-        raise Failed(f"qemu has left during {execute}")
+        raise GuestFailed(f"qemu has left during {execute}")
 
     def ready(self, timeout_s: float) -> None:
         """Wait until the guest runs shell lines. Raises Failed where it does not."""
@@ -160,15 +160,15 @@ class Machine:
             while b"\n" not in self._rest:
                 more = self._agent.recv(1 << 20)
                 if not more:
-                    raise Failed(f"the guest has left during: {line}")
+                    raise GuestFailed(f"the guest has left during: {line}")
                 self._rest += more
         except TimeoutError as e:
-            raise Failed(f"the guest said nothing for {timeout_s + START_S:.0f} s to: {line}") from e
+            raise GuestFailed(f"the guest said nothing for {timeout_s + START_S:.0f} s to: {line}") from e
         answer, _, self._rest = self._rest.partition(b"\n")
         told = json.loads(answer)
         done = Done(told["rc"], base64.b64decode(told["out"]).decode(errors="replace"))
         if check and done.rc:
-            raise Failed(f"rc {done.rc} of: {line}\n{done.out[-2000:]}")
+            raise GuestFailed(f"rc {done.rc} of: {line}\n{done.out[-2000:]}")
         return done
 
     def put(self, path: str, data: bytes) -> None:
@@ -185,7 +185,7 @@ class Machine:
         self.run("udevadm settle")
         said = self.qmp("human-monitor-command", **{"command-line": "savevm ready"})
         if said.strip():
-            raise Failed(f"qemu: savevm: {said}")
+            raise GuestFailed(f"qemu: savevm: {said}")
         self.close()
 
     def bench(self) -> socket.socket:

@@ -28,7 +28,7 @@ from tests.factories.paths import ROOT
 from tests.rig import soak_judge, soak_page
 from tests.rig.soak_boxes import BoxUnderTest, Gone, Script, ThisMachine
 from tests.rig.soak_guest import VirtualBox
-from tests.rig.soak_judge import Run
+from tests.rig.soak_judge import SoakRun
 
 BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
 Clock = Callable[[], float]
@@ -46,7 +46,7 @@ NOTED = 200
 class Recorder:
     """Writes the record of a run from what a box says and from looks at its process. clock: tells seconds, monotonic."""
 
-    def __init__(self, box: BoxUnderTest, run: Run, sweeps: Script, clock: Clock) -> None:
+    def __init__(self, box: BoxUnderTest, run: SoakRun, sweeps: Script, clock: Clock) -> None:
         self.run = run
         self._box, self._sweeps, self._clock = box, sweeps, clock
         self._last, self._behind = 0, math.inf
@@ -134,7 +134,7 @@ class Recorder:
 
 
 def record(
-    box: BoxUnderTest, run: Run, length_s: float, save: Callable[[], None], *,
+    box: BoxUnderTest, run: SoakRun, length_s: float, save: Callable[[], None], *,
     stopped: Callable[[], bool] = lambda: False, clock: Clock = time.monotonic, log: Callable[[str], None] = print,
 ) -> None:  # fmt: skip
     """Have a box sweep for so long; `save` is called each minute and at the end. What goes wrong stands in the run."""
@@ -156,7 +156,7 @@ def record(
         save()
 
 
-def progress(run: Run) -> str:
+def progress(run: SoakRun) -> str:
     """A run in a line."""
     told = soak_judge.sums({"runs": [asdict(run)]})
     memory = f"{told['rss_kib'][-1] / 1024:.1f} MiB, " if told["rss_kib"] else ""
@@ -166,13 +166,13 @@ def progress(run: Run) -> str:
     )
 
 
-def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[Run], str]:
+def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[SoakRun], str]:
     """The runs of an interrupted soak and when it was started; none and now where there is none, or where it was of other
     code, another seed or another machine."""
     if path.exists():
         held = json.loads(path.read_text())
         if all(held.get(name) == value for name, value in about.items()):
-            return [Run(**run) for run in held["runs"]], held["started"]
+            return [SoakRun(**run) for run in held["runs"]], held["started"]
     return [], datetime.now(UTC).isoformat(timespec="seconds")
 
 
@@ -211,7 +211,7 @@ def soak(
     if done_s >= hours * 3600 - 1:
         log(f"{box.name}: {done_s / 3600:.2f} h are there already; remove {path} to begin anew")
         return path
-    run = Run(seed + len(runs), done_s)
+    run = SoakRun(seed + len(runs), done_s)
     runs.append(run)
 
     def save() -> None:

@@ -27,7 +27,7 @@ from appliance.sim import rig, script, skin
 from tests.factories.emulated_machines import LOCK
 from tests.rig import image
 from tests.rig.cell import IDLE
-from tests.rig.machine import Failed, Machine
+from tests.rig.machine import Guest, GuestFailed
 from tests.rig.soak_boxes import Gone, Script, process
 
 READY_S = 180
@@ -36,7 +36,7 @@ SENT = 4096
 """Packets of which it is remembered when they went: half a minute, longer than any sentence takes."""
 
 
-class Hand:
+class SoakRobot:
     """The robot: sweeps without pause as soon as `ready` is set (see sim.rig.Robot). edges_ns: of starts, and of stops.
 
     The edges of a sweep are planned while the one before it is made: they come in time however late frames are fetched.
@@ -89,13 +89,13 @@ class VirtualBox:
             raise Gone(self.missing())
         folder = self._stack.enter_context(tempfile.TemporaryDirectory())
         try:
-            self._guest = self._stack.enter_context(Machine(made, Path(folder), snapshot=True))
+            self._guest = self._stack.enter_context(Guest(made, Path(folder), snapshot=True))
             self._guest.ready(READY_S)
             self._pid = self._guest.run("systemctl show -P MainPID palpate", check=True).out.strip()
-        except (Failed, OSError) as e:
+        except (GuestFailed, OSError) as e:
             raise Gone(str(e)) from e
         self._guest.skin.mangle = self._note
-        self._hand = Hand(self._guest.lines, seed)
+        self._hand = SoakRobot(self._guest.lines, seed)
         self._board = rig.Board(skin.FORMAT, self._hand, SystemClock(), fifo_frames=2250)
         self._answer, self._board.request = self._board.request, self._request  # type: ignore[method-assign]
         self._guest.skin.plug(self._board)
@@ -141,7 +141,7 @@ class VirtualBox:
         place = f"/proc/{self._pid}"
         try:
             told = self._guest.run(f"cat {place}/smaps_rollup {place}/stat && ls {place}/fd | wc -l", check=True).out
-        except (Failed, OSError) as e:
+        except (GuestFailed, OSError) as e:
             raise Gone(f"the box cannot be looked at: {e}; did it end?") from e
         *_, stat, files = told.strip().splitlines()
         return process(told, stat, int(files))
@@ -162,7 +162,7 @@ class VirtualBox:
         """As BoxUnderTest."""
         try:
             self._guest.run("systemctl stop palpate", timeout_s=60, check=True)
-        except (Failed, OSError) as e:
+        except (GuestFailed, OSError) as e:
             raise Gone(f"the box was told to end: {e}") from e
         return self.heard(1.0)
 

@@ -36,7 +36,7 @@ SECURE_MIN = 10
 
 
 @dataclass(slots=True)
-class Run:
+class SoakRun:
     """One unbroken run of one box; a soak that was interrupted has several.
 
     began_s, length_s: in seconds of the soak, interruptions left out. due: sweeps that ought to be answered by its end.

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from tests.backends import remote
 from tests.rig.image import Image
-from tests.rig.inside import Bench, pack
-from tests.rig.machine import Machine
+from tests.rig.inside import GuestControls, pack
+from tests.rig.machine import Guest
 
 PYTEST = "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider tests/appliance/io/test_backends.py"
 CODE = (
@@ -33,13 +33,13 @@ def test_the_contract_holds_on_a_real_kernel(
     code.mkdir()
     pack(code, CODE)
     some = count(1, 0) * " -k 'without_a_gap or start_and_stop or test_outputs or arrive_whole'"
-    with Machine(image, tmp_path, snapshot=True, code=code) as machine:
+    with Guest(image, tmp_path, snapshot=True, code=code) as machine:
         asking = threading.Thread(
-            target=remote.serve, args=(machine.bench().makefile("rwb"), Bench(machine)), daemon=True
+            target=remote.serve, args=(machine.bench().makefile("rwb"), GuestControls(machine)), daemon=True
         )
         asking.start()
         machine.run("systemctl stop palpate; mkdir -p /code && mount -o ro /dev/vdb /code", timeout_s=90, check=True)
-        env = "PYTHONDONTWRITEBYTECODE=1 PALPATE_UNDERSIDE=remote PYTHONPATH=/code/site"
+        env = "PYTHONDONTWRITEBYTECODE=1 PALPATE_BACKEND=remote PYTHONPATH=/code/site"
         done = machine.run(f"cd /code && timeout -s INT 500 env {env} {PYTEST}{some}", timeout_s=520)
     assert done.rc == 0, done.out[-6000:]
     passed = int(re.search(r"(\d+) passed", done.out)[1])

@@ -23,8 +23,8 @@ from appliance.io.robot_link import sentence
 from appliance.sim import script, skin
 from tests.rig.cell import Cell, Touch
 from tests.rig.image import Image
-from tests.rig.kept import KEPT, Ledger, found, lost, owed, runs_with, sweeps, whole
-from tests.rig.machine import Machine
+from tests.rig.kept import KEPT, CampaignLog, found, lost, owed, runs_with, sweeps, whole
+from tests.rig.machine import Guest
 from tests.rig.notes import HOW
 from tests.rig.sound import known
 
@@ -42,7 +42,7 @@ PACKET = 24
 """Frames of a packet: fewer packets for an emulator that has to start programs, too."""
 
 
-class Robot:
+class EndlessRobot:
     """Sweeps whenever it may, without waiting for anything else."""
 
     def __init__(self, cell: Cell) -> None:
@@ -98,9 +98,9 @@ def kill(cell: Cell) -> int:
     return killed_ns
 
 
-def killed(image: Image, folder: Path, ledger: Ledger, n: int, rng: random.Random) -> None:
+def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.Random) -> None:
     """Kill the program `n` times: mostly at any moment after the last kill, now and then once it is READY."""
-    with Machine(image, folder, snapshot=True) as machine:
+    with Guest(image, folder, snapshot=True) as machine:
         cell = Cell(machine)
         cell.acts = known(script.tubes(rng.randrange(1 << 30)))
         cell.packet_frames = PACKET
@@ -108,7 +108,7 @@ def killed(image: Image, folder: Path, ledger: Ledger, n: int, rng: random.Rando
         machine.run("systemctl restart --no-block palpate", check=True)
         cell.plug()
         cell.until_ready(BACK_S)
-        robot, kills = Robot(cell), list[int]()
+        robot, kills = EndlessRobot(cell), list[int]()
         for i in range(n):
             if i % EVERY:
                 doing = robot.for_seconds(rng.uniform(0, START_S))
@@ -132,7 +132,7 @@ def killed(image: Image, folder: Path, ledger: Ledger, n: int, rng: random.Rando
 
 def test_killed(image: Image, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]):
     """SIGKILL at random moments, while starting, idle and sweeping: READY again each time, no kept sweep is lost."""
-    ledger, rng = Ledger("kills", image.disk), random.Random()
+    ledger, rng = CampaignLog("kills", image.disk), random.Random()
     wanted = count(ledger.sum("back") + 1, 200)
     while (left := wanted - ledger.sum("back")) > 0:
         killed(image, tmp_path, ledger, min(left, BATCH), rng)
@@ -153,7 +153,7 @@ def disk(image: Image, tmp_path: Path) -> Path:
     """A disk on top of the image's, on which the service keeps its sweeps."""
     made = tmp_path / "disk.qcow2"
     shutil.copy(image.disk, made)
-    with Machine(image, tmp_path, snapshot=True, disk=made) as machine:
+    with Guest(image, tmp_path, snapshot=True, disk=made) as machine:
         runs_with(machine, f"record --out {KEPT}")
         machine.run("systemctl stop --no-block palpate; sync; sync", check=True)
     subprocess.run(["qemu-img", "snapshot", "-d", "ready", made], check=True)
@@ -161,18 +161,18 @@ def disk(image: Image, tmp_path: Path) -> Path:
 
 
 def cut(
-    image: Image, disk: Path, folder: Path, ledger: Ledger, rng: random.Random, *, booting: bool, had: int = 0
+    image: Image, disk: Path, folder: Path, ledger: CampaignLog, rng: random.Random, *, booting: bool, had: int = 0
 ) -> int:
     """One life of a box: power on, READY, sweeps, power off at a random moment; or off already while it boots.
 
     had: sweeps that earlier lives have kept on this disk. What is there now.
     """
-    with Machine(image, folder, disk=disk) as machine:
+    with Guest(image, folder, disk=disk) as machine:
         cell = Cell(machine)
         cell.acts = known(script.tubes(rng.randrange(1 << 30)))
         cell.packet_frames = PACKET
         cell.plug()
-        robot, begun, ready_s, parts = Robot(cell), time.monotonic(), None, 0
+        robot, begun, ready_s, parts = EndlessRobot(cell), time.monotonic(), None, 0
         if not booting:
             cell.until_ready(BACK_S)
             ready_s = round(time.monotonic() - begun, 1)
@@ -192,7 +192,7 @@ def cut(
 def test_power_cut(image: Image, disk: Path, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]):
     """The power goes at random moments, while booting, idle and sweeping: it boots again, the file system is sound, no
     kept sweep is lost."""
-    ledger, rng = Ledger("cuts", image.disk), random.Random()
+    ledger, rng = CampaignLog("cuts", image.disk), random.Random()
     wanted, kept = count(ledger.sum("cut") + 1, 50), 0
     while (n := ledger.sum("cut")) < wanted:
         # twice while it boots, then a life that has to get to READY; such a one is the last, too

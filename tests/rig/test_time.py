@@ -20,7 +20,7 @@ from appliance.core.types import EPOCH_BITS, Sweep, load
 from appliance.sim import rig, script, skin
 from tests.rig.cell import Cell
 from tests.rig.kept import KEPT, runs_with
-from tests.rig.machine import Machine
+from tests.rig.machine import Guest
 from tests.rig.notes import HOW
 from tests.rig.sound import LATE, known, not_wrong
 
@@ -65,7 +65,7 @@ class Offset:
 class GuestClock:
     """Asks the guest for its time. Each trip's answer was read between its two ends, so the offset lies in all of them."""
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: Guest) -> None:
         machine.put("/run/tell.py", TELL.encode())
         machine.run("python3 /run/tell.py < /dev/null > /dev/null 2>&1 &", check=True)
         self._port = machine.bench()

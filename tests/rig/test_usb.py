@@ -18,7 +18,7 @@ from appliance.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
 from tests.rig.sound import begin, comes_back, known, let_go, not_wrong, only_answer, state, until, until_state
-from tests.rig.usbredir import Peer
+from tests.rig.usbredir import UsbRedirPeer
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]
@@ -135,7 +135,7 @@ def test_resets(cell: Cell, count: Count, note: Note, what: str):
 
 
 @pytest.fixture
-def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[Peer]:
+def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[UsbRedirPeer]:
     """Another cable, behind a hub on another port; nothing hangs on the first one."""
     cell.unplug()
     assert cell.lines.wait("FAULT", True, 20)
@@ -147,13 +147,13 @@ def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[Peer]:
     qmp("chardev-add", id="far", backend={"type": "socket", "data": {"addr": address, "server": False}})
     qmp("device_add", driver="usb-redir", id="behind", chardev="far", bus="xhci.0", port="2.1")
     listener.settimeout(20)
-    peer = Peer(listener.accept()[0])
+    peer = UsbRedirPeer(listener.accept()[0])
     yield peer
     peer.close()
 
 
 @pytest.mark.skipif(HOW != "full", reason="one of the full run's")
-def test_behind_a_hub(cell: Cell, behind_a_hub: Peer, count: Count, note: Note):
+def test_behind_a_hub(cell: Cell, behind_a_hub: UsbRedirPeer, count: Count, note: Note):
     """The hub that the skin hangs on is reset, or pulled out with it, in mid sweep: the sweep is lost, no more than that."""
     behind_a_hub.plug(cell.board())
     comes_back(cell)

@@ -54,7 +54,7 @@ class Descriptors:
         return {1: self.device, 2: self.configuration}.get(kind)
 
 
-class Peer:
+class UsbRedirPeer:
     """A cable. `plug` hangs a board on it, `unplug` takes it off; both may be called from any thread.
 
     mangle: what the cable does to a transfer; more than was asked for is a babble. silent: transfers never end.

@@ -1,6 +1,6 @@
-"""One contract, many undersides: what the drivers hold over the simulator, umockdev, the virtual box and a real board.
+"""One contract, many backends: what the drivers hold over the simulator, umockdev, the virtual box and a real board.
 
-PALPATE_UNDERSIDE chooses one a process, the simulator by default (`undersides`). What a bus, a chip or a port can do in
+PALPATE_BACKEND chooses one a process, the simulator by default (`backends`). What a bus, a chip or a port can do in
 detail, to the microsecond, is held in virtual time by test_sensor.py, test_trigger.py and test_sink.py.
 """
 
@@ -26,30 +26,30 @@ from appliance.io.trigger import EdgeKind, GpioTrigger
 from appliance.io.usb_link import REPLY_MS
 from appliance.io.usb_sensor import UsbSensor
 from tests import backends
-from tests.backends import Skin, Underside, mocks, remote, skins
+from tests.backends import Backend, Skin, mocks, remote, skins
 
 SECOND = 1_000_000_000
 LIMIT_S = 10
 SETTLE_S = 2.2
 """Until the skin's clock is known well (DeviceClock), stamps may be set right by the delays of a busy machine."""
-Need = Callable[..., Underside]
+Need = Callable[..., Backend]
 
 
 @pytest.fixture(scope="module")
-def world() -> Iterator[Underside]:
-    """The underside of this process."""
+def world() -> Iterator[Backend]:
+    """The backend of this process."""
     try:
         with backends.opened(backends.chosen()) as made:
             yield made
-    except backends.Missing as e:
+    except backends.BackendMissing as e:
         pytest.exit(str(e), returncode=1)
 
 
 @pytest.fixture
-def need(world: Underside) -> Need:
-    """Gives the underside as it is at the start of a test, to tests that ask no more of it than it can."""
+def need(world: Backend) -> Need:
+    """Gives the backend as it is at the start of a test, to tests that ask no more of it than it can."""
 
-    def able(*wanted: str) -> Underside:
+    def able(*wanted: str) -> Backend:
         if lacking := [what for what in wanted if what not in world.can]:
             pytest.skip(f"{world.name}: no {', no '.join(lacking)} here")
         world.reset()
@@ -58,17 +58,17 @@ def need(world: Underside) -> Need:
     return able
 
 
-def now(u: Underside) -> int:
+def now(u: Backend) -> int:
     """The world's time in nanoseconds."""
     return u.clock.now_ns()
 
 
-def limit(u: Underside) -> int:
+def limit(u: Backend) -> int:
     """The time at which to give up."""
     return now(u) + round((LIMIT_S + u.slack_s) * SECOND)
 
 
-def until(u: Underside, done: Callable[[], Any], step_s: float = 0.002) -> None:
+def until(u: Backend, done: Callable[[], Any], step_s: float = 0.002) -> None:
     """Ask again and again until it is so; fails after LIMIT_S of the world's time."""
     end_ns = limit(u)
     while not done():
@@ -82,7 +82,7 @@ def until(u: Underside, done: Callable[[], Any], step_s: float = 0.002) -> None:
 class Reader:
     """A sensor that is read on and on. No read may last longer than all its timeouts together."""
 
-    def __init__(self, u: Underside, **settings: Any) -> None:
+    def __init__(self, u: Backend, **settings: Any) -> None:
         self.settings = replace(u.sensor, **{"timeout_ms": 50, "retry_ms": 100} | settings)
         self.sensor = UsbSensor(self.settings, u.format, u.clock, u.backend)
         self.states: list[str] = []
@@ -129,7 +129,7 @@ class Reader:
         self.sensor.close()
 
 
-def check_content(u: Underside, frames: Frames) -> None:
+def check_content(u: Backend, frames: Frames) -> None:
     """Each frame holds what the skin has taken under that number."""
     if "numbered" in u.can:
         assert (frames.taxels == skins.digits(frames.seq, u.format)).all()
@@ -280,7 +280,7 @@ def test_garbage_on_the_cable(need: Need):
 class Watcher:
     """A trigger that is asked every two milliseconds."""
 
-    def __init__(self, u: Underside, **settings: Any) -> None:
+    def __init__(self, u: Backend, **settings: Any) -> None:
         self.config = replace(u.trigger, **settings)
         self.trigger = GpioTrigger(self.config, u.gpio)
         self.told: list[tuple[EdgeKind, int]] = []
@@ -321,7 +321,7 @@ class Watcher:
         self.trigger.close()
 
 
-def pulse(u: Underside, line: str) -> tuple[int, int]:
+def pulse(u: Backend, line: str) -> tuple[int, int]:
     """Drive a line high and low again; the times before and after."""
     before = now(u)
     u.drive(line, True)
@@ -417,13 +417,13 @@ def test_a_line_that_is_not_there(need: Need):
 # ---------------------------------------------------------------- Lines
 
 
-def seen(u: Underside) -> set[str]:
+def seen(u: Backend) -> set[str]:
     """The outputs that are high."""
     o = u.output
     return {n for n in (o.ready, o.busy, o.result_valid, o.fault, o.decided, *o.class_bits) if n and u.level(n)}
 
 
-def check_seen(u: Underside, *wanted: str) -> None:
+def check_seen(u: Backend, *wanted: str) -> None:
     """Outside, these outputs are high and no others; those that are not wired are not looked at."""
     until(u, lambda: seen(u) == set(filter(None, wanted)))
 
@@ -466,7 +466,7 @@ def test_inputs_and_outputs_together(need: Need):
 class Peer:
     """The robot controller at the far end of a sink."""
 
-    def __init__(self, u: Underside, sink: SerialSink) -> None:
+    def __init__(self, u: Backend, sink: SerialSink) -> None:
         self.heard = b""
         self.commands: list[Command] = []
         self._u, self._sink = u, sink
@@ -486,7 +486,7 @@ def sink_on() -> Iterator[Callable[..., SerialSink]]:
     """Makes sinks on the serial line, and closes them after the test."""
     made: list[SerialSink] = []
 
-    def make(u: Underside, **settings: Any) -> SerialSink:
+    def make(u: Backend, **settings: Any) -> SerialSink:
         made.append(SerialSink(replace(u.serial, **settings), u.clock, u.name))
         made[-1].commands()
         return made[-1]
@@ -567,14 +567,14 @@ def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSin
     assert sink.trouble == ""
 
 
-# ---------------------------------------------------------------- the undersides themselves
+# ---------------------------------------------------------------- the backends themselves
 
 
 def test_controls_over_a_wire():
     """Each control of the virtual box reaches the bench outside, with what it is given and gives; a failure is told."""
     asked: list[tuple[Any, ...]] = []
 
-    class Bench:
+    class FakeControls:
         def __getattr__(self, name: str) -> Callable[..., Any]:
             return lambda *given: (
                 asked.append((name, *given)),
@@ -586,7 +586,7 @@ def test_controls_over_a_wire():
 
     here, there = socket.socketpair()
     with here, there, there.makefile("rwb") as stream:
-        outside = threading.Thread(target=remote.serve, args=(stream, Bench()))
+        outside = threading.Thread(target=remote.serve, args=(stream, FakeControls()))
         outside.start()
         ask = remote.Asker(here.fileno()).ask
         assert ask("able") == ["lines"]
@@ -610,24 +610,24 @@ def test_controls_over_a_wire():
     ("name", "there", "hint"), [("wired", "/dev/gpiochip0", "wired as tests"), ("remote", remote.PORT, "make test-rig")]
 )
 def test_what_is_missing_is_said(name: str, there: str, hint: str):
-    """Where an underside cannot be had, one line says what to do."""
+    """Where a backend cannot be had, one line says what to do."""
     if os.path.exists(there):
         pytest.skip(f"{there} is here")
-    with pytest.raises(backends.Missing, match=hint), backends.opened(name):
+    with pytest.raises(backends.BackendMissing, match=hint), backends.opened(name):
         pass
 
 
-def test_an_unknown_underside(monkeypatch: pytest.MonkeyPatch):
+def test_an_unknown_backend(monkeypatch: pytest.MonkeyPatch):
     """A name that is none is refused, and the names are told."""
     monkeypatch.setenv(backends.VARIABLE, "real")
-    with pytest.raises(backends.Missing, match="'real' is unknown; known are simulated, mocked, remote, wired"):
+    with pytest.raises(backends.BackendMissing, match="'real' is unknown; known are simulated, mocked, remote, wired"):
         backends.chosen()
 
 
 def test_over_umockdev():
     """The same contract over unmodified libusb, pyusb, libgpiod and gpiod, in a process of its own."""
     if os.environ.get(backends.VARIABLE):
-        pytest.skip("one underside is chosen")
+        pytest.skip("one backend is chosen")
     if lacking := mocks.lacking():
         pytest.fail(lacking) if os.environ.get("PALPATE_MOCKS") else pytest.skip(lacking)
     done = subprocess.run(
