@@ -50,7 +50,7 @@ def test_document_names_the_numbers():
     assert all(f"| {r.value} | {r.name} |" in text for r in wire.Request)
     assert f"| 1 | IDENTITY | {len(wire.pack_identity(wire.Identity(1, (1, 2, 3), 'b', 's')))} bytes" in text
     assert f"| 2 | FORMAT | {len(wire.pack_format(wire.SkinFormat(4, 4, 'uint8', 750, 750, 4)))} bytes" in text
-    assert "digit type: " + ", ".join(f"{i} {d}" for i, d in enumerate(DIGITS)) in text
+    assert "data type: " + ", ".join(f"{i} {d}" for i, d in enumerate(DIGITS)) in text
 
 
 @pytest.mark.parametrize("dtype", DIGITS)
