@@ -10,7 +10,6 @@ import re
 import subprocess
 import sys
 import tarfile
-import tempfile
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from fleet import Failed
 from packaging.requirements import Requirement
 
 from appliance import __version__
+from appliance.core import storage
 
 ROOT = Path(__file__).resolve().parent.parent
 LOCK = ROOT / "appliance" / "requirements.lock"
@@ -93,9 +93,7 @@ def fetch(lock: str, python: str, machine: str) -> Path:
         return target
     tags = [f"--platform=manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 16, -1)]
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-        part = Path(folder) / "part"
-        part.mkdir()
+    with storage.folder(target) as part:
         (part / "requirements.lock").write_text(lock)
         command = (
             sys.executable, "-m", "pip", "--disable-pip-version-check", "-q", "download", "--no-deps",
@@ -105,5 +103,4 @@ def fetch(lock: str, python: str, machine: str) -> Path:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise Failed(f"wheels for {machine}, Python {short}: {done.stderr.strip().splitlines()[-1]}")
-        part.rename(target)
     return target

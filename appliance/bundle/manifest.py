@@ -140,17 +140,7 @@ class Manifest:
     def parse(cls, text: bytes) -> Manifest:
         """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong type."""
         try:
-            raw = json.loads(text)
-            for name, kind in (
-                ("format", SweepFormat),
-                ("thresholds", Thresholds),
-                ("early", Early),
-                ("known", Known),
-                ("place", ContactPositions),
-            ):
-                if raw.get(name) is not None:
-                    raw[name] = typed(kind, raw[name])
-            made = typed(cls, raw)
+            made = typed(cls, json.loads(text))
             made.json()  # nested so deeply that it could not be written again after enrolment
             return made
         except (ValueError, TypeError, AttributeError, RecursionError, FormatError) as e:

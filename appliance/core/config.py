@@ -10,13 +10,12 @@ import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_type_hints
 
 from appliance.core.errors import ConfigError
-from appliance.core.schema import Key, gpio_line, number
+from appliance.core.schema import Key, closest, gpio_line, keys, number, read_table, shown
 
 SITE = Path("/etc/palpate/palpate.toml")
 """What the person who set up this robot has changed; may be missing."""
@@ -157,11 +156,7 @@ class Config:
 
 _SECTIONS: Mapping[str, Any] = MappingProxyType({n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)})
 _KEYS: Mapping[str, Key] = MappingProxyType(
-    {
-        f"{section}.{f.name}": Key(get_type_hints(group)[f.name], f.default, f.metadata)
-        for section, group in _SECTIONS.items()
-        for f in fields(group)
-    }
+    {f"{section}.{last}": key for section, group in _SECTIONS.items() for last, key in keys(group).items()}
 )
 
 
@@ -224,7 +219,7 @@ def _board_file(folder: Path, board: Any, where: str) -> Path:
     boards = {path.stem.removeprefix("board-"): path for path in sorted(folder.glob("board-*.toml"))}
     if not (isinstance(board, str) and board in boards):
         there = ", ".join(boards) or "none"
-        raise ConfigError(f"{where}: board = {_shown(board)} has no board-NAME.toml in {folder}; boards there: {there}")
+        raise ConfigError(f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: {there}")
     return boards[board]
 
 
@@ -248,34 +243,22 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
             raise _unknown(section, [*_SECTIONS, "board"], where)
         if not isinstance(content, dict):
             raise ConfigError(
-                f"{where}: {section} = {_shown(content)} is not a section; write [{section}], its keys below"
+                f"{where}: {section} = {shown(content)} is not a section; write [{section}], its keys below"
             )
-        for last, value in content.items():
-            name = f"{section}.{last}"
-            if name not in _KEYS:
-                raise _unknown(name, [*_KEYS], where)
-            fitted = _KEYS[name].fit(value)
-            if fitted is None:
-                raise ConfigError(f"{where}: {name} = {_shown(value)} is not allowed; use {_KEYS[name].allowed}")
-            yield name, fitted
+        named = {f"{section}.{last}": value for last, value in content.items()}
+        yield from read_table(
+            _KEYS, named,
+            unknown=lambda name: _unknown(name, [*_KEYS], where), refused=lambda why: ConfigError(f"{where}: {why}"),
+        ).items()  # fmt: skip
 
 
 def _unknown(name: str, known: list[str], where: str) -> ConfigError:
     """A right key in the wrong section is told before a key that only looks alike."""
     last = name.rpartition(".")[2]
     known = [k for k in known if k != name]
-    near = [k for k in _KEYS if k.endswith(f".{last}")] or get_close_matches(name, known, 1, 0.5)
+    near = [k for k in _KEYS if k.endswith(f".{last}")] or closest(name, known)
     hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-    return ConfigError(f"{where}: {name if name.isprintable() else _shown(name)} is unknown; {hint}")
-
-
-def _shown(value: object) -> str:
-    """A value for a message of one line, cut where it is long."""
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # a number of over 4300 digits; tables in tables
-        return "(too large to show)"
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    return ConfigError(f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}")
 
 
 def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:

@@ -1,15 +1,16 @@
-"""What a setting may hold. In: fields of dataclasses, values from files. Out: these checked, and what is allowed.
+"""Reads settings and JSON by the dataclass that holds them. In: dataclasses, values from files. Out: these values, checked.
 
-The dataclass field is the one place for a value's type, default and limits; `config` reads files by it. What comes as
-JSON is made by it too.
+A field of the dataclass is the one place for a value's type, default and limits. TOML tables are read with `keys` and
+`read_table`, JSON objects with `typed`; `closest` finds what a misspelt name probably means.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
@@ -18,18 +19,27 @@ _Kind = TypeVar("_Kind")
 
 
 def number(default: _Number, least: _Number, most: _Number, **more: object) -> _Number:
-    """A number field with its limits. more: `step` for whole multiples only, `hex` for how it is printed."""
+    """A number field with its limits. more: `step` allows whole multiples only, `hex` prints it in hexadecimal."""
     return field(default=default, metadata={"least": least, "most": most, **more})
 
 
 def gpio_line() -> str:
-    """A field that names a GPIO line; "" is not wired."""
+    """A field that names a GPIO line; "" means not wired."""
     return field(default="", metadata={"line": True})
+
+
+def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
+    """A field with its own reader. allowed: what may be written there, for a person. read: gives the value to keep, or None
+    where the value is not allowed. A dict as default is copied for each object."""
+    metadata = {"allowed": allowed, "read": read}
+    if isinstance(default, dict):
+        return field(default_factory=default.copy, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A field as a key of the files."""
+    """A field of a dataclass as a key of a TOML table. hint: its type. limits: the field's metadata."""
 
     hint: Any
     default: Any
@@ -37,6 +47,8 @@ class Key:
 
     def fit(self, value: Any) -> Any:
         """`value` as the field's type, or None where it is not allowed."""
+        if "read" in self.limits:
+            return self.limits["read"](value)
         if get_origin(self.hint) is Literal:
             return value if value in get_args(self.hint) else None
         if get_origin(self.hint) is tuple:
@@ -50,7 +62,9 @@ class Key:
 
     @property
     def allowed(self) -> str:
-        """What `fit` takes, for a person."""
+        """What `fit` accepts, for a person."""
+        if "allowed" in self.limits:
+            return str(self.limits["allowed"])
         if get_origin(self.hint) is Literal:
             return "one of " + ", ".join(json.dumps(v) for v in get_args(self.hint))
         if self.hint not in (int, float):
@@ -61,16 +75,60 @@ class Key:
         return f"{kind} from {self.limits['least']} to {self.limits['most']}"
 
 
-def typed(kind: type[_Kind], table: Any) -> _Kind:
-    """The dataclass `kind` from a JSON object, lists as tuples where it holds tuples. Raises TypeError naming the field.
+def keys(kind: Any) -> dict[str, Key]:
+    """The fields of the dataclass `kind` as keys of a TOML table, by name."""
+    hints = get_type_hints(kind)
+    return {f.name: Key(hints[f.name], f.default, f.metadata) for f in fields(kind)}
 
-    Whatever is accepted can be reckoned with and shown: whole numbers where they belong, finite ones, printable texts.
+
+def read_table(
+    known: Mapping[str, Key], table: Mapping[str, Any], *, unknown: Callable[[str], Exception],
+    refused: Callable[[str], Exception],
+) -> dict[str, Any]:  # fmt: skip
+    """The values of a TOML table as their fields' types, by name.
+
+    unknown: makes the error for a name that is not among `known`, which is raised. refused: makes the error for a value
+    that is not allowed from the text "NAME = VALUE is not allowed; use ...".
+    """
+    values = {}
+    for name, value in table.items():
+        if name not in known:
+            raise unknown(name)
+        values[name] = known[name].fit(value)
+        if values[name] is None:
+            raise refused(f"{name} = {shown(value)} is not allowed; use {known[name].allowed}")
+    return values
+
+
+def shown(value: object) -> str:
+    """A value from a file for a message of one line, cut at 80 characters."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of over 4300 digits; deeply nested tables
+        return "(too large to show)"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def closest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.5) -> list[str]:
+    """Up to `most` of the `known` names that a misspelt `name` may mean, the most similar first; case does not matter.
+
+    cutoff: least similarity from 0 to 1 (difflib's ratio).
+    """
+    by_folded = {k.casefold(): k for k in known}
+    return [by_folded[k] for k in get_close_matches(name.casefold(), by_folded, most, cutoff)]
+
+
+def typed(kind: type[_Kind], table: Any) -> _Kind:
+    """The dataclass `kind` from a JSON object; lists become tuples and objects dataclasses where its fields hold these.
+
+    What is accepted can be computed with and printed: integers where integers belong, finite numbers, printable texts.
+    Raises TypeError naming the field, and whatever `kind` raises about its own values.
     """
     hints = get_type_hints(kind)
     if not isinstance(table, dict) or not table.keys() <= hints.keys():
         wrong = sorted(table.keys() - hints.keys()) if isinstance(table, dict) else table
         raise TypeError(f"{wrong!r} is none of {', '.join(hints)}")
-    values = {n: tuple(v) if get_origin(hints[n]) is tuple and isinstance(v, list) else v for n, v in table.items()}
+    values = {name: _nested(hints[name], value) for name, value in table.items()}
     for name, value in values.items():
         if isinstance(value, str) and not value.isprintable():
             raise TypeError(f"{kind.__name__}.{name} = {value!r} cannot be shown")
@@ -80,6 +138,19 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
             wanted = getattr(hints[name], "__name__", hints[name])
             raise TypeError(f"{kind.__name__}.{name} = {value!r} is not of type {wanted}")
     return made
+
+
+def _nested(hint: Any, value: Any) -> Any:
+    """A JSON value for a field of type `hint`, with lists as tuples and objects as dataclasses where the type says so."""
+    if get_origin(hint) is tuple and isinstance(value, list):
+        return tuple(value)
+    if get_origin(hint) is dict and isinstance(value, dict):
+        return {name: _nested(get_args(hint)[1], v) for name, v in value.items()}
+    alternatives = get_args(hint) if get_origin(hint) is UnionType else (hint,)
+    kind: Any = next((k for k in alternatives if is_dataclass(k)), None)
+    if kind is None or value is None or isinstance(value, kind):
+        return value
+    return typed(kind, value)
 
 
 def _fits(value: Any, hint: Any) -> bool:

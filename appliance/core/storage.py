@@ -18,23 +18,28 @@ AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Of the Linux call renameat2."""
 
 
-def put(path: Path, data: bytes, *, parents: bool = False) -> None:
-    """Write one file, whole or not at all. parents: make its folders. Raises OSError, and then leaves nothing behind."""
+def put(path: Path, data: bytes, *, parents: bool = False, durable: bool = True, mode: int | None = None) -> None:
+    """Write one file, whole or not at all. parents: make its folders. durable, mode: as for `put_all`.
+
+    Raises OSError, and then leaves nothing behind.
+    """
     if parents:
         path.parent.mkdir(parents=True, exist_ok=True)
-    put_all({path: data})
+    put_all({path: data}, durable=durable, mode=mode)
 
 
-def put_all(files: Mapping[Path, bytes]) -> None:
+def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | None = None) -> None:
     """Write files of one folder; they take their names in this order, so the last may rely on those before it.
 
-    Raises OSError where that fails, and then leaves none of them behind that was not there before.
+    durable: False leaves out the syncs; the file is still whole for every reader, but not after a loss of power. mode:
+    permission bits, whatever the umask; None leaves them to the umask. Raises OSError where that fails, and then leaves
+    none of them behind that was not there before.
     """
     asides = {target: target.with_name(target.name + PART) for target in files}
     taken: list[Path] = []
     try:
         for target, data in files.items():
-            write(asides[target], data)
+            write(asides[target], data, durable=durable, mode=mode)
         for target, aside in asides.items():
             new = not target.exists()
             aside.replace(target)
@@ -45,16 +50,20 @@ def put_all(files: Mapping[Path, bytes]) -> None:
             with suppress(OSError):
                 left.unlink(missing_ok=True)
         raise
-    for folder in {target.parent for target in files}:
+    for folder in {target.parent for target in files} if durable else ():
         sync(folder)
 
 
-def write(path: Path, data: bytes) -> None:
-    """Write and sync one file under its own name: for a folder that takes its name only when it is complete."""
+def write(path: Path, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:
+    """Write one file under its own name and sync it where it is to be `durable`: for a folder that takes its name only
+    when it is complete."""
     with path.open("wb") as f:
+        if mode is not None:
+            os.fchmod(f.fileno(), mode)
         f.write(data)
         f.flush()
-        os.fsync(f.fileno())
+        if durable:
+            os.fsync(f.fileno())
 
 
 @contextmanager

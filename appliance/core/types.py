@@ -183,6 +183,12 @@ class Verdict:
     own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     moved: str = ""
 
+    def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
+        """All fields by name, as JSON holds them; numbers come back bit for bit. arrays: with `scores` and `own`, as lists."""
+        values = {name: getattr(self, name) for name in Verdict.__slots__}
+        lists = {name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)}
+        return values | lists if arrays else {name: v for name, v in values.items() if name not in lists}
+
 
 def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
     return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.digits, (fmt.rows, fmt.cols))])

@@ -24,7 +24,7 @@ from appliance.core.statistics import wilson
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
-from appliance.recording.recording import SweepFolder, told
+from appliance.recording.recording import SweepFolder
 from appliance.service.journal import WARNING
 
 FILE = "agreement.json"
@@ -173,7 +173,7 @@ class Shadow:
         elif not self.agreement.add(verdict, other, took_ns / 1e6):
             self._due_ns = begin_ns
             if self.agreement.kept + len(self._waiting) < KEPT:
-                self._waiting.append((sweep, verdict, {**about, "candidate": told(other)}))
+                self._waiting.append((sweep, verdict, {**about, "candidate": other.as_dict()}))
 
     def turn(self, health: Health) -> None:
         """A turn is over: write one thing that is due, while no sweep is open."""

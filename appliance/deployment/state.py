@@ -103,5 +103,6 @@ class StoreState:
     def parse(cls, text: bytes) -> StoreState:
         """Read it. Raises ValueError or TypeError naming what is wrong."""
         raw = json.loads(text)
-        raw["standings"] = {sha: typed(Standing, held) for sha, held in raw["standings"].items()}
+        if isinstance(raw, dict) and "standings" not in raw:
+            raise TypeError("it has no standings")
         return typed(cls, raw)

@@ -9,10 +9,10 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Self
 
 from appliance.core.errors import LineError
+from appliance.core.schema import closest
 
 if TYPE_CHECKING:
     from gpiod import LineRequest
@@ -60,7 +60,7 @@ def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
                 if denied:
                     what, advice = f"may not open {', '.join(denied)} (errno 13)", _ADVICE[errno.EACCES]
                     raise LineError(f"{what}, where gpio line {name!r} might be; {advice}")
-                near = get_close_matches(name, places, cutoff=0.5) or sorted(places)[:3]
+                near = closest(name, places, 3) or sorted(places)[:3]
                 raise LineError(f"no gpio line is named {name!r}; nearest: {', '.join(near)}; gpioinfo lists them all")
             case several:
                 where = " and ".join(f"{path} line {offset}" for path, offset in several)

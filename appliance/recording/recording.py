@@ -17,8 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from appliance.bundle.manifest import LABEL
 from appliance.core import storage
 from appliance.core.clock import Clock
@@ -35,12 +33,6 @@ than a recording."""
 MOST_CHANGES = 1024
 """Changes of the labels that are remembered until the sweeps before them are answered; far more than a person makes."""
 _KEPT = re.compile(rf"sweep-([0-9]+)\.(?:npy|json)({re.escape(storage.PART)})?")
-
-
-def told(verdict: Verdict) -> dict[str, Any]:
-    """All that a verdict says, as JSON has it; its numbers come back bit for bit."""
-    values = ((name, getattr(verdict, name)) for name in Verdict.__slots__)
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values}
 
 
 class SweepFolder:
@@ -64,7 +56,7 @@ class SweepFolder:
     def put(self, sweep: Sweep, verdict: Verdict, about: Mapping[str, Any]) -> int:
         """Write a sweep and what is to be told about it, whole or not at all; its number. Raises OSError."""
         number = self.run + sweep.id
-        save(self.path(number), sweep, self._format, {**about, "run": self.run, "verdict": told(verdict)})
+        save(self.path(number), sweep, self._format, {**about, "run": self.run, "verdict": verdict.as_dict()})
         self.numbers.append(number)
         return number
 

@@ -24,7 +24,6 @@ from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.io.robot_link import StdoutPort, result
 from appliance.recording.capture import Playback
-from appliance.recording.recording import told
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime import assembly
 from appliance.runtime.loop import Box
@@ -72,7 +71,7 @@ class Kept:
     """A kept sweep with what its sidecar says; an older one says less.
 
     object: whose sweeps were fused. rule: None where it is not told. tare: [R, C] digits. bundle: its id or "".
-    verdict: as `record.told` has it, or empty.
+    verdict: as `Verdict.as_dict` gives it, or empty.
     """
 
     sweep: Sweep
@@ -158,7 +157,7 @@ class Judge:
             return Judged(verdict, DIFFERENT, "it was answered early, which this bundle does not do")
         if not was:
             return Judged(verdict, SILENT)
-        now = told(verdict)
+        now = verdict.as_dict()
         changed = [_change(name, was[name], now.get(name)) for name in was if was[name] != now.get(name)]
         return Judged(verdict, DIFFERENT if changed else SAME, ", ".join(changed))
 

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from appliance import __version__
+from appliance.core import storage
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.health import Health
-from appliance.core.storage import PART
 from appliance.core.types import Status, Verdict
 from appliance.service.journal import REASONS, WARNING
 
@@ -33,11 +33,6 @@ STALE_NS = 10_000_000_000
 MOST_BYTES = 1 << 20
 _START = "systemctl start palpate, then journalctl -u palpate tells more"
 WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
-
-
-def plain(v: Verdict) -> dict[str, Any]:
-    """A verdict for JSON, without its arrays of probabilities."""
-    return {name: getattr(v, name) for name in Verdict.__slots__ if name not in ("scores", "own")}
 
 
 class StatusFile:
@@ -58,7 +53,7 @@ class StatusFile:
 
     def send(self, verdict: Verdict) -> None:
         """Have a verdict told with the end of the turn."""
-        self._verdicts.append(plain(verdict))
+        self._verdicts.append(verdict.as_dict(arrays=False))
         self._fresh = True
 
     def turn(self, health: Health) -> None:
@@ -73,18 +68,12 @@ class StatusFile:
             **self._more(), **asdict(health), "time_ns": now_ns, "since_ns": self._since_ns, "pid": os.getpid(),
             "version": __version__, "schema": SCHEMA, "verdicts": list(self._verdicts),
         }  # fmt: skip
-        self._try(lambda: self._write(json.dumps(told).encode()))
+        # every user of the box may ask; the file lies in memory (/run), and on a card one sync a second would wear it
+        self._try(lambda: storage.put(self._path, json.dumps(told).encode(), durable=False, mode=0o644))
 
     def stopping(self) -> None:
         """The loop has ended: what the file tells is no longer so."""
         self._try(lambda: self._path.unlink(missing_ok=True))
-
-    def _write(self, text: bytes) -> None:
-        aside = self._path.with_name(self._path.name + PART)
-        with aside.open("wb") as f:
-            os.fchmod(f.fileno(), 0o644)  # whatever the umask: every user of the box may ask
-            f.write(text)
-        aside.replace(self._path)
 
     def _try(self, act: Callable[[], object]) -> None:
         try:

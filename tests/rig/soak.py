@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from appliance.core import storage
 from appliance.core.provenance import commit
 from appliance.io.robot_link import checksum
 from appliance.sim import skin
@@ -178,10 +179,7 @@ def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[SoakRun], str]:
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON whole or not at all, a row a line."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_suffix(".part")
-    aside.write_text(_text(content) + "\n")
-    aside.replace(path)
+    storage.put(path, (_text(content) + "\n").encode(), parents=True)
 
 
 def _text(value: Any, indent: str = "") -> str:

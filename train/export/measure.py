@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle
+from appliance.core import storage
 from appliance.core.errors import BundleError
 from appliance.core.provenance import commit
 from train.data.sets import Dataset
@@ -77,12 +78,8 @@ def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Pac
     """
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent) as aside:
-            work = Path(aside) / "work"
-            work.mkdir()
-            told = list(_made(method, sweeps, seed, work))
-            (work / TOLD).write_text(json.dumps(told))
-            work.rename(folder)
+        with storage.folder(folder) as work:
+            (work / TOLD).write_text(json.dumps(list(_made(method, sweeps, seed, work))))
     told = json.loads((folder / TOLD).read_text())
     return [Packed(**one | {"method": method.name, "folder": folder / one["folder"]}) for one in told]
 

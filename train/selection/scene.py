@@ -9,9 +9,8 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import Field, dataclass, field, fields, replace
-from difflib import get_close_matches
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 
 from appliance.bundle.bundle import LABEL
 from appliance.core.errors import FormatError
+from appliance.core.schema import closest, custom, keys, number, read_table
 from train.data import sets
 from train.data.sets import Dataset
 from train.evaluation import corruptions
@@ -28,32 +28,13 @@ REDUCTIONS = ("window", "rate", "taxels", "bits", "classes")
 """What may be tried with less of."""
 APPLICABLE = ("window", "rate", "taxels")
 """Of these, what a bundle's format holds. The others are told only."""
-Read = Callable[[Any], Any]
-
-
-def _key(default: Any, allowed: str, read: Read) -> Any:
-    """A field that a file may set. read: a value -> what is kept, None where it is not `allowed`."""
-    return field(default=default, metadata={"allowed": allowed, "read": read})
-
-
-def _table(allowed: str, read: Read) -> Any:
-    return field(default_factory=dict, metadata={"allowed": allowed, "read": read})
-
-
-def _number(default: float, least: float, most: float, *, whole: bool = False) -> Any:
-    kinds, name = ((int,), "a whole number") if whole else ((int, float), "a number")
-
-    def read(value: Any) -> Any:
-        return value if type(value) in kinds and least <= value <= most else None
-
-    return _key(default, f"{name} from {least:g} to {most:g}", read)
 
 
 def _text(default: str, form: re.Pattern[str] = LABEL) -> Any:
     def read(value: Any) -> Any:
         return value if isinstance(value, str) and form.fullmatch(value) else None
 
-    return _key(default, "a text of 1 to 24 letters, digits, spaces, '.', '_' or '-'", read)
+    return custom(default, "a text of 1 to 24 letters, digits, spaces, '.', '_' or '-'", read)
 
 
 def _texts(value: Any) -> tuple[str, ...] | None:
@@ -66,7 +47,7 @@ def _list(default: tuple[str, ...] = (), of: tuple[str, ...] = ()) -> Any:
         found = _texts(value)
         return None if found is None or (of and set(found) - set(of)) else found
 
-    return _key(default, f"a list of some of {', '.join(of)}" if of else "a list of different texts", read)
+    return custom(default, f"a list of some of {', '.join(of)}" if of else "a list of different texts", read)
 
 
 def _severities(value: Any) -> dict[str, float] | None:
@@ -88,10 +69,10 @@ class Budget:
     slower: how many of this machine's ms are one of the board's: an assumption, until it is measured there.
     """
 
-    ms: float = _number(math.inf, 1e-3, 1e6)
-    kb: float = _number(math.inf, 1, 1e6)
-    mb: float = _number(math.inf, 1, 1e6)
-    slower: float = _number(1.0, 0.01, 1000)
+    ms: float = number(math.inf, 0.001, 1_000_000)
+    kb: float = number(math.inf, 1, 1_000_000)
+    mb: float = number(math.inf, 1, 1_000_000)
+    slower: float = number(1.0, 0.01, 1000)
 
 
 @dataclass(frozen=True)
@@ -111,16 +92,16 @@ class Scene:
     sets: tuple[str, ...] = _list()
     only: tuple[str, ...] = _list()
     materials: tuple[str, ...] = _list()
-    merge: Mapping[str, tuple[str, ...]] = _table("lists of materials by their new name", _merged)
+    merge: Mapping[str, tuple[str, ...]] = custom({}, "lists of materials by their new name", _merged)
     varies: tuple[str, ...] = _list()
-    folds: int = _number(0, 3, 20, whole=True)
-    stress: Mapping[str, float] = _table("numbers above 0 by a stress's name", _severities)
-    accuracy: float = _number(0.0, 0, 1)
-    seeds: int = _number(1, 1, 20, whole=True)
+    folds: int = number(0, 3, 20)
+    stress: Mapping[str, float] = custom({}, "numbers above 0 by a stress's name", _severities)
+    accuracy: float = number(0.0, 0, 1)
+    seeds: int = number(1, 1, 20)
     methods: tuple[str, ...] = _list()
     reduce: tuple[str, ...] = _list(REDUCTIONS, REDUCTIONS)
     apply: tuple[str, ...] = _list(("window",), APPLICABLE)
-    full_scale: float = _number(0.0, 1, 1e9)
+    full_scale: float = number(0.0, 1, 1_000_000_000)
     budget: Budget = Budget()
     path: Path = Path()
 
@@ -175,17 +156,12 @@ def read(path: Path) -> Scene:
 
 def _values(file: str, section: str, schema: type[Any], told: Mapping[str, Any]) -> dict[str, Any]:
     """The values of one table, each as its field has it."""
-    keys: dict[str, Field[Any]] = {f.name: f for f in fields(schema) if f.metadata}
-    found = {}
-    for name, value in told.items():
-        if name not in keys:
-            raise FormatError(f"{file}: key {section}{name} is unknown{_near(name, tuple(keys))}")
-        if (kept := keys[name].metadata["read"](value)) is None:
-            raise FormatError(
-                f"{file}: {section}{name} = {value!r} is not allowed; use {keys[name].metadata['allowed']}"
-            )
-        found[name] = kept
-    return found
+    known = {name: key for name, key in keys(schema).items() if key.limits}
+    return read_table(
+        known, told,
+        unknown=lambda name: FormatError(f"{file}: key {section}{name} is unknown{_near(name, tuple(known))}"),
+        refused=lambda why: FormatError(f"{file}: {section}{why}"),
+    )  # fmt: skip
 
 
 def _check(scene: Scene, told: Mapping[str, Any]) -> None:
@@ -218,6 +194,5 @@ def _check(scene: Scene, told: Mapping[str, Any]) -> None:
 
 
 def _near(value: str, known: tuple[str, ...]) -> str:
-    by_lower = {name.lower(): name for name in known}
-    close = get_close_matches(value.lower(), by_lower, 1)
-    return f"; did you mean {by_lower[close[0]]!r}?" if close else f"; use {', '.join(known)}"
+    close = closest(value, known, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else f"; use {', '.join(known)}"

@@ -231,7 +231,7 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
     ("settings", "the file is not named", config, "load", numb(config.load)),
     ("settings", "what is described does not load", config, "describe",
      changed(config, "describe", lambda text: text.replace("= true", "= 1").replace("0x", ""))),
-    ("manifest", "types are not looked at", manifest, "typed", unguarded),
+    ("manifest", "types are not looked at", schema, "_fits", lambda value, hint: True),
     ("manifest", "a message of two lines", manifest.json, "loads", broken_json),
     ("manifest", "golden sweeps of any form", bundle, "_golden", lambda data, manifest: (np.ones((1, 2, 3, 4)), None)),
     ("recording", "a time is lost", types, "Frames", lambda t_ns, seq, taxels: FRAMES(t_ns[1:], seq, taxels)),

@@ -130,7 +130,7 @@ def test_a_full_disk_costs_the_recording_never_the_classifying(
 ):
     """Neither sweeps nor capture can be written: each is told, every sweep is answered, exit code 0."""
 
-    def full(*args: object) -> None:
+    def full(*args: object, **options: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("appliance.core.storage.write", full)

@@ -251,7 +251,7 @@ def test_samples_are_what_the_box_prints():
     file = {
         **health, "running": True, "why": "", "pid": 712, "version": __version__, "since_ns": 0,
         "model": "default 2, 6 labels",
-        "verdicts": [status.plain(verdict(1, Status.OK, "wood", 0.991, time_ns=now_ns - 9_000_000_000))],
+        "verdicts": [verdict(1, Status.OK, "wood", 0.991, time_ns=now_ns - 9_000_000_000).as_dict(arrays=False)],
     }  # fmt: skip
     told += status.lines(file, now_ns)
     detail = "start 1 of 3, 7 of 20 sweeps, 41 of 600 s, as of its last start or end"

@@ -280,7 +280,7 @@ def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatc
     """Told once; verdicts go on being compared."""
     pair = side(renamed)
 
-    def full(*_: object) -> None:
+    def full(*_: object, **options: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(storage, "put_all", full)

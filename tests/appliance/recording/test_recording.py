@@ -17,7 +17,7 @@ import pytest
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.types import Frames, Status, Sweep, Verdict, load, sidecar
 from appliance.recording import recording
-from appliance.recording.recording import Labels, RecordingSession, SweepFolder, told
+from appliance.recording.recording import Labels, RecordingSession, SweepFolder
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import Rigged
@@ -127,7 +127,7 @@ def test_a_sidecar_tells_all(recorded: Callable[..., Rigged], tmp_path: Path):
     box = recorded(world, Labels("wood", "3", "monday"))
     (verdict,) = box.until(lambda: world.finished(box.box.answered))
     about = json.loads((tmp_path / "sweep-000001.json").read_text())
-    assert about["verdict"] == told(verdict)
+    assert about["verdict"] == verdict.as_dict()
     assert np.array(about["verdict"]["own"]).tobytes() == verdict.own.tobytes()
     assert about["device"]["serial"] == "SIM0001"
     assert about["clock"]["late_ms"] >= 0
@@ -394,7 +394,7 @@ def test_a_disk_that_is_full_costs_no_answer(recorded: Callable[..., Rigged], mo
 def test_numbers_in_a_verdict_come_back_bit_for_bit():
     """Floats through JSON: the same bits, also where they have no short form; and no field is left out."""
     _, verdict = judged(1)
-    again = json.loads(json.dumps(told(verdict)))
-    assert again == told(verdict)
+    again = json.loads(json.dumps(verdict.as_dict()))
+    assert again == verdict.as_dict()
     assert np.array(again["scores"]).tobytes() == verdict.scores.tobytes()
     assert again.keys() == set(Verdict.__slots__)

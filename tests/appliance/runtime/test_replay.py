@@ -20,7 +20,6 @@ from appliance.core.types import Frames, Status, Sweep, load, save, sidecar
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.recording.black_box import BlackBox
-from appliance.recording.recording import told
 from appliance.runtime.replay import replay
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
@@ -121,7 +120,7 @@ def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
     verdicts = classifier(whole), Decider(classifier)(early)
     assert [(str(v.status), v.fused) for v in verdicts] == [("unsure", 1), ("ok", 2)]
     for sweep, verdict in zip((whole, early), verdicts, strict=True):
-        about = {"rule": classifier.rule, "bundle": model.id, "verdict": told(verdict)}
+        about = {"rule": classifier.rule, "bundle": model.id, "verdict": verdict.as_dict()}
         save(tmp_path / f"sweep-{sweep.id:06d}.npy", sweep, toy_bundle.FORMAT, about)
     assert played(tmp_path, model)[2][-1] == "2 sweeps: 2 the same"
     (tmp_path / "sweep-000001.npy").unlink()
