@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 
 from appliance.bundle import bundle
 from appliance.core.errors import BundleError
-from appliance.deployment.shelf import SHA
 from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
+from appliance.deployment.store import SHA, Store
 
 if TYPE_CHECKING:
     from appliance.core.config import StoreConfig
-    from appliance.deployment.store import Store
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +35,8 @@ class ListedBundle:
 
 def entries(store: Store) -> list[ListedBundle]:
     """The store's bundles, those that matter most first."""
-    current, ledger = store.current, store.ledger
-    there = sorted(p.name for p in store.shelf.folder.iterdir()) if store.shelf.folder.is_dir() else []
+    current, ledger = store.current, store.state
+    there = sorted(p.name for p in store.bundles.folder.iterdir()) if store.bundles.folder.is_dir() else []
     told = [_entry(store, sha, current, ledger) for sha in (*filter(SHA.fullmatch, there), PACKAGED)]
     order = ("current", "on trial", "previous", "candidate", "left", "kept", "damaged")
     return sorted(told, key=lambda e: order.index(e.role))
@@ -52,12 +51,12 @@ def lines(told: Iterable[ListedBundle]) -> list[str]:
 
 
 def _entry(store: Store, sha: str, current: str, ledger: StoreState) -> ListedBundle:
-    role, detail = _role(sha, current, ledger, store.how)
+    role, detail = _role(sha, current, ledger, store.settings)
     try:
         if sha == PACKAGED:
             found, signer = bundle.load(bundle.DEFAULT), "palpate"
         else:
-            held = store.shelf.get(sha)
+            held = store.bundles.get(sha)
             found, signer = held.bundle, held.signer
     except BundleError as e:
         return ListedBundle(sha, sha[:8], "?", "?", 0, "?", "damaged", " ".join(filter(None, (role, detail, str(e)))))

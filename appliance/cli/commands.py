@@ -46,7 +46,7 @@ def run_bundles(args: argparse.Namespace) -> int:
     store, folder = assembly.store(how), Path(how.store.folder) / "shadow"
     told, beside = bundle_list.entries(store), shadow.read(folder)
     lines = bundle_list.lines(told)
-    if beside and store.ledger.candidate.startswith(beside.candidate):
+    if beside and store.state.candidate.startswith(beside.candidate):
         lines += beside.lines(folder)
     print(json.dumps([asdict(e) for e in told], indent=1) if args.json else "\n".join(lines))
     return 0
@@ -56,7 +56,7 @@ def run_install(args: argparse.Namespace) -> int:
     """`palpate install`: a signed bundle comes into the store."""
     store = assembly.store(settings(args))
     sha = store.install(args.folder, args.shadow)
-    committed = "it is committed already" if store.ledger.of(sha).committed else f"it runs on trial {NEXT}"
+    committed = "it is committed already" if store.state.of(sha).committed else f"it runs on trial {NEXT}"
     print(f"bundle {sha[:8]} is installed; {'it is the candidate' if args.shadow else committed}")
     return 0
 

@@ -1,4 +1,4 @@
-"""Work that may die, hang or ask for all memory, done apart. In: something to call. Out: nothing, or why it failed.
+"""Runs work that may crash, hang or take all memory in a limited child process. In: a callable. Out: nothing, or why it failed.
 
 The child is a fork: it has what was read and checked here, byte for byte, and what it does to itself stays with it.
 """
@@ -14,30 +14,31 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 DEADLINE_S = 30.0
-"""The golden sweeps of our largest network take .1 s on a desktop."""
+"""The golden sweeps of our largest network take 0.1 s on a desktop."""
 MOST_BYTES = 256 << 20
 """Of address space beyond what the process has already."""
-MOST_TOLD = 2000
+MOST_MESSAGE = 2000
+"""Bytes of the child's message that are read."""
 
 
-def apart(work: Callable[[], object]) -> None:
-    """Do `work` in a child process of its own. Raises BundleError where it raises, dies, or takes too long."""
+def run_limited(work: Callable[[], object]) -> None:
+    """Do `work` in a child process. Raises BundleError where it raises, dies, or takes longer than DEADLINE_S."""
     import multiprocessing  # these two here: only commands need them, not the service
     import signal
 
     context = multiprocessing.get_context("fork")
-    heard, told = context.Pipe(duplex=False)
-    child = context.Process(target=_work, args=(work, told), daemon=True)
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_work, args=(work, sender), daemon=True)
     child.start()
-    told.close()
+    sender.close()
     child.join(DEADLINE_S)
     if child.is_alive():
         child.kill()
         child.join()
         raise BundleError(f"model was not run within {DEADLINE_S:g} s; export the bundle again")
-    if heard.poll():
+    if receiver.poll():
         try:
-            raise BundleError(heard.recv_bytes(MOST_TOLD).decode(errors="replace"))
+            raise BundleError(receiver.recv_bytes(MOST_MESSAGE).decode(errors="replace"))
         except EOFError:
             pass
     if child.exitcode:
@@ -45,19 +46,19 @@ def apart(work: Callable[[], object]) -> None:
         raise BundleError(f"model killed the process that tried it ({name}); export the bundle again")
 
 
-def _work(work: Callable[[], object], told: Connection) -> None:
-    """The child's part."""
+def _work(work: Callable[[], object], sender: Connection) -> None:
+    """What the child does: set the limits, do the work, send the error if there is one."""
     import resource
 
     with open("/proc/self/statm", "rb") as f:
-        has = int(f.read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (has + MOST_BYTES,) * 2)
+        used = int(f.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + MOST_BYTES,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         work()
     except ApplianceError as e:
-        told.send_bytes(str(e).encode()[:MOST_TOLD])
+        sender.send_bytes(str(e).encode()[:MOST_MESSAGE])
     except MemoryError:
-        told.send_bytes(f"model asks for more than {MOST_BYTES >> 20} MB; export a smaller one".encode())
+        sender.send_bytes(f"model asks for more than {MOST_BYTES >> 20} MB; export a smaller one".encode())
     except Exception as e:  # of onnxruntime's classes, which share no base but this
-        told.send_bytes(f"model cannot be run: {type(e).__name__}: {e}".encode()[:MOST_TOLD])
+        sender.send_bytes(f"model cannot be run: {type(e).__name__}: {e}".encode()[:MOST_MESSAGE])

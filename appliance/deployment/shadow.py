@@ -1,7 +1,7 @@
-"""The room of the shadow: a candidate that classifies beside the bundle in service, before anybody commits to it.
+"""Shadow mode: a candidate bundle classifies beside the one in service, before anybody commits to it.
 
-In: sweeps with the verdicts that were sent. Out: how often the candidate says the same, and the sweeps on which it does
-not, in a folder. What the candidate does, raises or takes is never seen by the robot: an answer is out before it is asked.
+In: sweeps with the verdicts that were sent. Out: how often the candidate agrees, and the sweeps on which it does not, in
+a folder. The candidate cannot affect the robot: it gets a sweep only after the answer has been sent.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from appliance.service.journal import WARNING
 
 FILE = "agreement.json"
 KEPT = 100
-"""So many sweeps on which the two differ are kept."""
+"""Most sweeps on which the two differ that are kept."""
 FAILURES = 3
-"""The shadow ends after so many sweeps in a row on which the candidate failed."""
+"""The candidate is no longer asked after it failed on so many sweeps in a row."""
 SLOW_NS = 100_000_000
-"""A candidate that computes for longer has failed: frames wait for it."""
+"""A candidate that computes for longer has failed on the sweep: frames wait for it."""
 STARTS = 3
-"""After so many starts in a row that a candidate's shadow did not outlive for PERIOD_NS it stays away."""
+"""After so many starts in a row that did not last PERIOD_NS, the candidate is not loaded any more."""
 PERIOD_NS = 60_000_000_000
 """How often the counts are written where the two agree."""
 NEVER_NS = 1 << 63
@@ -43,12 +43,12 @@ NEVER_NS = 1 << 63
 
 @dataclass(slots=True)
 class Agreement:
-    """What two bundles have said of the same sweeps.
+    """How two bundles have answered the same sweeps; the content of agreement.json.
 
-    pairs: what the current one said -> what the candidate said -> sweeps. later: early answers to which the candidate
-    would have waited for more of the sweep; these are not compared. failed: sweeps on which the candidate did. kept:
-    sweeps that lie beside. worst_ms: its longest computing; total_ms: of all. starts: begun in a row without an end in
-    order, the present one included until it is older than PERIOD_NS.
+    pairs: answer of the current one -> answer of the candidate -> number of sweeps. later: early answers where the
+    candidate would have waited for more of the sweep; these are not compared. failed: sweeps on which the candidate
+    failed. kept: sweeps in the same folder. worst_ms, total_ms: its longest and its whole computing time. starts: in a
+    row without an orderly end, the present one included until it is older than PERIOD_NS.
     """
 
     candidate: str
@@ -67,30 +67,30 @@ class Agreement:
     @property
     def text(self) -> str:
         """In one line, for a person."""
-        told = f"candidate {self.candidate} agrees with {self.current} on {self.agreed} of {self.compared} sweeps"
+        text = f"candidate {self.candidate} agrees with {self.current} on {self.agreed} of {self.compared} sweeps"
         if self.compared:
             low, high = wilson(self.agreed, self.compared)
-            told += (
+            text += (
                 f" [{100 * low:.1f} to {100 * high:.1f} %], computing {self.total_ms / self.compared:.2g} ms for each"
             )
-            told += f" and {self.worst_ms:.2g} ms at most"
-        told += f"; {self.later} early answers are not compared" if self.later else ""
-        return told + (f"; it failed on {self.failed}" if self.failed else "")
+            text += f" and {self.worst_ms:.2g} ms at most"
+        text += f"; {self.later} early answers are not compared" if self.later else ""
+        return text + (f"; it failed on {self.failed}" if self.failed else "")
 
     def lines(self, folder: Path) -> list[str]:
-        """The same, then each pair of answers in which they differ, the most frequent first, and where the sweeps are."""
-        apart = [(n, one, other) for one, said in self.pairs.items() for other, n in said.items() if one != other]
-        said = [f"  {one} -> {other}: {n}" for n, one, other in sorted(apart, key=lambda a: -a[0])]
-        return [self.text, *said, *([f"  {self.kept} of these are kept in {folder}"] if self.kept else [])]
+        """The text, then each pair of different answers, the most frequent first, and where the sweeps are."""
+        pairs = [(n, one, other) for one, row in self.pairs.items() for other, n in row.items() if one != other]
+        differ = [f"  {one} -> {other}: {n}" for n, one, other in sorted(pairs, key=lambda pair: -pair[0])]
+        return [self.text, *differ, *([f"  {self.kept} of these are kept in {folder}"] if self.kept else [])]
 
     def json(self) -> bytes:
-        """As it is written."""
+        """The content of agreement.json."""
         return json.dumps(asdict(self), indent=1).encode()
 
     def add(self, one: Verdict, other: Verdict, took_ms: float) -> bool:
-        """Count a sweep; whether the robot would have been told the same."""
-        said = self.pairs.setdefault(_answer(one), {})
-        said[_answer(other)] = said.get(_answer(other), 0) + 1
+        """Count a sweep; whether the robot would have got the same answer."""
+        row = self.pairs.setdefault(_answer(one), {})
+        row[_answer(other)] = row.get(_answer(other), 0) + 1
         same = _answer(one) == _answer(other)
         self.compared, self.agreed = self.compared + 1, self.agreed + same
         self.total_ms, self.worst_ms = self.total_ms + took_ms, max(self.worst_ms, took_ms)
@@ -98,12 +98,12 @@ class Agreement:
 
 
 def _answer(v: Verdict) -> str:
-    """What a robot goes by: the label, behind the status where that is not ok."""
+    """What a robot acts on: the label, after the status where that is not ok."""
     return v.label if v.status is Status.OK else f"({v.status}) {v.label}".strip()
 
 
 def read(folder: Path) -> Agreement | None:
-    """The agreement that lies in a shadow's folder, None where there is none. Raises FormatError where it is broken."""
+    """The agreement in a shadow's folder, None where there is none. Raises FormatError where it cannot be read."""
     try:
         found = typed(Agreement, json.loads((folder / FILE).read_bytes()))
         if found.schema != 1:
@@ -116,12 +116,12 @@ def read(folder: Path) -> Agreement | None:
 
 
 class Shadow:
-    """Keeper and pulse of a running box: has the candidate judge each sweep by the same rules, and counts.
+    """Sweep and health observer of a running box: lets the candidate judge each sweep by the same rules, and counts.
 
-    current: the bundle in service. folder: where agreement and kept sweeps lie; those of another pair of bundles are
-    taken away. judge: makes a bundle's classifier, as the settings want it. circumstances: what the box tells of itself,
-    its tare among it. log: told when the shadow ends, and once where it cannot write. Raises ApplianceError where the
-    candidate or the folder cannot be used.
+    current: the bundle in service. folder: for agreement and kept sweeps; those of another pair of bundles are removed.
+    judge: makes a bundle's classifier by the settings. circumstances: what the box reports of itself, with its tare.
+    log: gets a line when the candidate is given up, and one when the folder cannot be written. Raises ApplianceError
+    where the candidate or the folder cannot be used.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class Shadow:
                 "cannot serve both; commit to it without a shadow"
             )
         self._clock, self._circumstances, self._log = clock, circumstances, log
-        self._row, self._told = 0, False
+        self._failures_in_row, self._logged = 0, False
         self._waiting: list[tuple[Sweep, Verdict, Mapping[str, Any]]] = []
         self._settled_ns = self._due_ns = clock.now_ns() + PERIOD_NS
         try:
@@ -142,20 +142,20 @@ class Shadow:
             self.agreement = self._begin(candidate.id, current.id)
         except OSError as e:
             raise ApplianceError(f"{folder}: {e.strerror}; see that it has room and may be written") from e
-        try:  # the start is counted by now: the model may kill the program here
-            self._run = judge(candidate)
-            self._run.self_test()
-            self._early = Decider(self._run) if candidate.manifest.early else None
+        try:  # the model may kill the program here, so the start was counted before
+            self._classifier = judge(candidate)
+            self._classifier.self_test()
+            self._early = Decider(self._classifier) if candidate.manifest.early else None
         except ApplianceError:
             self.stopping()
             raise
 
     def __call__(self, sweep: Sweep, verdict: Verdict) -> None:
-        """Have the candidate judge a sweep that has a window; a sweep on which they differ is kept later."""
-        if self._row == FAILURES or not len(sweep.frames):
+        """Let the candidate judge a sweep that has a window; one on which they differ is kept in a later turn."""
+        if self._failures_in_row == FAILURES or not len(sweep.frames):
             return
         about = self._circumstances()
-        self._run.tare = np.asarray(about["tare"], np.float64)
+        self._classifier.tare = np.asarray(about["tare"], np.float64)
         begin_ns = self._clock.now_ns()
         self._due_ns = min(self._due_ns, begin_ns + PERIOD_NS)
         try:
@@ -167,7 +167,7 @@ class Shadow:
         if took_ns > SLOW_NS:
             self._fail(f"it computed {took_ns / 1e6:.0f} ms for a sweep, {SLOW_NS / 1e6:.0f} are allowed")
             return
-        self._row = 0
+        self._failures_in_row = 0
         if other is None:
             self.agreement.later += 1
         elif not self.agreement.add(verdict, other, took_ns / 1e6):
@@ -176,7 +176,7 @@ class Shadow:
                 self._waiting.append((sweep, verdict, {**about, "candidate": other.as_dict()}))
 
     def turn(self, health: Health) -> None:
-        """A turn is over: write one thing that is due, while no sweep is open."""
+        """At the end of a turn: write one thing that is due, while no sweep is open."""
         if health.sweeping:
             return
         if self._waiting:
@@ -185,7 +185,7 @@ class Shadow:
             self._try(self._write)
 
     def stopping(self) -> None:
-        """The loop has ended: write what is left. The present start has ended in order."""
+        """The loop has ended in order: write what is left, and do not count this start."""
         self.agreement.starts = 0
         while self._waiting:
             self._try(self._keep)
@@ -193,7 +193,7 @@ class Shadow:
         self._sweeps.close()
 
     def _begin(self, candidate: str, current: str) -> Agreement:
-        """The agreement that goes on, or a new one; this start counted."""
+        """The agreement to continue, or a new one; with this start counted."""
         try:
             found = read(self._sweeps.folder)
         except FormatError as e:
@@ -216,13 +216,13 @@ class Shadow:
     def _judge(self, sweep: Sweep) -> Verdict | None:
         """The candidate's verdict; None where it would wait for more of the sweep."""
         if sweep.share == 1:
-            return self._run(sweep)
+            return self._classifier(sweep)
         return self._early(sweep) if self._early else None
 
     def _fail(self, why: str) -> None:
         self.agreement.failed += 1
-        self._row += 1
-        if self._row == FAILURES:
+        self._failures_in_row += 1
+        if self._failures_in_row == FAILURES:
             self._log(
                 f"{WARNING}shadow: candidate {self.agreement.candidate} is not asked any more, it failed {FAILURES} times "
                 f"in a row: {why}; classifying goes on"
@@ -242,9 +242,9 @@ class Shadow:
         try:
             act()
         except OSError as e:
-            if not self._told:
+            if not self._logged:
                 self._log(
                     f"{WARNING}shadow: {self._sweeps.folder} cannot be written: {e.strerror}; make room there; "
                     "classifying goes on"
                 )
-            self._told = True
+            self._logged = True

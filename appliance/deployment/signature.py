@@ -1,7 +1,7 @@
-"""Whose bundle it is. In: a manifest, its signature, a file of the signers that the box believes. Out: the signer's name.
+"""Signs and verifies bundles. In: a manifest, its signature, a file of trusted signers. Out: the signer's name.
 
-The work is ssh-keygen's (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its manual): keys and tools that
-people have, none of our own. A manifest names the hash of every other file, so its signature is that of the bundle.
+ssh-keygen does the work (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its manual), with keys and tools
+that people have already. A manifest names the hash of every other file, so its signature covers the whole bundle.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from subprocess import CompletedProcess
 
 NAMESPACE = "palpate-bundle"
-"""What is signed is meant for this alone: a signature for anything else, git say, is none here."""
+"""A signature made for another purpose, git for example, is not accepted here."""
 MOST_SIGNATURE, MOST_SIGNERS = 16 << 10, 256 << 10
 """Bytes. A signature by the longest usual key, RSA of 16,384 bits, takes 6 kB."""
-DEADLINE_S, PATIENCE_S = 10.0, 120.0
+DEADLINE_S, INTERACTIVE_S = 10.0, 120.0
 """For ssh-keygen by itself, some milliseconds on a desktop; and with a person who types a passphrase or touches a key."""
 LINE = re.compile(
     r'[\w.@+-]+[ \t]+(namespaces="[^"]*"[ \t]+)?'
@@ -32,30 +32,31 @@ LINE = re.compile(
     r"[ \t]+(?P<key>[A-Za-z0-9+/]+={0,2})([ \t].*)?",
     re.ASCII,
 )
-"""One name, one key. ssh-keygen allows more: patterns, certificates, and dates, for which a box must know the time."""
-NO_TIME = re.compile(r"valid-after|valid-before|cert-authority", re.IGNORECASE)
+"""A line of the signers' file: one name, one key. ssh-keygen allows more: patterns, certificates, and dates, for which a box
+must know the time."""
+DATED = re.compile(r"valid-after|valid-before|cert-authority", re.IGNORECASE)
 
 
 def verify(message: bytes, signature: bytes, signers: Path) -> str:
-    """The name of the one of `signers` who signed `message` as a bundle's manifest.
+    """The name of the signer, one of `signers`, who signed `message` as a bundle's manifest.
 
-    Raises BundleError where nobody of them did, and ConfigError where the box itself cannot tell: the file of signers is
-    missing, empty or holds a line that is not understood, or ssh-keygen does not do its work.
+    Raises BundleError where none of them did, and ConfigError where this cannot be checked: the file of signers is
+    missing, empty or holds a line that is not understood, or ssh-keygen fails.
     """
     if len(signature) > MOST_SIGNATURE:
         raise BundleError(f"signature has more than {MOST_SIGNATURE} bytes; sign the bundle again")
-    with _lent(_believed(signers)) as allowed, _lent(signature) as signed:
+    with _as_file(_trusted(signers)) as allowed, _as_file(signature) as signed:
         found = _keygen("find-principals", "-f", allowed, "-s", signed)
         names = found.stdout.decode(errors="replace").splitlines()
         if found.returncode or not names:
             raise BundleError(
-                f"bundle is signed by none of those in {signers} ({_said(found)}); sign it with a key that is "
+                f"bundle is signed by none of those in {signers} ({_output(found)}); sign it with a key that is "
                 "there (palpate-train sign), or have the administrator add the key"
             )
         checked = _keygen("verify", "-f", allowed, "-I", names[0], "-n", NAMESPACE, "-s", signed, message=message)
     if checked.returncode:
         raise BundleError(
-            f"signature of {names[0]} does not fit the manifest ({_said(checked)}); copy the bundle again, or sign it "
+            f"signature of {names[0]} does not fit the manifest ({_output(checked)}); copy the bundle again, or sign it "
             "again (palpate-train sign)"
         )
     return names[0]
@@ -66,15 +67,15 @@ def sign(message: bytes, key: Path) -> bytes:
 
     key: a private key, or a public one whose private key an agent holds. Raises ConfigError where it does not sign.
     """
-    done = _keygen("sign", "-f", str(key), "-n", NAMESPACE, "-q", message=message, asks=True)
+    done = _keygen("sign", "-f", str(key), "-n", NAMESPACE, "-q", message=message, interactive=True)
     if done.returncode or not done.stdout:
         raise ConfigError(f"{key} does not sign; name a key of yours, or make one with ssh-keygen -t ed25519")
     return bytes(done.stdout)
 
 
-def _believed(signers: Path) -> bytes:
-    """The content of the file of signers, each line of it understood: one that ssh-keygen passed over would be believed in
-    vain. Raises ConfigError."""
+def _trusted(signers: Path) -> bytes:
+    """The content of the file of signers, with each line checked: ssh-keygen would skip one that it does not understand
+    without a word. Raises ConfigError."""
     try:
         with signers.open("rb") as f:
             data = f.read(MOST_SIGNERS + 1)
@@ -83,19 +84,19 @@ def _believed(signers: Path) -> bytes:
         raise ConfigError(f"{signers} cannot be read: {e}; put a line `NAME KEY` there for each who signs") from e
     if len(data) > MOST_SIGNERS:
         raise ConfigError(f"{signers} has more than {MOST_SIGNERS} bytes; keep one line for each who signs")
-    held = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    if not held:
+    entries = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    if not entries:
         raise ConfigError(f"{signers} names nobody, so no bundle can be believed; put a line `NAME KEY` there")
-    for n, line in held:
+    for n, line in entries:
         if not _is_signer(line):
-            dated = NO_TIME.search(line)
+            dated = DATED.search(line)
             why = f"{dated[0]} is not used here, a box may not know the time" if dated else "it is not understood"
             raise ConfigError(f"{signers}, line {n}: {why}; write NAME ssh-ed25519 AAAA..., the rest as in a .pub file")
     return data
 
 
 def _is_signer(line: str) -> bool:
-    """Whether a line is a name with a key that is what it says."""
+    """Whether a line is a name and a key of the kind that it names."""
     found = LINE.fullmatch(line)
     if not found:
         return False
@@ -108,8 +109,8 @@ def _is_signer(line: str) -> bool:
 
 
 @contextmanager
-def _lent(data: bytes) -> Iterator[str]:
-    """`data` as a file that a child can open: in memory, so that it reads what was looked at here, and no disk is needed."""
+def _as_file(data: bytes) -> Iterator[str]:
+    """Path of a file in memory with `data`, which a child can open: it reads what was checked here, and no disk is needed."""
     at = os.memfd_create("palpate", 0)  # children inherit it
     try:
         os.write(at, data)
@@ -118,22 +119,22 @@ def _lent(data: bytes) -> Iterator[str]:
         os.close(at)
 
 
-def _keygen(does: str, *options: str, message: bytes = b"", asks: bool = False) -> CompletedProcess[bytes]:
-    """What ssh-keygen says to `message`. asks: it may have something to ask of a person. Raises ConfigError."""
+def _keygen(action: str, *options: str, message: bytes = b"", interactive: bool = False) -> CompletedProcess[bytes]:
+    """Run `ssh-keygen -Y action` on `message`. interactive: it may ask a person on the terminal. Raises ConfigError."""
     import subprocess  # 200 kB, and only where a bundle was deployed
 
     try:
         return subprocess.run(
-            ["ssh-keygen", "-Y", does, *options], input=message, timeout=PATIENCE_S if asks else DEADLINE_S,
-            stdout=subprocess.PIPE, stderr=None if asks else subprocess.PIPE, close_fds=False, check=False,
+            ["ssh-keygen", "-Y", action, *options], input=message, timeout=INTERACTIVE_S if interactive else DEADLINE_S,
+            stdout=subprocess.PIPE, stderr=None if interactive else subprocess.PIPE, close_fds=False, check=False,
         )  # fmt: skip
     except FileNotFoundError as e:
         raise ConfigError("ssh-keygen is missing, so no signature can be checked: apt install openssh-client") from e
     except (OSError, subprocess.TimeoutExpired) as e:
-        raise ConfigError(f"ssh-keygen cannot be asked: {e}; try `ssh-keygen -Y {does}` by hand") from e
+        raise ConfigError(f"ssh-keygen cannot be asked: {e}; try `ssh-keygen -Y {action}` by hand") from e
 
 
-def _said(done: CompletedProcess[bytes]) -> str:
-    """What ssh-keygen said, in one line."""
+def _output(done: CompletedProcess[bytes]) -> str:
+    """The error output of ssh-keygen, in one line."""
     text = b" ".join((done.stderr or b"").split()).decode(errors="replace")
     return text[:200] or f"ssh-keygen ended with {done.returncode}"

@@ -1,41 +1,112 @@
 """What the box runs. In: bundles that were copied to it. Out: the one for this start, old or new, whole at every moment.
 
-In the store's folder, `bundles/SHA/` are whole, verified bundles (shelf), the symlink `current` says which of them runs
-(none: the packaged one), and `ledger.json` all else. Each step is one renaming, of a file, a folder or the link, and
-what it relies on is on the disk before:
+In the store's folder, `bundles/SHA/` are whole, verified bundles, the symlink `current` names the one that runs (missing:
+the packaged one), and `ledger.json` holds all else (StoreState). Each step is one atomic rename of a file, a folder or
+the link, and what the step relies on is on the disk before:
 
-- install: the bundle's folder takes its name; the ledger gets its standing, on trial and with what it goes back to; then
-  `current` leads to it. The standing of what was current stays as it was, and holds if the power goes in between.
-- choose, at each start: the ledger counts the start before the bundle is touched.
-- commit: the ledger, with the end of the trial and the new least counter in one.
-- going back: the ledger, where the trial's starts are used up, or the way forward again is kept; then `current`.
+- install: the bundle's folder gets its name; its state is written, on trial and with the bundle to go back to; then
+  `current` leads to it. The state of the bundle that was current is unchanged, and holds if the power goes in between.
+- choose, at each start: the start is counted before the bundle is touched.
+- commit: the end of the trial and the new least counter are one write.
+- going back: the state first, with the trial's starts used up or the way forward again kept; then `current`.
 
-So whoever reads the link first and the ledger then needs no lock. Whoever changes them holds one on the folder.
+So a reader that reads first the link and then the state needs no lock. A writer holds one on the folder.
 """
 
 from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Callable, Iterator
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from appliance import __version__
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
+from appliance.bundle.manifest import version
 from appliance.core import storage
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, BundleError, ConfigError
-from appliance.deployment.sandbox import apart
-from appliance.deployment.shelf import SHA, Shelf, Signed
+from appliance.deployment import signature
+from appliance.deployment.sandbox import run_limited
 from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
 from appliance.deployment.trial import Trial
 from appliance.service.journal import WARNING
 
+SHA = re.compile(r"[0-9a-f]{64}")
+INCOMPLETE = "."
+"""First character of a folder's name while it is being written or removed."""
 LOCK_S, STEP_NS = 10.0, 20_000_000
-"""How long another command is waited for, some fsyncs long on a slow card; and how often it is looked for."""
+"""How long to wait for another command, which takes some fsyncs on a slow card; and how often to try."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignedBundle:
+    """A bundle and who signed it, with its files as they were checked."""
+
+    bundle: Bundle
+    signer: str
+    files: Mapping[str, bytes]
+
+    @property
+    def sha(self) -> str:
+        """The sha256 of its manifest."""
+        return bundle.digest(self.files[bundle.MANIFEST])
+
+
+class BundleFolder:
+    """Whole, verified bundles in `folder`, each under the sha256 of its manifest. signers: the file of trusted signers."""
+
+    def __init__(self, folder: Path, signers: Path) -> None:
+        self.folder, self._signers = folder, signers
+
+    def at(self, sha: str) -> Path:
+        """The folder of a bundle."""
+        return self.folder / sha
+
+    def read(self, folder: Path) -> SignedBundle:
+        """The bundle in any `folder`, checked but not run. Raises BundleError, and ConfigError as signature.verify."""
+        files = bundle.files(folder)
+        if bundle.SIGNATURE not in files:
+            raise BundleError(f"{folder} is not signed; sign the bundle (palpate-train sign)")
+        signer = signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers)
+        loaded = bundle.made(files, str(folder))
+        if version(loaded.manifest.runtime) > version(__version__):
+            raise BundleError(
+                f"bundle needs palpate {loaded.manifest.runtime} and this is {__version__}; update the box (make install)"
+            )
+        return SignedBundle(loaded, signer, files)
+
+    def get(self, sha: str) -> SignedBundle:
+        """The bundle `sha`, checked again. Raises BundleError where another one is in its place."""
+        signed = self.read(self.at(sha))
+        if signed.sha != sha:
+            raise BundleError(f"{self.at(sha)} holds another bundle, {signed.bundle.id}; deploy the right one again")
+        return signed
+
+    def put(self, signed: SignedBundle) -> None:
+        """Write a bundle, whole or not at all. Raises OSError."""
+        folder = self.at(signed.sha)
+        if folder.exists() and _holds(folder, signed.files):
+            storage.sync(self.folder)  # whoever renamed it may have been killed before this
+            return
+        with storage.folder(folder) as new:
+            for name, data in signed.files.items():
+                (new / name).write_bytes(data)
+
+    def keep(self, *kept: str) -> None:
+        """Remove all other bundles, and what an interruption left. A bundle is renamed before its files are removed."""
+        for folder in sorted(self.folder.iterdir()):  # incomplete ones first
+            if folder.name in kept:
+                continue
+            if not folder.name.startswith(INCOMPLETE):
+                folder = folder.rename(folder.with_name(INCOMPLETE + folder.name))
+            shutil.rmtree(folder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,211 +119,218 @@ class Choice:
 
 
 class Store:
-    """The store at work.
+    """The bundles on this box and which of them runs.
 
     prove: raises where this machine does not run a bundle as it should: golden sweeps, and whether it fits the settings.
-    Its methods raise OSError for trouble with the disk, BundleError for what is not to be run, ConfigError where the
-    settings leave no way to tell whom to believe, and ApplianceError where another command is in the way.
+    The methods raise OSError for trouble with the disk, BundleError for a bundle that must not run, ConfigError where
+    the settings name no trusted signers, and ApplianceError where another command holds the lock.
     """
 
-    def __init__(self, how: StoreConfig, prove: Callable[[Bundle], object], clock: Clock | None = None) -> None:
-        self.how, self.folder, self._prove = how, Path(how.folder), prove
-        self.shelf = Shelf(self.folder / "bundles", Path(how.signers))
-        self._link, self._book = self.folder / "current", self.folder / "ledger.json"
+    def __init__(self, settings: StoreConfig, prove: Callable[[Bundle], object], clock: Clock | None = None) -> None:
+        self.settings, self.folder, self._prove = settings, Path(settings.folder), prove
+        self.bundles = BundleFolder(self.folder / "bundles", Path(settings.signers))
+        self._link, self._state_file = self.folder / "current", self.folder / "ledger.json"
         self._clock = clock or SystemClock()
 
     @property
     def current(self) -> str:
-        """What `current` leads to, PACKAGED where it is not there."""
+        """The bundle that `current` leads to, PACKAGED where there is no such link."""
         try:
             target = os.readlink(self._link)
         except FileNotFoundError:
             return PACKAGED
-        place, _, sha = target.partition("/")
-        if place != self.shelf.folder.name or not SHA.fullmatch(sha):
+        parent, _, sha = target.partition("/")
+        if parent != self.bundles.folder.name or not SHA.fullmatch(sha):
             raise BundleError(f"{self._link} leads to {target!r}, which is no bundle of the store; remove this link")
         return sha
 
     @property
-    def ledger(self) -> StoreState:
+    def state(self) -> StoreState:
         """What is known of the bundles; empty where nothing was ever deployed."""
         try:
-            return StoreState.parse(self._book.read_bytes())
+            return StoreState.parse(self._state_file.read_bytes())
         except FileNotFoundError:
             return StoreState()
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
             raise BundleError(
-                f"{self._book} cannot be read: {e}; without this file the current bundle counts as committed, and any "
+                f"{self._state_file} cannot be read: {e}; without this file the current bundle counts as committed, and any "
                 "counter is taken: remove it if you can vouch for both"
             ) from e
 
-    def examine(self, folder: Path) -> Signed:
+    def examine(self, folder: Path) -> SignedBundle:
         """The bundle in `folder`, checked in every way but its counter; nothing is changed."""
-        held = self.shelf.read(folder)
-        apart(lambda: self._prove(held.bundle))
-        return held
+        signed = self.bundles.read(folder)
+        run_limited(lambda: self._prove(signed.bundle))
+        return signed
 
     def install(self, incoming: Path, shadow: bool = False) -> str:
-        """Take the bundle in `incoming` and have it run from the next start on, on trial; its sha256.
+        """Install the bundle in `incoming`, so that it runs on trial from the next start on; its sha256.
 
-        shadow: it becomes the candidate instead. What else lies in `incoming` is not looked at. The folder may be
-        another's, who changes it meanwhile: what was checked is what is written, and it is read once.
+        shadow: it becomes the candidate instead. Other files in `incoming` are ignored. Somebody else may own the folder
+        and change it meanwhile: the files are read once, and what was checked is what is written.
         """
-        held = self.examine(incoming)
-        self.shelf.folder.mkdir(parents=True, exist_ok=True)
-        with self._held() as ledger:
-            ledger.admit(held.sha, held.bundle.manifest.counter)
-            needed = (held.sha, *ledger.chain(self.current), ledger.candidate)
-            self.shelf.keep(*needed)
-            self.shelf.put(held)
-            ledger = ledger.only(*needed)
+        signed = self.examine(incoming)
+        self.bundles.folder.mkdir(parents=True, exist_ok=True)
+        with self._locked() as state:
+            state.admit(signed.sha, signed.bundle.manifest.counter)
+            needed = (signed.sha, *state.chain(self.current), state.candidate)
+            self.bundles.keep(*needed)
+            self.bundles.put(signed)
+            state = state.only(*needed)
             if shadow:
-                self._put(replace(ledger, candidate=held.sha))
+                self._write(replace(state, candidate=signed.sha))
             else:
-                self._activate(held, ledger)
-        return held.sha
+                self._activate(signed, state)
+        return signed.sha
 
     def promote(self) -> str:
-        """Have the candidate run from the next start on, on trial; its sha256."""
-        sha = self.ledger.candidate
+        """Make the candidate run on trial from the next start on; its sha256."""
+        sha = self.state.candidate
         if sha == PACKAGED:
             raise BundleError("there is no candidate; deploy one with SHADOW=1 (palpate install --shadow)")
-        held = self.shelf.get(sha)
-        with self._held() as ledger:
-            ledger.admit(sha, held.bundle.manifest.counter)
-            self._activate(held, ledger)
+        signed = self.bundles.get(sha)
+        with self._locked() as state:
+            state.admit(sha, signed.bundle.manifest.counter)
+            self._activate(signed, state)
         return sha
 
     def candidate(self) -> Bundle | None:
-        """The bundle that is to classify beside the current one, checked."""
-        sha = self.ledger.candidate
-        return None if sha == PACKAGED else self.shelf.get(sha).bundle
+        """The bundle that is to classify beside the current one, checked; None where there is none."""
+        sha = self.state.candidate
+        return None if sha == PACKAGED else self.bundles.get(sha).bundle
 
     def running(self) -> Bundle:
-        """The current bundle, checked. No start is counted."""
-        return self._settled(self.current).bundle
+        """The current bundle, checked. This counts no start."""
+        return self._committed(self.current).bundle
 
     def choose(self, log: Callable[[str], None]) -> Choice:
-        """What this start runs, checked. A bundle on trial that was started MOST_STARTS times, or is refused, is left for
-        what it goes back to."""
+        """What this start runs, checked. A bundle on trial that was started MOST_STARTS times, or is refused, gives way
+        to the bundle it goes back to."""
         sha = self.current
-        if self.ledger.of(sha).committed:
-            return self._settled(sha)
+        if self.state.of(sha).committed:
+            return self._committed(sha)
         try:
             why = self._count(sha)
             if not why:
                 try:
-                    return self._tried(sha, log)
+                    return self._on_trial(sha, log)
                 except BundleError as e:
                     why = str(e)
-            self._leave(sha, why)
+            self._go_back(sha, why)
         except OSError as e:
             log(f"{WARNING}{self.folder}: {e.strerror}, so no bundle can be on trial; what was committed runs for now")
-            return self._settled(self.ledger.of(sha).previous)
-        chosen = self._settled(self.current)
+            return self._committed(self.state.of(sha).previous)
+        chosen = self._committed(self.current)
         log(f"{WARNING}bundle {sha[:8]} has failed its trial, and {chosen.bundle.id} runs again: {why}")
         return chosen
 
     def commit(self, sha: str | None = None, wait_s: float = LOCK_S) -> bool:
-        """End the trial of the current bundle, where it is `sha` (None: any) and on trial; whether it was."""
-        with self._held(wait_s) as ledger:
+        """End the trial of the current bundle, if that is `sha` (None: any) and on trial; whether it was."""
+        with self._locked(wait_s) as state:
             now = self.current
-            if ledger.of(now).committed or sha not in (None, now):
+            if state.of(now).committed or sha not in (None, now):
                 return False
-            self._put(ledger.committed(now))
+            self._write(state.committed(now))
         return True
 
     def rollback(self) -> str:
-        """Go back to what was committed before, from the next start on; its sha256 or PACKAGED. A second time goes
-        forward again, but never to what did not stand its trial."""
-        with self._held() as ledger:
+        """Go back to the bundle that was committed before, from the next start on; its sha256 or PACKAGED. Going back
+        twice returns to the first one, unless that had failed its trial."""
+        with self._locked() as state:
             sha = self.current
-            standing = ledger.of(sha)
+            standing = state.of(sha)
             back = standing.previous
-            if back == sha or not ledger.of(back).committed:
+            if back == sha or not state.of(back).committed:
                 raise BundleError("there is no committed bundle to go back to; deploy one")
             if back != PACKAGED:
-                self.shelf.get(back)
-            self._put(ledger.exchanged(sha) if standing.committed else ledger.left(sha, "rolled back by hand"))
-            self._point(back)
+                self.bundles.get(back)
+            self._write(state.exchanged(sha) if standing.committed else state.left(sha, "rolled back by hand"))
+            self._set_current(back)
         return back
 
     def note(self, sha: str, starts: int, sweeps: int, streamed_s: float) -> None:
-        """Write down how far the trial of `sha` has come, at once; ApplianceError where another command is at work."""
-        with self._held(0.0) as ledger:
-            self._put(ledger.changed(sha, starts=starts, sweeps=sweeps, streamed_s=round(streamed_s, 1)))
+        """Write down how far the trial of `sha` has come. Does not wait: ApplianceError where another command is at work."""
+        with self._locked(0.0) as state:
+            self._write(state.changed(sha, starts=starts, sweeps=sweeps, streamed_s=round(streamed_s, 1)))
 
-    def _settled(self, sha: str) -> Choice:
+    def _committed(self, sha: str) -> Choice:
         """A committed bundle for this start."""
         if sha == PACKAGED:
             return Choice(bundle.load(bundle.DEFAULT), bundle.DEFAULT, None)
         try:
-            return Choice(self.shelf.get(sha).bundle, self.shelf.at(sha), None)
+            return Choice(self.bundles.get(sha).bundle, self.bundles.at(sha), None)
         except BundleError as e:
             raise BundleError(f"{e} (this bundle is committed; `palpate rollback` goes back to the one before)") from e
 
-    def _tried(self, sha: str, log: Callable[[str], None]) -> Choice:
+    def _on_trial(self, sha: str, log: Callable[[str], None]) -> Choice:
         """A bundle on trial for this start, which was counted."""
-        found = self.shelf.get(sha).bundle
+        loaded = self.bundles.get(sha).bundle
         try:
-            self._prove(found)
+            self._prove(loaded)
         except ConfigError as e:
             raise BundleError(f"it does not fit the settings: {e}") from e
-        standing = self.ledger.of(sha)
+        standing = self.state.of(sha)
         log(f"bundle {sha[:8]} is on trial, start {standing.starts} of {MOST_STARTS}")
-        return Choice(found, self.shelf.at(sha), Trial(self, sha, standing, log))
+        return Choice(loaded, self.bundles.at(sha), Trial(self, sha, standing, log))
 
     def _count(self, sha: str) -> str:
-        """Count a start of `sha`, or say why there is to be none."""
-        with self._held() as ledger:
-            standing = ledger.of(sha)
+        """Count a start of `sha`; the reason where it must not be started again, else ""."""
+        with self._locked() as state:
+            standing = state.of(sha)
             if standing.starts >= MOST_STARTS:
                 return standing.why or f"it was started {MOST_STARTS} times without being committed"
-            self._put(ledger.changed(sha, starts=standing.starts + 1))
+            self._write(state.changed(sha, starts=standing.starts + 1))
         return ""
 
-    def _leave(self, sha: str, why: str) -> None:
-        """Have what `sha` goes back to run instead."""
-        with self._held() as ledger:
+    def _go_back(self, sha: str, why: str) -> None:
+        """Let the bundle that `sha` goes back to run instead."""
+        with self._locked() as state:
             if self.current == sha:
-                self._put(ledger.left(sha, why))
-                self._point(ledger.of(sha).previous)
+                self._write(state.left(sha, why))
+                self._set_current(state.of(sha).previous)
 
-    def _activate(self, held: Signed, ledger: StoreState) -> None:
-        self._put(ledger.activated(held.sha, held.bundle.manifest.counter, self.current))
-        self._point(held.sha)
+    def _activate(self, signed: SignedBundle, state: StoreState) -> None:
+        self._write(state.activated(signed.sha, signed.bundle.manifest.counter, self.current))
+        self._set_current(signed.sha)
 
-    def _put(self, ledger: StoreState) -> None:
-        storage.put(self._book, ledger.json())
+    def _write(self, state: StoreState) -> None:
+        storage.put(self._state_file, state.json())
 
-    def _point(self, sha: str) -> None:
-        """Have `current` lead to a bundle, in one step."""
+    def _set_current(self, sha: str) -> None:
+        """Make `current` lead to a bundle, in one step."""
         if sha != PACKAGED:
-            storage.link(self._link, f"{self.shelf.folder.name}/{sha}")
+            storage.link(self._link, f"{self.bundles.folder.name}/{sha}")
         else:
             self._link.unlink(missing_ok=True)
             storage.sync(self.folder)
 
     @contextmanager
-    def _held(self, wait_s: float = LOCK_S) -> Iterator[StoreState]:
-        """The ledger, while nobody else changes it."""
-        door = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
+    def _locked(self, wait_s: float = LOCK_S) -> Iterator[StoreState]:
+        """The state, while no other command can change it."""
+        folder = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
-            if (owner := os.fstat(door).st_uid) != os.geteuid():
+            if (owner := os.fstat(folder).st_uid) != os.geteuid():
                 raise ConfigError(f"{self.folder} belongs to user {owner}; do this as that user (sudo -u palpate ...)")
             end_ns = self._clock.now_ns() + round(wait_s * 1e9)
-            while not _locked(door):
+            while not _try_lock(folder):
                 if self._clock.now_ns() >= end_ns:
                     raise ApplianceError(f"{self.folder} is in use by another command; try again when that has ended")
                 self._clock.sleep_until(self._clock.now_ns() + STEP_NS)
-            yield self.ledger
+            yield self.state
         finally:
-            os.close(door)
+            os.close(folder)
 
 
-def _locked(door: int) -> bool:
+def _holds(folder: Path, files: Mapping[str, bytes]) -> bool:
     try:
-        fcntl.flock(door, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return bundle.files(folder) == files
+    except BundleError:
+        return False
+
+
+def _try_lock(folder: int) -> bool:
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True

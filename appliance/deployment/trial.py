@@ -1,37 +1,51 @@
-"""A bundle on trial. In: how the box is, turn by turn, and its verdicts. Out: the ledger, so that a start which goes wrong
-is known at the next one, and the commit once enough went well.
+"""A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store is told to record: starts that
+count against the bundle, its progress, and the commit once enough went well.
 
-A start counts against the bundle from `choose` on. It does not while the skin is away, and not once the program ends in
-order or for want of a device: none of this is the bundle's doing.
+`Store.choose` counts a start before the bundle is touched. The start is not held against the bundle while the skin is away,
+nor when the program ends in order or for want of a device.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from appliance.core.errors import ApplianceError, BundleError
 from appliance.service.journal import WARNING
 
 if TYPE_CHECKING:
+    from appliance.core.config import StoreConfig
     from appliance.core.health import Health
     from appliance.core.types import Verdict
     from appliance.deployment.state import Standing
-    from appliance.deployment.store import Store
 
 RETRY_NS = 10_000_000_000
-"""How long a disk that took no note is left alone."""
+"""After a write that failed, the disk is left alone for so long."""
+
+
+class TrialStore(Protocol):
+    """What a trial asks of the store. Both methods raise OSError or ApplianceError where nothing could be written."""
+
+    @property
+    def settings(self) -> StoreConfig:
+        """How many sweeps and seconds a trial lasts."""
+
+    def note(self, sha: str, starts: int, sweeps: int, streamed_s: float) -> None:
+        """Write down how far the trial of `sha` has come."""
+
+    def commit(self, sha: str | None, wait_s: float) -> bool:
+        """End the trial of `sha`; whether it was on trial."""
 
 
 class Trial:
-    """Watches over one bundle's trial: a pulse, a sink for verdicts, and around both a context.
+    """Observes one bundle's trial: health observer, sink for verdicts, and a context around both.
 
-    standing: as it is with this start counted. Never raises for the disk: what cannot be written is told once and tried
-    again later, and the classifying goes on.
+    standing: with this start counted. Never raises for the disk: a failed write is logged once and tried again after
+    RETRY_NS, and classifying goes on.
     """
 
-    def __init__(self, store: Store, sha: str, standing: Standing, log: Callable[[str], None]) -> None:
+    def __init__(self, store: TrialStore, sha: str, standing: Standing, log: Callable[[str], None]) -> None:
         self._store, self._sha, self._log = store, sha, log
         self._starts, self._counted = standing.starts, True
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
@@ -40,13 +54,13 @@ class Trial:
 
     @property
     def text(self) -> str:
-        """How far it is, for a person; "" once it is over."""
+        """How far the trial is, for a person; "" once it is over."""
         if self._over:
             return ""
-        how = self._store.how
+        settings = self._store.settings
         return (
-            f"on trial: {self._sweeps} of {how.trial_sweeps} sweeps, "
-            f"{self._streamed_ns / 1e9:.0f} of {how.trial_s:.0f} s"
+            f"on trial: {self._sweeps} of {settings.trial_sweeps} sweeps, "
+            f"{self._streamed_ns / 1e9:.0f} of {settings.trial_s:.0f} s"
         )
 
     def send(self, verdict: Verdict) -> None:
@@ -54,13 +68,13 @@ class Trial:
         self._sweeps += bool(verdict.label)
 
     def turn(self, health: Health) -> None:
-        """Count the time that the skin streams; write down what is new, or that it is enough."""
+        """Add the time that the skin streams; record what has changed, or commit where it is enough."""
         if self._over:
             return
         if health.streams and self._last_ns is not None:
             self._streamed_ns += health.time_ns - self._last_ns
         self._last_ns = health.time_ns if health.streams else None
-        if health.time_ns >= self._next_ns and not self._written(health):
+        if health.time_ns >= self._next_ns and not self._record(health):
             self._next_ns = health.time_ns + RETRY_NS
 
     def stopping(self) -> None:
@@ -72,14 +86,14 @@ class Trial:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """What ends the program without being the bundle's doing: hardware and settings that it was not started for."""
-        if kind is None or not issubclass(kind, Exception) or _is_of_the_box(error):
+        """An error of hardware or settings does not count against the bundle, nor does a signal; any other does."""
+        if kind is None or not issubclass(kind, Exception) or _is_hardware_or_settings(error):
             self.stopping()
 
-    def _written(self, health: Health) -> bool:
-        """Whether the ledger holds what it should; a sweep that is open is not disturbed for the commit."""
-        how = self._store.how
-        if self._sweeps >= how.trial_sweeps or self._streamed_ns >= how.trial_s * 1e9:
+    def _record(self, health: Health) -> bool:
+        """Whether the store knows all it should. A commit waits until no sweep is open."""
+        settings = self._store.settings
+        if self._sweeps >= settings.trial_sweeps or self._streamed_ns >= settings.trial_s * 1e9:
             return health.sweeping or self._try(self._commit)
         return health.streams == self._counted or self._try(lambda: self._note(health.streams))
 
@@ -89,20 +103,20 @@ class Trial:
         self._counted = counts
 
     def _commit(self) -> None:
-        done = self._store.commit(self._sha, wait_s=0.0)
+        done = self._store.commit(self._sha, 0.0)
         self._over = True
         if done:
             self._log(f"bundle {self._sha[:8]} has stood its trial and is committed")
 
     def _try(self, write: Callable[[], None]) -> bool:
-        """Whether it could be written."""
+        """Whether it could be written; a reason is logged once, until a write succeeds or the reason changes."""
         try:
             write()
         except (OSError, ApplianceError) as e:
             trouble = str(getattr(e, "strerror", None) or e)
             if trouble != self._trouble:
                 self._log(
-                    f"{WARNING}trial of bundle {self._sha[:8]}: the ledger cannot be written: {trouble}; it is tried again"
+                    f"{WARNING}trial of bundle {self._sha[:8]}: ledger.json cannot be written: {trouble}; it is tried again"
                 )
             self._trouble = trouble
             return False
@@ -110,5 +124,5 @@ class Trial:
         return True
 
 
-def _is_of_the_box(error: BaseException | None) -> bool:
+def _is_hardware_or_settings(error: BaseException | None) -> bool:
     return isinstance(error, ApplianceError) and not isinstance(error, BundleError)

@@ -21,7 +21,7 @@ from appliance.bundle.manifest import SCHEMA
 from appliance.cli.main import main
 from appliance.core import storage
 from appliance.deployment import signature
-from appliance.deployment.shelf import SHA
+from appliance.deployment.store import SHA
 from appliance.deployment.trial import Trial
 from tests.cuts.calls import DEADLINE_S, NotFollowed
 from tests.cuts.scene import CutScene, Found, SceneStep

@@ -111,7 +111,7 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
     told = types.sidecar(path)
     assert (told["verdict"]["label"], told["candidate"]["label"]) == ("a", "b")
     assert fmt == toy_bundle.FORMAT
-    for name, run in (("verdict", pair.current), ("candidate", pair.shadow._run)):
+    for name, run in (("verdict", pair.current), ("candidate", pair.shadow._classifier)):
         assert run(again).scores.tolist() == told[name]["scores"]
     written = pair.written()
     assert (written.compared, written.agreed, written.kept, written.pairs) == (1, 0, 1, {"a": {"b": 1}})
@@ -214,7 +214,7 @@ def strange() -> None:
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side):
     """Three failures in a row: told once, not asked any more; a success between begins the row anew."""
     pair = side()
-    pair.shadow._run = Broken(pair.shadow._run, lambda s: s.id != 3, strange)
+    pair.shadow._classifier = Broken(pair.shadow._classifier, lambda s: s.id != 3, strange)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 10)))
     found = pair.shadow.agreement
     assert (found.compared, found.failed) == (1, 5)
@@ -230,7 +230,7 @@ def test_a_candidate_that_is_too_slow_has_failed(side):
     """A tenth of a second is the most that frames may wait."""
     pair = side()
     slow = lambda: pair.clock.sleep_until(pair.clock.now_ns() + SECOND // 5)  # noqa: E731
-    pair.shadow._run = Broken(pair.shadow._run, lambda s: True, slow)
+    pair.shadow._classifier = Broken(pair.shadow._classifier, lambda s: True, slow)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
     assert (pair.shadow.agreement.compared, pair.shadow.agreement.failed) == (0, 3)
     assert "it computed 200 ms for a sweep, 100 are allowed" in pair.log[0]

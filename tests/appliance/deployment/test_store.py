@@ -116,11 +116,11 @@ def test_deploying_again_what_runs_changes_nothing(box: Delivery):
     """A committed bundle stays committed; one on trial gets its three starts anew."""
     one = box.committed(1)
     assert box.installed(1) == one
-    assert box.store.ledger.of(one).committed
+    assert box.store.state.of(one).committed
     two = box.installed(2)
     box.start()
     assert box.installed(2) == two
-    assert (box.store.ledger.of(two).starts, box.store.ledger.of(two).previous) == (0, one)
+    assert (box.store.state.of(two).starts, box.store.state.of(two).previous) == (0, one)
 
 
 def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
@@ -128,8 +128,8 @@ def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
     one, two = box.committed(1), box.installed(2)
     assert box.installed(1) == one
     assert box.store.current == one
-    assert box.store.ledger.of(one).committed
-    assert not box.store.ledger.of(two).committed
+    assert box.store.state.of(one).committed
+    assert not box.store.state.of(two).committed
 
 
 def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
@@ -217,12 +217,12 @@ BAD: dict[str, tuple[Ways, str]] = {
 def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
     """Refused with its reason; the current bundle, the ledger and the folder of bundles are as before."""
     one = PACKAGED if name == "never counted" else box.committed(1)  # which is also below that one
-    before = box.store.ledger
+    before = box.store.state
     make, why = BAD[name]
     with pytest.raises(BundleError, match=why):
         box.store.install(make(box))
-    assert (box.store.current, box.store.ledger) == (one, before)
-    assert [p.name for p in box.store.shelf.folder.glob("*")] == [one] * bool(one)
+    assert (box.store.current, box.store.state) == (one, before)
+    assert [p.name for p in box.store.bundles.folder.glob("*")] == [one] * bool(one)
 
 
 def test_what_else_lies_there_is_not_taken(box: Delivery):
@@ -231,7 +231,7 @@ def test_what_else_lies_there_is_not_taken(box: Delivery):
     (folder / "extra").write_bytes(b"x")
     sha = box.store.install(folder)
     names = {bundle.MANIFEST, bundle.SIGNATURE, bundle.MODEL, bundle.GOLDEN, bundle.MEANS}
-    assert {p.name for p in box.store.shelf.at(sha).iterdir()} <= names
+    assert {p.name for p in box.store.bundles.at(sha).iterdir()} <= names
 
 
 def test_what_was_checked_is_what_is_written(box: Delivery):
@@ -244,7 +244,7 @@ def test_what_was_checked_is_what_is_written(box: Delivery):
 
     changing = store.Store(box.how, change)
     sha = changing.install(folder)
-    assert box.store.shelf.get(sha).sha == sha
+    assert box.store.bundles.get(sha).sha == sha
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,7 @@ def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: D
     """Its files have rotted, or the golden sweeps differ, or it does not fit the settings: what was before runs."""
     one = box.committed(1)
     two = box.installed(2)
-    (box.store.shelf.at(two) / bundle.MODEL).write_bytes(b"rotten")
+    (box.store.bundles.at(two) / bundle.MODEL).write_bytes(b"rotten")
     assert box.start() == one
     assert "was altered" in box.logged[-1]
     for counter, error in ((3, BundleError("golden sweeps differ")), (4, ConfigError("no early heads"))):
@@ -296,7 +296,7 @@ def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: D
 def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
     """Nothing is guessed: the error names the way back, and that way works."""
     one, two = box.committed(1), box.committed(2)
-    shutil.rmtree(box.store.shelf.at(two))
+    shutil.rmtree(box.store.bundles.at(two))
     with pytest.raises(BundleError, match="committed; `palpate rollback` goes back"):
         box.start()
     assert box.store.rollback() == one == box.start()
@@ -305,8 +305,8 @@ def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
 def test_another_bundle_in_a_bundles_place_is_refused(box: Delivery):
     """Whole and signed as it is, it is not the one that the link names."""
     one, two = box.committed(1), box.committed(2)
-    shutil.rmtree(box.store.shelf.at(two))
-    shutil.copytree(box.store.shelf.at(one), box.store.shelf.at(two))
+    shutil.rmtree(box.store.bundles.at(two))
+    shutil.copytree(box.store.bundles.at(one), box.store.bundles.at(two))
     with pytest.raises(BundleError, match="holds another bundle"):
         box.start()
 
@@ -314,20 +314,20 @@ def test_another_bundle_in_a_bundles_place_is_refused(box: Delivery):
 def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
     """Also the current one: its folder is exchanged for a whole one."""
     one = box.committed(1)
-    (box.store.shelf.at(one) / bundle.MODEL).write_bytes(b"rotten")
+    (box.store.bundles.at(one) / bundle.MODEL).write_bytes(b"rotten")
     assert [e.role for e in bundle_list.entries(box.store)] == ["previous", "damaged"]
     assert box.installed(1) == one == box.start()
-    assert os.listdir(box.store.shelf.folder) == [one]
+    assert os.listdir(box.store.bundles.folder) == [one]
 
 
 def test_leftovers_and_old_bundles_go_at_the_next_accept(box: Delivery):
     """What an interruption left, and bundles that nothing goes back to."""
     shas = [box.committed(n) for n in range(1, 5)]
-    left = box.store.shelf.folder / f".{shas[0]}-abc"
+    left = box.store.bundles.folder / f".{shas[0]}-abc"
     left.mkdir()
     (left / "model.onnx").write_bytes(b"half")
     five = box.installed(5)
-    assert set(os.listdir(box.store.shelf.folder)) == {five, *shas[2:]} == set(box.store.ledger.standings)
+    assert set(os.listdir(box.store.bundles.folder)) == {five, *shas[2:]} == set(box.store.state.standings)
     assert box.store.rollback() == shas[3]
     assert box.store.rollback() == shas[2]
 
@@ -356,7 +356,7 @@ def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
     """Another one is waited for, not for ever; and nobody but the folder's owner changes it."""
     monkeypatch.setattr(store, "LOCK_S", 0.1)
     box.installed(1)
-    with box.store._held(), pytest.raises(ApplianceError, match="in use by another command"):
+    with box.store._locked(), pytest.raises(ApplianceError, match="in use by another command"):
         store.Store(box.how, lambda b: None).commit(wait_s=0.1)
     monkeypatch.setattr(os, "geteuid", lambda: 4711)
     with pytest.raises(ConfigError, match="do this as that user"):

@@ -55,7 +55,7 @@ class Trying(Delivery):
     @property
     def standing(self) -> Standing:
         """What the ledger says of the bundle on trial."""
-        return self.store.ledger.of(self.two)
+        return self.store.state.of(self.two)
 
 
 @pytest.fixture
@@ -117,10 +117,10 @@ def test_enough_sweeps_commit(box: Trying):
     trial.turn(health(3))
     assert box.standing.committed
     assert box.logged[-1] == f"bundle {box.two[:8]} has stood its trial and is committed"
-    assert (box.store.ledger.counter, box.store.ledger.highest, trial.text) == (2, box.two, "")
+    assert (box.store.state.counter, box.store.state.highest, trial.text) == (2, box.two, "")
     trial.stopping()
     trial.turn(health(4, streams=False))
-    assert box.store.ledger.of(box.two) == Standing(box.one, 2)
+    assert box.store.state.of(box.two) == Standing(box.one, 2)
     assert box.start() == box.two
 
 
@@ -189,7 +189,7 @@ def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pyte
         trial.stopping()
     assert len(calls) == 3
     assert box.logged[1:] == [
-        f"<4>trial of bundle {box.two[:8]}: the ledger cannot be written: No space left on device; it is tried again"
+        f"<4>trial of bundle {box.two[:8]}: ledger.json cannot be written: No space left on device; it is tried again"
     ]
     trial.turn(health(30))
     assert box.standing.committed
@@ -198,7 +198,7 @@ def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pyte
 def test_another_command_is_not_waited_for(box: Trying):
     """The loop goes on; what was to be written is written later."""
     trial = box.tried()
-    with box.store._held():
+    with box.store._locked():
         trial.turn(health(0, streams=False))
     assert box.standing.starts == 1
     assert "in use by another command" in box.logged[-1]
@@ -216,7 +216,7 @@ def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
         trial.turn(health(1))
         assert trial.text == ""
         assert not box.standing.committed
-        assert box.store.ledger.counter == 1
+        assert box.store.state.counter == 1
         box.store.install(box.made(2))
 
 
@@ -235,7 +235,7 @@ def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
     """The whole way on the rig: five sweeps of the simulated robot, each with its answer."""
     trial = box.tried()
     world = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
-    running = rigged(world, model=bundle.load(box.store.shelf.at(box.two)), also=[trial], pulses=[trial])
+    running = rigged(world, model=bundle.load(box.store.bundles.at(box.two)), also=[trial], pulses=[trial])
     running.until(lambda: running.box.answered >= 5 and not trial.text)
     assert box.standing.committed
 
@@ -245,6 +245,6 @@ def test_a_box_without_a_skin_takes_its_start_back(box: Trying, rigged: Callable
     trial = box.tried()
     world = idle_world()
     world.backend.unplug()
-    running = rigged(world, model=bundle.load(box.store.shelf.at(box.two)), also=[trial], pulses=[trial])
+    running = rigged(world, model=bundle.load(box.store.bundles.at(box.two)), also=[trial], pulses=[trial])
     running.seconds(1)
     assert box.standing.starts == 0
