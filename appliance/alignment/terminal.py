@@ -1,27 +1,26 @@
-"""The room of the terminal that shows how the skin is placed. In: Views. Out: a picture drawn over and over, or plain lines.
+"""Shows in a terminal where the skin is touched. In: Views. Out: a picture that is drawn again and again, or plain lines.
 
-Everything can be told without colour: load by five characters and its digits, places by signs. Where the output is no
-terminal, or a dumb one, it gets one line a second.
+Nothing depends on colour: five characters and numbers show the load, signs the positions. Where the output is no terminal,
+or a dumb one, it gets one line a second.
 """
 
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Self, TextIO
+from typing import Self, TextIO
 
+from appliance.alignment.view import View
+from appliance.core.clock import Clock
 from appliance.signal.contact import Point
 
-if TYPE_CHECKING:
-    from appliance.alignment.live import View
-
 LINE_NS = 1_000_000_000
-"""Between two plain lines."""
+"""Time between two plain lines."""
 ENTER, LEAVE = "\033[?1049h\033[?25l", "\033[?1049l\033[?25h"
-"""To a screen of its own without a cursor, and back: what stood in the terminal before is there again."""
+"""Control sequences: to the alternate screen without a cursor, and back to what was on the terminal before."""
 BLOCKS, ASCII = " ░▒▓█◉+┌─┐│└┘", " .:*#@+.-.|''"
-"""Five loads, the contact's centre, a trained position and a frame: for UTF-8, and for any terminal."""
+"""Signs for five loads, the contact's centre, a trained position and a frame: for UTF-8, and for any terminal."""
 LEFT, TOP, SPARE = 8, 6, 12
-"""Where the grid begins, and how many lines are not the grid's."""
+"""Column and line where the grid begins, and the number of lines outside it."""
 BOLD, PLAIN = "\033[1m", "\033[0m"
 MARKED = "\033[1;7m"
 HEAT = (236, 23, 30, 37, 79, 158)
@@ -29,10 +28,10 @@ HEAT = (236, 23, 30, 37, 79, 158)
 
 
 class Screen:
-    """Shows Views on `out`; `address`: of the page, where there is one. Leaves the terminal as it found it."""
+    """Shows Views on `out`; `address`: of the page, where there is one. Restores the terminal at the end."""
 
-    def __init__(self, out: TextIO, address: str = "") -> None:
-        self._out, self._address = out, address
+    def __init__(self, out: TextIO, clock: Clock, address: str = "") -> None:
+        self._out, self._clock, self._address = out, clock, address
         kind = os.environ.get("TERM", "dumb")
         self._live = out.isatty() and kind != "dumb"
         self._colours = "256" in kind
@@ -46,13 +45,13 @@ class Screen:
     def __exit__(self, *_: object) -> None:
         self._write(LEAVE if self._live else "")
 
-    def show(self, view: View, now_ns: int) -> None:
-        """Draw `view` over the one before, in one write so that nothing flickers; or say it in a line, once a second."""
+    def show(self, view: View) -> None:
+        """Draw `view` over the one before, in one write so that nothing flickers; or print a line, once a second."""
         if self._live:
             width, height = os.get_terminal_size(self._out.fileno())
             lines = Canvas(view, self._signs, width or 80, height or 24, self._address).lines(self._colours)
             self._write("\033[H" + "".join(f"{line}\033[K\n" for line in lines[:-1]) + f"{lines[-1]}\033[J")
-        elif now_ns >= self._next_ns:
+        elif (now_ns := self._clock.now_ns()) >= self._next_ns:
             self._next_ns = now_ns + LINE_NS
             self._write(line(view) + "\n")
 
@@ -62,18 +61,13 @@ class Screen:
 
 
 def line(view: View) -> str:
-    """A View in one line, the words first."""
-    at = f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {unit(view)}" if view.centre else ""
-    return f"{'SIMULATED  ' * (view.source != 'usb')}{view.said}{at}  ({view.todo})"
-
-
-def unit(view: View) -> str:
-    """What a View's places are counted in."""
-    return "mm" if view.place else "taxels"
+    """A View in one line, the message first."""
+    at = f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {view.unit}" if view.centre else ""
+    return f"{'SIMULATED  ' * (view.source != 'usb')}{view.message}{at}  ({view.hint})"
 
 
 class Canvas:
-    """A View as characters, each with a style, cut to the terminal's size."""
+    """A View as characters, each with a style, cut to the size of the terminal."""
 
     def __init__(self, view: View, signs: str, width: int, height: int, address: str) -> None:
         self._view, self._signs = view, signs
@@ -84,7 +78,7 @@ class Canvas:
         self._words(address)
         if view.load:
             self._grid()
-            self._places()
+            self._positions()
 
     def lines(self, colours: bool) -> list[str]:
         """The picture, line by line."""
@@ -108,18 +102,18 @@ class Canvas:
         view, (rows, _) = self._view, self._view.shape
         simulated = "   SIMULATED" * (view.source != "usb")
         self._put(0, 1, f"palpate align   skin {view.skin}   bundle {view.bundle}{simulated}")
-        self._put(2, 1, view.said, BOLD)
-        self._put(3, 1, view.todo)
+        self._put(2, 1, view.message, BOLD)
+        self._put(3, 1, view.hint)
         below = TOP + rows * self._cell[0] + 1
         if view.centre:
             row, col = view.centre
-            self._put(below, 1, f"centre: row {row:.1f}, column {col:.1f} {unit(view)} from taxel 1.1")
+            self._put(below, 1, f"centre: row {row:.1f}, column {col:.1f} {view.unit} from taxel 1.1")
         trained = f"   {self._signs[6]} where it was in training" if view.place else ""
         self._put(below + 1, 1, f"{self._signs[5]} the contact's centre{trained}   Ctrl-C ends")
         self._put(below + 2, 1, address)
 
     def _grid(self) -> None:
-        """Each taxel a field of characters for its load, with the digits in the middle; a frame around all."""
+        """A field of characters for the load of each taxel, with the number in its middle; a frame around all."""
         (high, wide), view = self._cell, self._view
         left_up, flat, right_up, upright, left_down, right_down = list(self._signs[7:])
         for c in range(view.shape[1]):
@@ -139,22 +133,22 @@ class Canvas:
         (high, wide), share = self._cell, max(0.0, min(1.0, load / self._view.full))
         for y in range(high):
             self._put(top + y, left, self._signs[round(4 * share)] * (wide - 1), f"\033[38;5;{HEAT[round(5 * share)]}m")
-        digits = f"{load:.0f}"
-        if wide >= len(digits) + 3:
-            digits = f" {digits} "
-        self._put(top + high // 2, left + (wide - 1 - len(digits)) // 2, digits[: wide - 1])
+        number = f"{load:.0f}"
+        if wide >= len(number) + 3:
+            number = f" {number} "
+        self._put(top + high // 2, left + (wide - 1 - len(number)) // 2, number[: wide - 1])
 
-    def _places(self) -> None:
+    def _positions(self) -> None:
         view = self._view
         if view.place:
-            for place in zip(view.place.rows_mm, view.place.cols_mm, strict=True):
-                self._put(*self._at(place), self._signs[6], BOLD)
+            for position in zip(view.place.rows_mm, view.place.cols_mm, strict=True):
+                self._put(*self._at(position), self._signs[6], BOLD)
         if view.centre:
             y, x = self._at(view.centre)
             self._put(y, x - 1, f"({self._signs[5]})", MARKED)
 
     def _at(self, point: Point) -> tuple[int, int]:
-        """Line and column of a place, at the grid's edge where it lies beyond it."""
+        """Line and column of a point, at the grid's edge where it lies beyond it."""
         pitch = self._view.place.pitch_mm if self._view.place else 1.0
         (high, wide), (rows, cols) = self._cell, self._view.shape
         row, col = (point[0] / pitch + 0.5) * high, (point[1] / pitch + 0.5) * wide

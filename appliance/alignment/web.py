@@ -1,8 +1,8 @@
-"""The room of the page that shows how the skin is placed. In: Views. Out: the page and its state, to browsers on this machine.
+"""Serves a page that shows where the skin is touched. In: Views. Out: the page and its state, to browsers on this machine.
 
-It listens on 127.0.0.1 alone and only gives: two paths, GET, nothing that is sent is read beyond the head. The server has
-a thread of its own, so that no browser, however slow, keeps the loop from reading the skin; between them there is one
-value, the newest state, which is set whole. `palpate run` never comes here.
+It listens on 127.0.0.1 alone and only answers GET on two paths; of a request nothing beyond the head is read. The server
+runs in its own thread, so that no slow browser keeps the loop from reading the skin. The two share one value, the newest
+state, which is replaced as a whole. `palpate run` does not use this module.
 """
 
 from __future__ import annotations
@@ -17,30 +17,28 @@ import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
+from appliance.alignment.view import View
 from appliance.core.clock import Clock
 from appliance.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from appliance.alignment.live import View
 
 HERE = "127.0.0.1"
 PAGE = Path(__file__).with_name("page.html")
 NAMES = ("localhost", HERE)
-"""How a browser may call this machine. Another name is another site's that points here (DNS rebinding)."""
+"""Names by which a browser may ask for this machine. Another name belongs to another site that points here (DNS rebinding)."""
 DEADLINE_NS = 2_000_000_000
-"""From a connection's begin to the end of its head, and again to that of the answer, whatever the other side does."""
+"""Limit from the start of a connection to the end of the request's head, and again for the answer."""
 MOST_HEAD = 8192
-"""Bytes of a request that are read."""
+"""Most bytes of a request that are read."""
 MOST_OPEN = 16
-"""Connections at a time; a further one is closed at once."""
+"""Most connections at a time; a further one is closed at once."""
 POLL_S = 0.2
-"""How soon the server notices that it shall stop."""
+"""How often the server checks whether it shall stop."""
 
 
 def policy(page: str) -> str:
-    """What the page may do: run the script and the styles that are in it, known by their hashes, and ask this server."""
+    """Content security policy of the page: its own script and styles, by their hashes, and requests to this server."""
 
     def hashes(tag: str) -> str:
         texts = re.findall(rf"<{tag}>(.*?)</{tag}>", page, re.S)
@@ -53,34 +51,34 @@ def policy(page: str) -> str:
 
 
 class PageHandler(BaseHTTPRequestHandler):
-    """One request. The library reads its head, this answers from what the server holds."""
+    """One request. The library parses its head; the answer is what the server has under that path."""
 
     server: Server
     server_version, sys_version = "palpate", ""
 
     def setup(self) -> None:
-        """Read the head, so much and so long and no more; what comes after it is nobody's."""
+        """Read the head within MOST_HEAD and DEADLINE_NS; what comes after it is ignored."""
         super().setup()
         self.rfile = io.BytesIO(self._head())
-        self.connection.settimeout(DEADLINE_NS / 1e9)  # of the whole answer, as `sendall` counts it
+        self.connection.settimeout(DEADLINE_NS / 1e9)  # `sendall` counts it for the whole answer
 
     def _head(self) -> bytes:
-        """Up to the empty line and what came with it; nothing where the limit or the other side's end comes first. Raises
-        TimeoutError at the deadline."""
+        """Up to the empty line and what came with it; nothing where the limit is reached or the other side closes first.
+        Raises TimeoutError at the deadline."""
         clock, head = self.server.clock, b""
         until_ns = clock.now_ns() + DEADLINE_NS
         while b"\r\n\r\n" not in head:
-            left_ns, room = until_ns - clock.now_ns(), MOST_HEAD - len(head)
+            left_ns, free = until_ns - clock.now_ns(), MOST_HEAD - len(head)
             if left_ns <= 0:
                 raise TimeoutError
             self.connection.settimeout(left_ns / 1e9)
-            if not room or not (more := self.connection.recv(room)):
+            if not free or not (more := self.connection.recv(free)):
                 return b""
             head += more
         return head
 
     def parse_request(self) -> bool:
-        """Refuse what is meant for another site."""
+        """Refuse a request that is meant for another site."""
         if not super().parse_request():
             return False
         if self.headers.get("Host", "").rsplit(":", 1)[0] not in NAMES:
@@ -89,11 +87,11 @@ class PageHandler(BaseHTTPRequestHandler):
         return True
 
     def do_GET(self) -> None:
-        """`/` and `/state`; there is nothing else."""
-        if self.path not in self.server.held:
+        """Answer `/` and `/state`; any other path is not found."""
+        if self.path not in self.server.content:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
-        kind, body = self.server.held[self.path]
+        kind, body = self.server.content[self.path]
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
@@ -101,7 +99,7 @@ class PageHandler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def end_headers(self) -> None:
-        """What each answer says, errors too."""
+        """Add the headers that every answer has, errors too."""
         for name, value in (
             ("Content-Security-Policy", self.server.policy),
             ("Cache-Control", "no-store"),
@@ -114,46 +112,48 @@ class PageHandler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing: the terminal shows the skin."""
+        """Print nothing: the terminal shows the skin."""
 
 
 class Server(ThreadingHTTPServer):
-    """A thread for each connection, of which there are few and none lasts. held: content type and body by path."""
+    """One thread for each connection; these are few and short. content: content type and body by path."""
 
     daemon_threads = True
     block_on_close = False
-    request_queue_size = 2 * MOST_OPEN  # or the kernel lets those wait a second whom this would turn away at once
+    request_queue_size = (
+        2 * MOST_OPEN
+    )  # with less, the kernel lets a connection wait a second that would be refused at once
 
     def __init__(self, port: int, clock: Clock, page: str) -> None:
         self.clock, self.policy = clock, policy(page)
-        self.held = {"/": ("text/html; charset=utf-8", page.encode()), "/state": ("application/json", b"null")}
-        self._room = threading.Semaphore(MOST_OPEN)
+        self.content = {"/": ("text/html; charset=utf-8", page.encode()), "/state": ("application/json", b"null")}
+        self._free = threading.Semaphore(MOST_OPEN)
         super().__init__((HERE, port), PageHandler)
 
     def server_bind(self) -> None:
-        """As of a plain server: the library's own would ask a name server for this machine's name, and wait for it."""
+        """Bind as TCPServer does: HTTPServer would ask a name server for this machine's name, and wait for it."""
         socketserver.TCPServer.server_bind(self)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Take a connection on, where there are not too many."""
-        if self._room.acquire(blocking=False):
+        """Accept a connection unless there are MOST_OPEN."""
+        if self._free.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """One connection, in its thread, to its end."""
+        """Serve one connection in its thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._room.release()
+            self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that has left is no trouble of ours."""
+        """Ignore a browser that has closed its connection."""
 
 
 class Page:
-    """Shows Views at http://127.0.0.1:`port`, 0 for any that is free. Raises ConfigError where it cannot be had."""
+    """Shows Views at http://127.0.0.1:`port`, 0 for any that is free. Raises ConfigError where it cannot be used."""
 
     def __init__(self, port: int, clock: Clock) -> None:
         try:
@@ -171,5 +171,5 @@ class Page:
         self._server.server_close()
 
     def show(self, view: View) -> None:
-        """The newest state."""
-        self._server.held["/state"] = "application/json", json.dumps(view.json(), allow_nan=False).encode()
+        """Make `view` the newest state."""
+        self._server.content["/state"] = "application/json", json.dumps(view.json(), allow_nan=False).encode()

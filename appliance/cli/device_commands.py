@@ -225,11 +225,18 @@ def run_enrol(args: argparse.Namespace, devices: OpenDevices) -> int:
 def run_align(args: argparse.Namespace, devices: OpenDevices) -> int:
     """`palpate align`: where the contact lies, until Ctrl-C."""
     from appliance.alignment import live
+    from appliance.alignment.terminal import Screen
+    from appliance.alignment.view import Display
+    from appliance.alignment.web import Page
 
     how = settings(args)
     held = model(how)
     world = devices(lambda: held.format)
-    live.run(world.wire(how).sensor, held, world, sys.stdout, stop_flag(), args.web)
+    with ExitStack() as stack:
+        pages = [stack.enter_context(Page(args.web, world.clock))] if args.web is not None else []
+        screen = stack.enter_context(Screen(sys.stdout, world.clock, *(page.address for page in pages)))
+        displays: list[Display] = [screen, *pages]
+        live.run(world.wire(how).sensor, held, world, displays, stop_flag())
     return 0
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from appliance.alignment import web
-from appliance.alignment.live import View
+from appliance.alignment.view import View
 from appliance.alignment.web import MOST_HEAD, MOST_OPEN, Page
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Manifest
@@ -78,9 +78,9 @@ def test_the_state_is_the_newest_view(page: Page):
     assert head.startswith(b"HTTP/1.0 200 ")
     assert b"Content-Type: application/json" in head
     assert json.loads(body) == json.loads(json.dumps(VIEW.json()))
-    page.show(replace(VIEW, turn=8, centre=None, place=None))
+    page.show(replace(VIEW, number=8, centre=None, place=None))
     held = json.loads(asked(page).partition(b"\r\n\r\n")[2])
-    assert (held["turn"], held["centre"], held["place"]) == (8, None, None)
+    assert (held["number"], held["centre"], held["place"]) == (8, None, None)
 
 
 @pytest.mark.parametrize("path", ["/", "/state", "/nothing"])
@@ -182,7 +182,7 @@ def test_too_many_connections_are_turned_away(page: Page, monkeypatch: pytest.Mo
 def test_one_who_reads_nothing_holds_nobody_up(page: Page, monkeypatch: pytest.MonkeyPatch):
     """A browser that asks and never reads: its thread ends at the deadline, and others are served meanwhile."""
     monkeypatch.setattr(web, "DEADLINE_NS", 300_000_000)
-    page._server.held["/"] = "text/html", b"x" * 50_000_000
+    page._server.content["/"] = "text/html", b"x" * 50_000_000
     before = threading.active_count()
     with connected(page) as one:
         one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -265,22 +265,22 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     context = browser.new_context(viewport={"width": 820, "height": 1180})
     seen = Seen(context, address)
     seen.state("off")
-    until(lambda: seen.text("#said").startswith("2."))
-    assert re.fullmatch(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1", seen.text("#said"))
-    assert "move the skin" in seen.text("#todo")
+    until(lambda: seen.text("#message").startswith("2."))
+    assert re.fullmatch(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1", seen.text("#message"))
+    assert "move the skin" in seen.text("#hint")
     assert seen.page.is_visible("#simulated")
     assert seen.text("#state") == "skin streaming"
     assert seen.page.locator(".trained").count() == 2
     assert seen.page.is_visible("#way")
     seen.state("no-contact")
     assert seen.page.locator("#centre").evaluate("e => getComputedStyle(e).visibility") == "hidden"
-    assert set(seen.page.locator(".digits").all_text_contents()) <= {"0", "1"}
+    assert set(seen.page.locator(".count").all_text_contents()) <= {"0", "1"}
     seen.state("off")
     assert seen.troubles == []
     run.send_signal(signal.SIGINT)
     assert run.wait(timeout=WAIT_S) == 0
     seen.state("no-connection")
-    assert seen.text("#said") == "no connection"
+    assert seen.text("#message") == "no connection"
     assert {url.removeprefix(address) for url in seen.asked} == {"/", "/state"}
     context.close()
 
@@ -290,26 +290,26 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
     context = browser.new_context(viewport={"width": 1180, "height": 820})
     seen = Seen(context, page.address)
     seen.state("off")
-    assert seen.text("#said") == VIEW.said
-    assert seen.page.text_content("#heard").startswith(VIEW.said)
-    assert seen.page.get_attribute("#heard", "aria-live") == "polite"
+    assert seen.text("#message") == VIEW.message
+    assert seen.page.text_content("#spoken").startswith(VIEW.message)
+    assert seen.page.get_attribute("#spoken", "aria-live") == "polite"
     assert not seen.page.is_visible("#simulated")
     shades = seen.page.eval_on_selector_all(".load", "all => all.map(e => Number(e.style.opacity))")
     assert shades == pytest.approx([load / 80 for row in LOADS for load in row])
-    assert seen.page.locator(".digits").all_text_contents() == [f"{load:.0f}" for row in LOADS for load in row]
+    assert seen.page.locator(".count").all_text_contents() == [f"{load:.0f}" for row in LOADS for load in row]
     centre = seen.page.evaluate("new DOMMatrix(document.getElementById('centre').style.transform)")
     assert (centre["e"], centre["f"]) == pytest.approx((6.0 / 4 * 100 + 50, 3.8 / 4 * 100 + 50))
     assert [e["r"] for e in circles(seen, ".halo")] == pytest.approx([15, 15])
     assert circles(seen, ".trained")[1] == pytest.approx({"cx": 195, "cy": 210, "r": 3.5})
-    page.show(replace(VIEW, turn=8, state="in-place", said="in place"))
+    page.show(replace(VIEW, number=8, state="in-place", message="in place"))
     seen.state("in-place")
-    assert seen.text("#said") == "✓ in place"
+    assert seen.text("#message") == "✓ in place"
     assert not seen.page.is_visible("#way")
-    page.show(replace(VIEW, turn=9, state="no-skin", skin="absent", said="no skin: absent", load=(), centre=None))
+    page.show(replace(VIEW, number=9, state="no-skin", skin="absent", message="no skin: absent", load=(), centre=None))
     seen.state("no-skin")
     assert seen.text("#state") == "skin absent"
-    assert set(seen.page.locator(".digits").all_text_contents()) == {""}
-    page.show(replace(VIEW, turn=10, shape=(2, 3), load=((1.0, 2, 3),) * 2, place=None, state="no-positions", nearest=None,
+    assert set(seen.page.locator(".count").all_text_contents()) == {""}
+    page.show(replace(VIEW, number=10, shape=(2, 3), load=((1.0, 2, 3),) * 2, place=None, state="no-positions", nearest=None,
                       centre=(0.5, 1.0)))  # fmt: skip
     seen.state("no-positions")
     assert seen.page.locator(".tile").count() == 6
@@ -331,8 +331,8 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
     seen = Seen(context, page.address)
     seen.state("off")
     seen.state("no-connection")
-    assert "no news" in seen.text("#todo")
-    page.show(replace(VIEW, turn=8))
+    assert "no news" in seen.text("#hint")
+    page.show(replace(VIEW, number=8))
     seen.state("off")
     context.close()
 
@@ -347,7 +347,7 @@ def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypa
         seen.state("no-connection")
     finally:
         held.set()
-    assert "tunnel" in seen.text("#todo")
+    assert "tunnel" in seen.text("#hint")
     context.close()
 
 
@@ -355,7 +355,7 @@ def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypa
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, height: int, scheme: str):
     """All of it on one screen, without scrolling, by day and by night; the words can be read on their ground."""
-    page.show(replace(VIEW, said="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"))
+    page.show(replace(VIEW, message="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"))
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     seen = Seen(context, page.address)
     seen.state("off")
@@ -365,7 +365,7 @@ def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, 
     assert board["x"] >= 0
     assert board["y"] + board["height"] <= height
     assert min(board["width"], board["height"]) > 0.3 * min(width, height)
-    for what in ("#said", "#todo", "#figures"):
+    for what in ("#message", "#hint", "#figures"):
         box = seen.page.locator(what).bounding_box()
         assert box["x"] + box["width"] <= width
         assert contrast(seen, what) > 4.5

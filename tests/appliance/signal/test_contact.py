@@ -1,42 +1,22 @@
-"""The room of the skin's place: the contact's centre, what is said of it, and `palpate align` in a terminal."""
+"""The centre of a contact, the advice that follows from it, and the positions that a bundle holds."""
 
 from __future__ import annotations
 
-import errno
-import fcntl
-import io
-import math
-import os
 import re
-import signal
-import struct
-import subprocess
-import sys
-import termios
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from appliance.alignment import live
-from appliance.alignment.live import Placing, View
-from appliance.alignment.terminal import ASCII, BLOCKS, ENTER, LEAVE, Canvas, Screen
-from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle, Manifest
-from appliance.core import config
 from appliance.core.clock import SystemClock
-from appliance.core.config import SensorConfig
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Status, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.io.robot_link import MAX_LINE, result
 from appliance.signal.contact import ContactPositions, advice, centre, mended, moved
-from appliance.sim import devices, rig, script, skin
-from tests.factories.paths import NO_SITE
-from tests.factories.simulated_box import SECOND, idle_world
+from appliance.sim import skin
 from train.data import sets
 from train.data.sets import Dataset
 from train.export import contact_positions
@@ -184,240 +164,6 @@ def test_a_sentence_keeps_what_matters_most_of_the_advice():
 def model(default_bundle: Bundle) -> Bundle:
     """The default bundle, with trained positions."""
     return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE, schema=3))
-
-
-def placing(world: devices.SimDevices, model: Bundle) -> tuple[Placing, Callable[[float], list[View]]]:
-    """A Placing on `world`, and what gives its Views of so many seconds."""
-    how = world.wire(config.load(None, [], site=NO_SITE))
-    one = Placing(how.sensor, model, world)
-
-    def views(seconds: float) -> list[View]:
-        seen, end_ns, next_ns = [], world.clock.now_ns() + round(seconds * SECOND), world.clock.now_ns()
-        while world.clock.now_ns() < end_ns:
-            one.read()
-            if world.clock.now_ns() >= next_ns:
-                next_ns = world.clock.now_ns() + live.LOOK_NS
-                seen.append(one.view())
-        return seen
-
-    return one, views
-
-
-def resting(seed: int = 1) -> devices.SimDevices:
-    """The simulated finger that rests on the tube while the skin is placed."""
-    return devices.build(skin.FORMAT, script.named("rest", skin.FORMAT, seed)[0], rig.VirtualClock(), "sim")
-
-
-def states(views: list[View]) -> list[str]:
-    """States one after another, each once."""
-    return [v.state for i, v in enumerate(views) if i == 0 or v.state != views[i - 1].state]
-
-
-def test_somebody_places_the_skin(model: Bundle):
-    """Finger off, then four touches, each nearer: what is said goes with it, to the last one that is in place."""
-    _, views = placing(resting(), model)
-    seen = views(17)
-    assert states(seen)[:4] == ["wait", "no-contact", "off", "no-contact"]
-    assert states(seen)[-3:] == ["no-contact", "in-place", "no-contact"]
-    off = [v for v in seen if v.state == "off"]
-    assert off[3].said.startswith("2.5 mm too far towards column 1 and ")
-    assert off[3].said.endswith("towards row 1")
-    last = [v for v in seen if v.state == "in-place"][-4]
-    assert last.said == "in place"
-    assert last.centre == pytest.approx((6, 6), abs=0.6)
-    assert math.dist(last.centre, last.nearest) < MIDDLE.limit_mm
-    assert last.full == pytest.approx(max(max(row) for v in seen for row in v.load), abs=0.1)
-    assert [v.turn for v in seen] == list(range(1, len(seen) + 1))
-
-
-def pressed(*loads: float) -> devices.SimDevices:
-    """A skin with these loads on all taxels but the last, a second each."""
-    on = np.concatenate([np.full((750, 4, 4), load, np.uint8) for load in loads])
-    on[:, 3, 3] = 3
-    return devices.build(skin.FORMAT, [rig.Act(on, 0, len(on) - 1, "")], rig.VirtualClock(), "sim")
-
-
-def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
-    """Until each taxel was unloaded once nothing is advised; then the touch is seen as it is."""
-    _, views = placing(pressed(80, 95, 2, 80), model)
-    seen = views(4)
-    assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
-    assert "80 digits" in next(v for v in seen if v.state == "lift").todo
-    assert seen[-1].load[0][0] == pytest.approx(78)
-    assert seen[-1].load[3][3] == 0
-
-
-def test_an_unplugged_skin_is_told_and_waited_for(model: Bundle):
-    """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is read anew."""
-    world = resting()
-    _, views = placing(world, model)
-    views(2)
-    world.backend.unplug()
-    gone = views(0.6)[-1]
-    assert gone.state == "no-skin"
-    assert gone.said in ("no skin: absent", "no skin: lost")
-    assert gone.todo
-    assert gone.load == ()
-    world.backend.plug()
-    assert states(views(4)) == ["no-skin", "wait", "lift", "no-contact", "off"]
-
-
-def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
-    """It says that it has none, and what to do; the centre is in taxels."""
-    without = replace(default_bundle, manifest=replace(default_bundle.manifest, place=None))
-    _, views = placing(resting(), without)
-    last = [v for v in views(14.5) if v.centre][-1]
-    assert last.state == "no-positions"
-    assert "export it again" in last.todo
-    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
-    assert last.nearest is None
-
-
-def test_another_skin_shape(model: Bundle):
-    """A skin of 2 x 3 taxels and float digits, some of which are no numbers."""
-    fmt = replace(model.format, rows=2, cols=3, dtype="float32")
-    other = replace(
-        model,
-        manifest=replace(model.manifest, format=fmt, place=replace(MIDDLE, rows_mm=(2.0, 2.0), cols_mm=(4.0, 4.0))),
-    )
-    load = np.zeros((3000, 2, 3), np.float32)
-    load[1000:, :, 1:] = 60.0
-    load[:, 0, 0] = np.nan
-    world = devices.build(fmt, [rig.Act(load, 0, 2999, "")], rig.VirtualClock(), "sim")
-    seen = placing(world, other)[1](3)
-    assert seen[-1].said == "2.0 mm too far towards column 3"
-    assert seen[-1].load[0][0] == 0
-    screen = Canvas(seen[-1], ASCII, 80, 24, "").lines(False)
-    assert any("row 2" in line and "60" in line for line in screen)
-
-
-VIEW = View(7, "sim", "default 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1", "move it", (4, 4),
-            tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4)), 80.0, (3.8, 6.0), (6.0, 6.0), MIDDLE)  # fmt: skip
-
-
-def test_a_pipe_gets_one_plain_line_a_second():
-    """No control characters; the words, the centre, and that it is simulated."""
-    out = io.StringIO()
-    with Screen(out, "http://127.0.0.1:8137") as screen:
-        for tenth in range(25):
-            screen.show(VIEW, tenth * SECOND // 10)
-    first, *lines = out.getvalue().splitlines()
-    assert first == "page: http://127.0.0.1:8137"
-    assert lines == ["SIMULATED  2.2 mm too far towards row 1  centre row 3.8 column 6.0 mm  (move it)"] * 3
-
-
-@pytest.mark.parametrize(("width", "height"), [(80, 24), (132, 50), (40, 16), (20, 5), (1, 1)])
-@pytest.mark.parametrize("signs", [BLOCKS, ASCII])
-def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
-    """No line is longer and none is too many; at 80 x 24 all digits, both places, words and the key are there."""
-    lines = Canvas(VIEW, signs, width, height, "http://127.0.0.1:8137").lines(False)
-    plain = [re.sub(r"\033\[[0-9;]*m", "", line) for line in lines]
-    assert len(lines) == height
-    assert all(len(line) <= width for line in plain)
-    if width < 80:
-        return
-    text = "\n".join(plain)
-    wanted = [
-        "SIMULATED",
-        "2.2 mm too far towards row 1",
-        "move it",
-        "row 4",
-        "col 4",
-        "Ctrl-C ends",
-        "http://127.0.0.1:8137",
-    ]
-    assert all(word in text for word in wanted + [f"{20 * r + c} " for r in range(4) for c in range(4)])
-    row_1, row_4 = (
-        next(line for line in plain if f"row {n}" in line and "│" in line.replace("|", "│")) for n in (1, 4)
-    )
-    assert signs[0] * 4 in row_1.replace(" ", signs[0])
-    assert signs[3] in row_4
-    assert f"({signs[5]})" in text
-    assert signs[6] in "\n".join(plain[9:14])
-    assert all(ord(sign) < 128 for sign in text) == (signs is ASCII)
-
-
-def test_a_place_beside_the_skin_is_shown_at_its_edge():
-    """However far: a bundle may name any number."""
-    far = replace(VIEW, place=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
-    lines = Canvas(far, ASCII, 80, 24, "").lines(False)
-    assert [
-        line.index("+") for plain in lines if "+" in (line := re.sub(r"\033\[[0-9;]*m", "", plain)) and "|" in line
-    ] == [24, 8]
-
-
-def test_only_a_terminal_that_knows_colours_gets_them():
-    """38;5 for 256 colours; bold and inverse for all."""
-    assert any("38;5" in line for line in Canvas(VIEW, BLOCKS, 80, 24, "").lines(True))
-    plain = Canvas(VIEW, BLOCKS, 80, 24, "").lines(False)
-    assert not any("38;5" in line for line in plain)
-    assert any("\033[1;7m" in line for line in plain)
-
-
-def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """Views come as fast as LOOK_NS allows, not one for each frame; `stopped` ends it and the skin is let go."""
-    world, out = resting(), io.StringIO()
-    end_ns = world.clock.now_ns() + 5 * SECOND
-    monkeypatch.setattr("appliance.alignment.terminal.LINE_NS", 0)
-    how = world.wire(config.load(None, [], site=NO_SITE))
-    live.run(how.sensor, model, world, out, lambda: world.clock.now_ns() >= end_ns)
-    assert 24 <= len(out.getvalue().splitlines()) <= 26
-    assert not world.backend.board.running
-
-
-def test_a_denied_skin_is_named(model: Bundle):
-    """What keeps the skin from being read is said with its remedy, and is no end."""
-    world = idle_world()
-    world.backend.errors["open"] = errno.EACCES
-    one = Placing(SensorConfig(), model, world)
-    one.read()
-    view = one.view()
-    assert (view.state, view.skin, view.said) == ("no-skin", "denied", "no skin: denied")
-    assert "udev" in view.todo
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bundle with trained positions, on disk."""
-    target = tmp_path_factory.mktemp("bundle")
-    for name in bundle.load(bundle.DEFAULT).manifest.files:
-        (target / name).write_bytes((bundle.DEFAULT / name).read_bytes())
-    manifest = Manifest.parse((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
-    (target / bundle.MANIFEST).write_bytes(replace(manifest, place=MIDDLE, schema=3).json())
-    return target
-
-
-@pytest.fixture
-def terminal() -> Iterator[tuple[int, int]]:
-    """A terminal of 80 x 24: its far end and the one that programs get."""
-    far, near = os.openpty()
-    fcntl.ioctl(near, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-    yield far, near
-    os.close(far)
-
-
-@pytest.mark.parametrize("kind", ["xterm-256color", "dumb"])
-def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal: tuple[int, int], kind: str):
-    """The command itself in a terminal: exit code 0; a screen of its own, left at the end; none where it is dumb."""
-    far, near = terminal
-    command = [sys.executable, "-m", "appliance", "align", "--sim", "rest", "--set", f"classifier.bundle={folder}"]
-    with subprocess.Popen(command, stdout=near, env=os.environ | {"TERM": kind}) as run:
-        os.close(near)
-        shown, pressed = b"", False
-        try:
-            while data := os.read(far, 65536):
-                shown += data
-                if b"SIMULATED" in shown and not pressed:
-                    pressed = True
-                    run.send_signal(signal.SIGINT)
-        except OSError:  # the terminal's end where the last writer has gone
-            pass
-        assert run.wait() == 0
-    text = shown.decode()
-    live = kind != "dumb"
-    assert (text.startswith(ENTER), text.endswith(LEAVE)) == (live, live)
-    assert ("\033" in text) == live
-    assert text.count("reading the unloaded skin") >= 1
 
 
 def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> Dataset:
