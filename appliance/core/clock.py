@@ -1,6 +1,7 @@
-"""Time: the host's monotonic clock as an object that is passed in, and device microseconds -> host nanoseconds.
+"""The host's monotonic clock as an object that is passed in, and the conversion of device time to host time.
 
-In: device time stamps with the host time at which each packet arrived. Out: when each frame was really taken.
+In: device time stamps (us) with the host time (ns) at which each packet arrived. Out: the host time at which each frame
+was taken.
 """
 
 from __future__ import annotations
@@ -11,19 +12,20 @@ from itertools import pairwise
 from typing import Protocol
 
 WRAP = 1 << 32
+"""Device time stamps are 32 bits wide."""
 USB_PPM = 2500
-"""How far the clock of a full-speed device may be off (USB 2.0, 7.1.11)."""
+"""Largest error of a full-speed device's clock, parts per million (USB 2.0, 7.1.11)."""
 
 
 class Clock(Protocol):
-    """What every room asks for the time; the rig passes a virtual one."""
+    """Where every module gets the time from; the simulator passes a virtual clock."""
 
     def now_ns(self) -> int:
-        """`CLOCK_MONOTONIC` in nanoseconds, the clock that GPIO edges are stamped with."""
+        """`CLOCK_MONOTONIC` in nanoseconds, the clock by which the kernel stamps GPIO edges."""
         ...
 
     def sleep_until(self, t_ns: int) -> None:
-        """Return at `t_ns` or at once where that has passed."""
+        """Return at `t_ns`, or at once if that has passed."""
         ...
 
 
@@ -42,15 +44,16 @@ class SystemClock:
 
 
 class DeviceClock:
-    """Device time -> host time, from packets that arrive late but never early.
+    """Converts device time to host time, from packets that arrive late but never early.
 
     Arrival minus device time is the clock offset plus a delay that is never negative, so the offset is the lower
-    envelope of these points. Until `settle_s` have been seen it is their minimum. Then it is the line below all points
-    of the last `span_s` that lies closest to them on average: the edge of their lower convex hull over the mean time,
-    with its slope bounded by `max_ppm` (two crystals differ by less). What stays is the shortest delay itself, some
-    0.1 ms, which cannot be told from the offset. A line that lies higher than the worst clock on USB can have drifted
-    since the last one is none: frames that all come late, from a full FIFO, were not taken late; the last line goes on.
-    Make a new one after each enumeration: the device's clock starts anew.
+    envelope of these points. During the first `settle_s` it is their minimum. After that it is the line below all
+    points of the last `span_s` that is closest to them on average: the edge of their lower convex hull at the mean
+    time, with its slope bounded by `max_ppm` (two crystals differ by less). The error that remains is the shortest
+    delay itself, about 0.1 ms, which cannot be distinguished from the offset.
+    A line that lies higher than the worst clock on USB can have drifted since the last one is rejected and the last one
+    stays in use: frames that all come late, from a full FIFO, were not taken late.
+    Make a new object after each enumeration, since the device's clock then starts again at 0.
     """
 
     def __init__(
@@ -59,15 +62,15 @@ class DeviceClock:
         self._settle_ns = settle_s * 1e9
         self._step_ns = int(step_s * 1e9)
         self._max_slope = max_ppm * 1e-6
-        # the lowest point of each step: (device ns, offset ns); old steps fall off the left end
+        # the lowest point of each step: (device ns, offset ns); the deque drops the oldest step
         self._points: deque[tuple[int, int]] = deque(maxlen=round(span_s / step_s))
         self._device_us: int | None = None
         self._first_ns = 0
-        self._line = (0, 0.0, 0.0)  # at device ns, offset ns, slope
-        self._fitted_ns = 0  # device time when it was found
+        self._line = (0, 0.0, 0.0)  # (device ns, offset there in ns, slope)
+        self._fitted_ns = 0  # device time at which the line was fitted
 
     def unwrap(self, device_us: int) -> int:
-        """Full microseconds of a 32-bit stamp, which wraps each 71.6 minutes; the nearest to the one before."""
+        """The unwrapped time in us of a 32-bit stamp, which wraps every 71.6 minutes: the one nearest to the last."""
         if self._device_us is None:
             self._device_us = device_us
         else:
@@ -75,7 +78,7 @@ class DeviceClock:
         return self._device_us
 
     def update(self, device_ns: int, arrival_ns: int) -> None:
-        """Take note that the frame taken at `device_ns` (unwrapped) had arrived at host time `arrival_ns`."""
+        """Record that the frame taken at `device_ns` (unwrapped) arrived at host time `arrival_ns`."""
         offset = arrival_ns - device_ns
         if not self._points:
             self._first_ns = device_ns
@@ -85,7 +88,7 @@ class DeviceClock:
             self._points[-1] = (device_ns, offset)
             at, low, slope = self._line
             if offset >= low + slope * (device_ns - at):
-                return  # above the line: it stays the lower envelope
+                return  # above the line, which remains the lower envelope
         else:
             self._points.append((device_ns, offset))
         line = self._fit()
@@ -95,14 +98,15 @@ class DeviceClock:
             self._line, self._fitted_ns = line, device_ns
 
     def to_host_ns(self, device_ns: float) -> int:
-        """Host time of `device_ns`; needs one `update` before."""
+        """Host time of `device_ns`; call `update` at least once before."""
         return round(device_ns + _at(self._line, device_ns))
 
     def quality(self) -> dict[str, float] | None:
-        """How well device time is known, or None before the first packet: for the record of a sweep.
+        """How well device time is known, for the sidecar of a recorded sweep; None before the first packet.
 
-        seconds: how much of the past the line rests on. drift_ppm: how much faster host time runs than the device's.
-        late_ms: how late the promptest packet of a quarter of a second was at worst, beside the promptest of all.
+        seconds: length of the past that the line was fitted to. drift_ppm: how much faster host time runs than device
+        time. late_ms: the fastest packet of each quarter of a second is compared with the fastest of all; this is the
+        largest delay among them.
         """
         if not self._points:
             return None
@@ -124,13 +128,13 @@ class DeviceClock:
         left, right = next((a, b) for a, b in pairwise(hull) if b[0] >= middle)
         slope = (right[1] - left[1]) / (right[0] - left[0])
         slope = max(-self._max_slope, min(self._max_slope, slope))
-        # with a bounded slope the line may cut the hull: lower it until it touches from below
+        # with a bounded slope the line may intersect the hull: lower it until it touches the hull from below
         x, y = min(hull, key=lambda p: p[1] - slope * p[0])
         return x, y, slope
 
 
 def _at(line: tuple[int, float, float], device_ns: float) -> float:
-    """Offset of a line (at device ns, offset ns, slope) at another device time, ns."""
+    """Offset in ns of a line (device ns, offset there in ns, slope) at the time `device_ns`."""
     at, offset, slope = line
     return offset + slope * (device_ns - at)
 

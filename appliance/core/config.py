@@ -1,7 +1,8 @@
 """The settings of the box. In: TOML files and `--set` options. Out: one frozen `Config` that knows each value's source.
 
-Layers, the later wins: the defaults below, `sensor.toml`, `board-NAME.toml`, `/etc/palpate/palpate.toml`, `--set`.
-The dataclasses are the schema: a field's type and limits say what a file may hold, and nothing is listed twice.
+Layers, each overriding those before it: the defaults below, `sensor.toml`, `board-NAME.toml`,
+`/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: a field's type and limits say what a file may
+hold.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from appliance.core.errors import ConfigError
 from appliance.core.schema import Key, closest, gpio_line, keys, number, read_table, shown
 
 SITE = Path("/etc/palpate/palpate.toml")
-"""What the person who set up this robot has changed; may be missing."""
+"""The settings of this robot's installation; the file may be missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
     """Where the skin is and how it is read.
 
-    vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link: the interface that is used,
+    vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link: the USB interface to use,
     "vendor" (bulk) or "acm" (a serial port over USB).
-    read_bytes: size of one read, whole USB packets. timeout_ms: how long one read waits. silence_ms: the skin counts as
-    lost after so long without a frame. retry_ms: how often a missing skin is looked for.
+    read_bytes: size of one read, in whole USB packets. timeout_ms: longest wait of one read. silence_ms: time without a
+    frame after which the skin counts as lost. retry_ms: time between two searches for a missing skin.
     """
 
     vendor_id: int = number(0x1209, 1, 0xFFFF, hex=True)
@@ -43,12 +44,12 @@ class SensorConfig:
 
 @dataclass(frozen=True, slots=True)
 class TriggerConfig:
-    """The robot's lines into the box. A line is named as the kernel names it (`gpioinfo`); "" is not wired.
+    """The robot's lines into the box, by the kernel's names (`gpioinfo`); "" means not wired.
 
     mode: "two-lines": rising edges of `start` and `stop`. "one-line": `start` rises and falls, `stop` is not used.
-    new_object: its rising edge says that another object comes. active_low: all three mean the opposite level.
-    bias: the inputs' resistor. glitch_us: a level counts once it has held so long. storm_edges: more edges than this in
-    one burst are a broken wire, not a robot.
+    new_object: its rising edge announces another object. active_low: inverts all three lines.
+    bias: the inputs' resistor. glitch_us: time for which a level must hold to count. storm_edges: largest number of
+    edges in one burst; more are taken for a broken wire.
     """
 
     mode: Literal["two-lines", "one-line"] = "two-lines"
@@ -63,9 +64,10 @@ class TriggerConfig:
 
 @dataclass(frozen=True, slots=True)
 class OutputConfig:
-    """The box's lines to the robot: ready, busy, result_valid, fault, decided as in PROTOCOL.md, part 3. "" is not wired.
+    """The box's lines to the robot; "" means not wired.
 
-    class_bits: the answer's code, lowest bit first. settle_us: how long they stand before `result_valid` rises.
+    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code, lowest bit first.
+    settle_us: time from setting them to the rise of `result_valid`.
     """
 
     ready: str = gpio_line()
@@ -79,10 +81,10 @@ class OutputConfig:
 
 @dataclass(frozen=True, slots=True)
 class SweepConfig:
-    """What may be a sweep. max_duration_s: without a stop edge for so long the sweep is answered `long`.
+    """Limits of a sweep. max_duration_s: without a stop edge for this long the sweep is answered `long`.
 
-    late_ms: how long frames of the window may come after the stop edge. lead_ms: from the start edge to the first frame
-    of the window of early answers (500 is the middle of the paper's three seconds).
+    late_ms: longest wait after the stop edge for frames of the window. lead_ms: time from the start edge to the first
+    frame of the window for early answers (500 is the middle of the paper's three seconds).
     """
 
     max_duration_s: float = number(12.0, 0.1, 3600.0)
@@ -92,9 +94,10 @@ class SweepConfig:
 
 @dataclass(frozen=True, slots=True)
 class SerialConfig:
-    """The serial line to the robot. port: a device path, "" for none. baud: bits a second, 8N1.
+    """The serial line to the robot. port: a device path, "" for none. baud: bits per second, 8N1.
 
-    queue: sentences that wait for a slow reader before the oldest is dropped. state_s: time between two STA sentences.
+    queue: largest number of sentences that wait for a slow reader; then the oldest is dropped. state_s: time between
+    two STA sentences.
     """
 
     port: str = ""
@@ -105,11 +108,12 @@ class SerialConfig:
 
 @dataclass(frozen=True, slots=True)
 class ClassifierConfig:
-    """The network. bundle: a bundle's path; "" for the one that was deployed last, or else the packaged one.
+    """The network. bundle: path of a bundle; "" for the one that was deployed last, or else the packaged one.
 
-    fuse: how the sweeps of one object become one answer; "none": they do not. early: answer while the finger still
-    slides, as soon as the bundle's rule allows. min_probability: least probability for status ok; 0 takes the bundle's threshold.
-    max_sweeps: fused sweeps of one object below `min_probability` after which the answer is `undecided`; 0 is no limit.
+    fuse: rule by which the sweeps of one object are fused into one answer; "none" answers each by itself. early: answer
+    while the finger still slides, as soon as the bundle's rule allows. min_probability: least probability for status
+    ok; 0 takes the bundle's threshold. max_sweeps: after this many fused sweeps of one object below `min_probability`
+    the answer is `undecided`; 0 means no limit.
     """
 
     bundle: str = ""
@@ -121,11 +125,11 @@ class ClassifierConfig:
 
 @dataclass(frozen=True, slots=True)
 class StoreConfig:
-    """What the box keeps. folder: bundles, recordings, the black box (store.py says what lies where).
+    """What the box stores. folder: bundles, recordings and black box (layout: deployment/store.py).
 
-    signers: whose bundles are taken, in the form of ssh-keygen's ALLOWED SIGNERS. status: the file that `palpate status`
-    reads, "" for none. trial_sweeps, trial_s: a new bundle stays once it has named so many sweeps, or the skin has
-    streamed for so long. black_box: so many of the latest sweeps are kept, 0 for none.
+    signers: file of the keys whose bundles are accepted, in the format ALLOWED SIGNERS of ssh-keygen. status: the file
+    that `palpate status` reads, "" for none. trial_sweeps, trial_s: a new bundle is committed once it has named this
+    many sweeps, or the skin has streamed for this long. black_box: number of latest sweeps to keep, 0 for none.
     """
 
     folder: str = "/var/lib/palpate"
@@ -163,10 +167,11 @@ _KEYS: Mapping[str, Key] = MappingProxyType(
 def load(board: str | None, sets: Sequence[str] = (), *, folder: Path | None = None, site: Path = SITE) -> Config:
     """All layers as one Config.
 
-    board: NAME of a `board-NAME.toml`; None or "" leaves the choice to `board = "NAME"` in `site`; else none is wired.
-    sets: "section.key=value", the value in TOML or a bare string. folder: where `sensor.toml` and the boards are; None
-    is `firmware_config/` beside the package, in an installation `/etc/palpate`. site: must exist if it is not SITE.
-    Raises ConfigError, naming the file, the key, the value and what is allowed.
+    board: NAME of a `board-NAME.toml`; None or "" takes `board = "NAME"` in `site`, and without that no line is wired.
+    sets: "section.key=value", the value in TOML or a bare string. folder: where `sensor.toml` and the boards' files
+    are; None means `firmware_config/` beside the package, in an installation `/etc/palpate`. site: must exist unless it
+    is SITE.
+    Raises ConfigError naming the file, the key, the value and what is allowed.
     """
     folder = folder or _folder()
     of_site = _read(site, needed=site != SITE)
@@ -188,7 +193,7 @@ def load(board: str | None, sets: Sequence[str] = (), *, folder: Path | None = N
 
 
 def describe(config: Config) -> str:
-    """One line a value, `section.key = value   # source`; the text is TOML that loads again as a site file."""
+    """One line per value, `section.key = value   # source`; the text is TOML that can be loaded as a site file."""
     values = {"board": json.dumps(config.board)}
     for name, key in _KEYS.items():
         section, _, last = name.partition(".")
@@ -211,7 +216,7 @@ def _read(path: Path, *, needed: bool) -> dict[str, Any]:
         raise ConfigError(f"{path}: no such file; check the path") from e
     except OSError as e:
         raise ConfigError(f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it") from e
-    except (ValueError, RecursionError) as e:  # of TOML, with the line, or of UTF-8; brackets in brackets
+    except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets
         raise ConfigError(f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes") from e
 
 
@@ -224,7 +229,7 @@ def _board_file(folder: Path, board: Any, where: str) -> Path:
 
 
 def _parse_set(text: str) -> dict[str, Any]:
-    """`section.key=value` as the table that a file would give."""
+    """`section.key=value` as the table that a file with this line gives."""
     name, equals, value = text.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (equals and dot):
@@ -237,7 +242,7 @@ def _parse_set(text: str) -> dict[str, Any]:
 
 
 def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
-    """Each value of a layer with its full name, as its field's type."""
+    """Each value of a layer with its full name, converted to its field's type."""
     for section, content in table.items():
         if section not in _SECTIONS:
             raise _unknown(section, [*_SECTIONS, "board"], where)
@@ -253,7 +258,7 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
 
 
 def _unknown(name: str, known: list[str], where: str) -> ConfigError:
-    """A right key in the wrong section is told before a key that only looks alike."""
+    """The error for an unknown name; a key of that name in another section is suggested before a similar spelling."""
     last = name.rpartition(".")[2]
     known = [k for k in known if k != name]
     near = [k for k in _KEYS if k.endswith(f".{last}")] or closest(name, known)
@@ -262,7 +267,7 @@ def _unknown(name: str, known: list[str], where: str) -> ConfigError:
 
 
 def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:
-    """Every line has one meaning."""
+    """Raises ConfigError where one line is given two meanings."""
     taken: dict[str, str] = {}
     for name in (n for n, key in _KEYS.items() if "line" in key.limits):
         for line in filter(None, [values[name]] if isinstance(values[name], str) else values[name]):

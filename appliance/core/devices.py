@@ -1,4 +1,4 @@
-"""What the drivers stand on: clock, GPIO module, USB backend. In: these. Out: Devices, which the simulator's replace."""
+"""Clock, GPIO module and USB backend that the drivers use. Here: the real ones; `sim.devices` has simulated ones."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from appliance.core.config import Config
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """What the drivers stand on. These are the real devices; the rig's world says otherwise.
+    """What the drivers use: the real devices, or those of a subclass (`sim.devices.SimDevices`).
 
-    gpio: the module gpiod or its double. backend: a pyusb backend, None for libusb. source: as sentences name it.
+    gpio: the module gpiod or its simulated double. backend: a pyusb backend, None for libusb. source: the name of the
+    source in sentences ("usb", "sim").
     """
 
     clock: Clock
@@ -22,9 +23,9 @@ class Devices:
     source: str = "usb"
 
     def wire(self, settings: Config) -> Config:
-        """The configuration as it fits this world."""
+        """The settings with the lines and ids of these devices; the real ones are wired as configured."""
         return settings
 
     def finished(self, answered: int) -> bool:
-        """True when nothing more will happen; a robot never says so."""
+        """True when nothing more will happen after `answered` sweeps; with real devices never."""
         return False

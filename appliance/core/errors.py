@@ -1,4 +1,4 @@
-"""The error tree of the box. Nothing comes in; each class is one kind of trouble and what a caller may do about it.
+"""The error tree of the box: each class is one kind of error, with the exit code of the command line.
 
 Messages are lower case, name the value that was wrong and say what to try. Exit codes are those of sysexits.h.
 """
@@ -7,25 +7,25 @@ from os import EX_CONFIG, EX_DATAERR, EX_UNAVAILABLE
 
 
 class ApplianceError(Exception):
-    """Anything that the box can name by itself; the command line prints it as one line and exits with `exit_code`."""
+    """Base of all expected errors; the command line prints one as a single line and exits with `exit_code`."""
 
     exit_code = 1
 
 
 class ConfigError(ApplianceError):
-    """A configuration file, key or value that cannot be used."""
+    """A configuration file, key or value cannot be used."""
 
     exit_code = EX_CONFIG
 
 
 class BundleError(ApplianceError):
-    """A model bundle that is incomplete, altered, or does not do what its manifest says."""
+    """A model bundle is incomplete, altered, or does not do what its manifest says."""
 
     exit_code = EX_CONFIG
 
 
 class SensorError(ApplianceError):
-    """The skin cannot be read. `state` names the trouble as the state sentence does (PROTOCOL.md, sensor states)."""
+    """The skin cannot be read. `state`: the sensor state of the STA sentence (PROTOCOL.md, sensor states)."""
 
     exit_code = EX_UNAVAILABLE
     state = "error"
@@ -44,7 +44,7 @@ class SensorBusy(SensorError):
 
 
 class SensorDenied(SensorError):
-    """The device node may not be opened by this user (errno 13)."""
+    """This user may not open the device node (errno 13)."""
 
     state = "denied"
 
@@ -56,19 +56,19 @@ class SensorMismatch(SensorError):
 
 
 class SensorLost(SensorError):
-    """The skin went away or failed while it was being read (errno 19, 5, 32, 71, 75)."""
+    """The skin was unplugged or failed while it was being read (errno 19, 5, 32, 71, 75)."""
 
     state = "lost"
 
 
 class SensorSilent(SensorError):
-    """The skin is there but sends nothing."""
+    """The skin is connected but sends nothing."""
 
     state = "silent"
 
 
 class LineError(ApplianceError):
-    """A GPIO line that cannot be found or requested, or an unusable libgpiod binding."""
+    """A GPIO line cannot be found or requested, or the libgpiod binding cannot be used."""
 
     exit_code = EX_UNAVAILABLE
 
@@ -80,6 +80,6 @@ class PortError(ApplianceError):
 
 
 class FormatError(ApplianceError):
-    """An array, file or sentence that does not have the form it should have."""
+    """An array, file or sentence does not have the required form."""
 
     exit_code = EX_DATAERR

@@ -1,4 +1,4 @@
-"""How the box is, told at the end of each turn of its loop. In: nothing. Out: Health, and what whoever watches must have."""
+"""The state of the box at the end of each turn of its loop (Health), and the interface of those who observe it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """How the box is at the end of a turn.
+    """State of the box at the end of a turn.
 
-    time_ns: host monotonic. skin: its state (PROTOCOL.md). trouble: why it does not stream, "" where it does. streams:
-    frames have come, and come. The counts are those of the STA sentence.
+    time_ns: host monotonic. skin: sensor state (PROTOCOL.md). trouble: why the skin does not stream, "" where it does.
+    streams: frames are arriving. The counts are those of the STA sentence.
     """
 
     time_ns: int
@@ -30,18 +30,18 @@ class Health:
 
     @property
     def text(self) -> str:
-        """In words, for a person."""
+        """One line for a person."""
         skin = f"skin {self.skin}: {self.trouble}" if self.trouble else f"skin {self.skin}"
         return f"{skin}. Sweeps answered: {self.answered}"
 
 
 class HealthObserver(Protocol):
-    """Whoever watches over the program: a turn that does not end is noticed by its silence."""
+    """Observes the loop, for example a watchdog, which notices a turn that does not end because no call comes."""
 
     def turn(self, health: Health) -> None:
-        """A turn of the loop is over: frames came in or the skin's absence was told, edges were polled, answers are out."""
+        """A turn of the loop has ended: frames were read or the skin's absence reported, edges polled, answers sent."""
         ...
 
     def stopping(self) -> None:
-        """The loop has ended; what is open is being answered."""
+        """The loop has ended; open sweeps are answered next."""
         ...

@@ -1,4 +1,4 @@
-"""Which code made a result. In: this checkout. Out: its commit, for result files."""
+"""Which code produced a result: the commit of this checkout, for result files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def commit() -> str:
-    """The commit that this code is of, with + where it was changed since; "unknown" outside a checkout."""
+    """The commit of this code, followed by + if files were changed since; "unknown" outside a checkout."""
     here = str(Path(__file__).parent)
     command = ["git", "-C", here, "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
     try:

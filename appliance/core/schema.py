@@ -1,7 +1,7 @@
-"""Reads settings and JSON by the dataclass that holds them. In: dataclasses, values from files. Out: these values, checked.
+"""Dataclasses as schemas of files. In: values from TOML or JSON. Out: these values, checked and as their fields' types.
 
-A field of the dataclass is the one place for a value's type, default and limits. TOML tables are read with `keys` and
-`read_table`, JSON objects with `typed`; `closest` finds what a misspelt name probably means.
+A field is the only place for a value's type, default and limits. TOML tables are read with `keys` and `read_table`,
+JSON objects with `typed`; `closest` finds the name that a misspelt one probably stands for.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def gpio_line() -> str:
 
 
 def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
-    """A field with its own reader. allowed: what may be written there, for a person. read: gives the value to keep, or None
-    where the value is not allowed. A dict as default is copied for each object."""
+    """A field with its own reader. allowed: what the file may hold, for messages. read: returns the value to keep, or
+    None if the given one is not allowed. A dict as default is copied for each object."""
     metadata = {"allowed": allowed, "read": read}
     if isinstance(default, dict):
         return field(default_factory=default.copy, metadata=metadata)
@@ -39,14 +39,14 @@ def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A field of a dataclass as a key of a TOML table. hint: its type. limits: the field's metadata."""
+    """A field of a dataclass as a key of a TOML table. hint: the field's type. limits: its metadata."""
 
     hint: Any
     default: Any
     limits: Mapping[str, Any]
 
     def fit(self, value: Any) -> Any:
-        """`value` as the field's type, or None where it is not allowed."""
+        """`value` as the field's type, or None if it is not allowed."""
         if "read" in self.limits:
             return self.limits["read"](value)
         if get_origin(self.hint) is Literal:
@@ -87,8 +87,8 @@ def read_table(
 ) -> dict[str, Any]:  # fmt: skip
     """The values of a TOML table as their fields' types, by name.
 
-    unknown: makes the error for a name that is not among `known`, which is raised. refused: makes the error for a value
-    that is not allowed from the text "NAME = VALUE is not allowed; use ...".
+    Raises the error that `unknown` makes of a name that is not in `known`, and the one that `refused` makes of the text
+    "NAME = VALUE is not allowed; use ...".
     """
     values = {}
     for name, value in table.items():
@@ -110,19 +110,19 @@ def shown(value: object) -> str:
 
 
 def closest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.5) -> list[str]:
-    """Up to `most` of the `known` names that a misspelt `name` may mean, the most similar first; case does not matter.
+    """Up to `most` of the `known` names that a misspelt `name` may stand for, the most similar first; case is ignored.
 
-    cutoff: least similarity from 0 to 1 (difflib's ratio).
+    cutoff: least similarity, 0 to 1 (difflib's ratio).
     """
     by_folded = {k.casefold(): k for k in known}
     return [by_folded[k] for k in get_close_matches(name.casefold(), by_folded, most, cutoff)]
 
 
 def typed(kind: type[_Kind], table: Any) -> _Kind:
-    """The dataclass `kind` from a JSON object; lists become tuples and objects dataclasses where its fields hold these.
+    """A `kind` (a dataclass) from a JSON object. Lists become tuples and objects dataclasses as its fields require.
 
-    What is accepted can be computed with and printed: integers where integers belong, finite numbers, printable texts.
-    Raises TypeError naming the field, and whatever `kind` raises about its own values.
+    Only values that can be computed with and printed are accepted: integers for int, finite numbers, printable strings.
+    Raises TypeError naming the field, and whatever the dataclass raises for its values.
     """
     hints = get_type_hints(kind)
     if not isinstance(table, dict) or not table.keys() <= hints.keys():
@@ -132,7 +132,7 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
     for name, value in values.items():
         if isinstance(value, str) and not value.isprintable():
             raise TypeError(f"{kind.__name__}.{name} = {value!r} cannot be shown")
-    made = kind(**values)  # what a class says of its own values is closer to them than their types
+    made = kind(**values)  # first, because what a class says about its values is more specific than their types
     for name, value in values.items():
         if not _fits(value, hints[name]):
             wanted = getattr(hints[name], "__name__", hints[name])
@@ -141,7 +141,7 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
 
 
 def _nested(hint: Any, value: Any) -> Any:
-    """A JSON value for a field of type `hint`, with lists as tuples and objects as dataclasses where the type says so."""
+    """A JSON value for a field of type `hint`: lists become tuples and objects dataclasses as the type requires."""
     if get_origin(hint) is tuple and isinstance(value, list):
         return tuple(value)
     if get_origin(hint) is dict and isinstance(value, dict):
@@ -154,14 +154,14 @@ def _nested(hint: Any, value: Any) -> Any:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a field of type `hint` may hold `value` from a file."""
+    """Whether `value` from a file is allowed for a field of type `hint`."""
     if get_origin(hint) is UnionType:
         return any(_fits(value, part) for part in get_args(hint))
     if get_origin(hint) is tuple:
         return type(value) is tuple and all(_fits(v, get_args(hint)[0]) for v in value)
     if get_origin(hint) is dict:
         return type(value) is dict and all(_fits(v, get_args(hint)[1]) for v in value.values())
-    if hint in (int, float):  # none of more than 64 bits, infinite or NaN
+    if hint in (int, float):  # at most 64 bits, finite
         return type(value) in (int, hint) and abs(value) <= (
             sys.float_info.max if type(value) is float else sys.maxsize
         )

@@ -1,7 +1,7 @@
-"""The room of the disk: files that are whole or not there. In: names and bytes. Out: these, through a loss of power too.
+"""Atomic writes: a file or folder is complete or absent, also after a loss of power. In: names and bytes. Out: files.
 
-A file is written aside, synced, renamed, and its folder synced: at every moment its name is what it was or the whole new
-content. Nothing here catches an OSError; who calls knows what is lost by it.
+A file is written under another name, synced and renamed, and its folder synced: at every moment its name refers to the
+old content or to all of the new. Nothing here handles an OSError; the caller knows what is lost by it.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PART = ".part"
-"""How the name of a file ends that is not finished; after a crash such a one may be taken away."""
+"""Suffix of a file that is not finished; after a crash such a file may be removed."""
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
-"""Of the Linux call renameat2."""
+"""Constants of the Linux system call renameat2."""
 
 
 def put(path: Path, data: bytes, *, parents: bool = False, durable: bool = True, mode: int | None = None) -> None:
-    """Write one file, whole or not at all. parents: make its folders. durable, mode: as for `put_all`.
+    """Write one file completely or not at all. parents: make its folders. durable, mode: as for `put_all`.
 
     Raises OSError, and then leaves nothing behind.
     """
@@ -29,11 +29,11 @@ def put(path: Path, data: bytes, *, parents: bool = False, durable: bool = True,
 
 
 def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | None = None) -> None:
-    """Write files of one folder; they take their names in this order, so the last may rely on those before it.
+    """Write files of one folder. They get their names in this order, so that a later file may refer to those before it.
 
-    durable: False leaves out the syncs; the file is still whole for every reader, but not after a loss of power. mode:
-    permission bits, whatever the umask; None leaves them to the umask. Raises OSError where that fails, and then leaves
-    none of them behind that was not there before.
+    durable: False omits the syncs: every reader still finds a complete file, but a loss of power may leave a broken
+    one. mode: permission bits, regardless of the umask; None leaves them to the umask.
+    Raises OSError, and then leaves behind no file that did not exist before.
     """
     asides = {target: target.with_name(target.name + PART) for target in files}
     taken: list[Path] = []
@@ -55,8 +55,7 @@ def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | No
 
 
 def write(path: Path, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:
-    """Write one file under its own name and sync it where it is to be `durable`: for a folder that takes its name only
-    when it is complete."""
+    """Write one file under its own name, synced if `durable`: for a folder that gets its name only when complete."""
     with path.open("wb") as f:
         if mode is not None:
             os.fchmod(f.fileno(), mode)
@@ -68,10 +67,10 @@ def write(path: Path, data: bytes, *, durable: bool = True, mode: int | None = N
 
 @contextmanager
 def folder(target: Path) -> Iterator[Path]:
-    """A new folder beside `target` that takes its name when the block ends well, in one step and with all its files on
-    the disk, and vanishes when it does not; what was at `target` gives way. Raises OSError.
+    """A new folder beside `target`. When the block ends without an exception its files are synced and it takes the name
+    `target` in one step, replacing what was there; otherwise it is removed. Raises OSError.
     """
-    import tempfile  # with all it brings 1 MB, and only where a bundle is written
+    import tempfile  # costs 1 MB of memory with its imports, needed only where a bundle is written
 
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as aside:
         new = Path(aside) / "new"
@@ -87,7 +86,7 @@ def folder(target: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Have a file's content, or the names in a folder, on the disk."""
+    """Flush a file's content, or the names in a folder, to the disk."""
     at = os.open(path, os.O_RDONLY)
     try:
         os.fsync(at)
@@ -96,7 +95,7 @@ def sync(path: Path) -> None:
 
 
 def link(path: Path, target: str) -> None:
-    """Have the symlink `path` lead to `target`, in one step; Linux cannot change one in place."""
+    """Point the symlink `path` to `target` in one step; Linux cannot change a symlink in place."""
     aside = path.with_name(path.name + PART)
     aside.unlink(missing_ok=True)
     aside.symlink_to(target)
@@ -105,7 +104,7 @@ def link(path: Path, target: str) -> None:
 
 
 def exchange(one: Path, other: Path) -> None:
-    """Swap two names in one step; Python's os has no such call."""
+    """Swap two names in one step (renameat2), for which Python's os has no function."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE):
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(other))

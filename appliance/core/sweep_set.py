@@ -1,6 +1,6 @@
-"""The form of a sweep set, for whoever plays it or trains on it. In: an .npz of a user's. Out: a checked SweepSet.
+"""Sweep sets, which the simulator plays and `train` learns from. In: a user's .npz. Out: a checked SweepSet.
 
-A broken file is refused by name: no later room looks at shapes again.
+All shapes and types are checked here, so that no other module has to.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from appliance.core.types import DIGITS, SweepFormat
+from appliance.core.types import DATA_TYPES, SweepFormat
 
 Array = NDArray[Any]
 Set = TypeVar("Set", bound="SweepSet")
@@ -23,11 +23,11 @@ Set = TypeVar("Set", bound="SweepSet")
 
 @dataclass(frozen=True)
 class SweepSet:
-    """N sweeps with what is known of them.
+    """N sweeps with their labels and groups.
 
-    samples: digits [N, T, R, C] of one of DIGITS. labels: int [N], index into `materials`.
-    groups: int [N] each; sweeps with the same number of `recording` are pieces of one recording.
-    Raises FormatError naming `source` and what is wrong.
+    samples: raw counts [N, T, R, C] of one of DATA_TYPES. labels: int [N], indices into `materials`. rate_hz: frames
+    per second. groups: int [N] each; sweeps with the same number in `recording` are parts of one recording. source: the
+    name used in messages. Raises FormatError naming `source` and what is wrong.
     """
 
     samples: Array
@@ -43,8 +43,8 @@ class SweepSet:
             raise self._error(
                 f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], none empty"
             )
-        if x.dtype.name not in DIGITS:
-            raise self._error(f"samples are {x.dtype}; use one of {', '.join(DIGITS)}{_conversion(x)}")
+        if x.dtype.name not in DATA_TYPES:
+            raise self._error(f"samples are {x.dtype}; use one of {', '.join(DATA_TYPES)}{_conversion(x)}")
         if x.dtype.kind == "f" and not np.isfinite(x).all():
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
@@ -75,12 +75,12 @@ class SweepSet:
 
     @property
     def format(self) -> SweepFormat:
-        """The form of each sweep."""
+        """The format of each sweep."""
         _, window, rows, cols = self.samples.shape
         return SweepFormat(rows, cols, self.rate_hz, window, self.samples.dtype.name)
 
     def group(self, name: str) -> Array:
-        """Group `name`, int [N]; where nothing is known of recordings each sweep is one. Raises FormatError."""
+        """Group `name`, int [N]; without a group `recording` each sweep is its own. Raises FormatError."""
         if name in self.groups:
             return self.groups[name]
         if name == "recording":
@@ -89,7 +89,7 @@ class SweepSet:
 
 
 def read(path: Path, what: str) -> dict[str, Array]:
-    """All arrays of an .npz, nothing unpickled. Raises FormatError saying that it is not `what`."""
+    """All arrays of an .npz by name; pickled objects are refused. Raises FormatError saying that it is not `what`."""
     try:
         with np.load(path, allow_pickle=False) as z:
             return {k: z[k] for k in z.files}
@@ -98,31 +98,31 @@ def read(path: Path, what: str) -> dict[str, Array]:
 
 
 def load_file(path: Path, kind: type[Set]) -> Set:
-    """The set in the .npz `path`. Raises FormatError naming what is missing or of the wrong form, and where."""
+    """The set in the .npz `path`. Raises FormatError naming the file and what is missing or of the wrong form."""
     return build(read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)"), path.name, kind)
 
 
-def build(held: dict[str, Array], source: str, kind: type[Set]) -> Set:
-    """The set of the arrays `held`, named as in a file. Raises FormatError naming `source` and what is wrong."""
-    missing = {"samples", "labels", "materials", "rate_hz"} - set(held)
+def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
+    """A set of `arrays`, named as in a file. Raises FormatError naming `source` and what is wrong."""
+    missing = {"samples", "labels", "materials", "rate_hz"} - set(arrays)
     if missing:
         raise FormatError(
             f"{source}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, materials, rate_hz"
         )
-    if held["materials"].ndim != 1 or held["materials"].dtype.kind != "U":
-        raise FormatError(f"{source}: materials hold {held['materials'].dtype}; give a list of names")
-    if held["rate_hz"].size != 1 or held["rate_hz"].dtype.kind not in "iuf":
-        raise FormatError(f"{source}: rate_hz holds {held['rate_hz']!r}; give one number, frames per second")
-    # torch and onnxruntime take this machine's byte order only
-    native = {k: v.astype(v.dtype.newbyteorder("="), copy=False) for k, v in held.items()}
+    if arrays["materials"].ndim != 1 or arrays["materials"].dtype.kind != "U":
+        raise FormatError(f"{source}: materials hold {arrays['materials'].dtype}; give a list of names")
+    if arrays["rate_hz"].size != 1 or arrays["rate_hz"].dtype.kind not in "iuf":
+        raise FormatError(f"{source}: rate_hz holds {arrays['rate_hz']!r}; give one number, frames per second")
+    # torch and onnxruntime accept only this machine's byte order
+    native = {k: v.astype(v.dtype.newbyteorder("="), copy=False) for k, v in arrays.items()}
     groups = {k.removeprefix("group_"): v for k, v in native.items() if k.startswith("group_")}
-    materials = tuple(str(m) for m in held["materials"])
-    return kind(native["samples"], native["labels"], materials, held["rate_hz"].item(), groups, source)
+    materials = tuple(str(m) for m in arrays["materials"])
+    return kind(native["samples"], native["labels"], materials, arrays["rate_hz"].item(), groups, source)
 
 
 def _conversion(x: Array) -> str:
-    """What to do with samples of another type: the first digit type that holds the same values, float32 for broken ones."""
+    """Advice for samples of another type: the first data type that holds the same values, float32 for fractions."""
     if x.dtype.kind not in "biuf":
         return ""
-    fits = (d for d in DIGITS if x.dtype.kind != "f" and (x.astype(d) == x).all())
+    fits = (d for d in DATA_TYPES if x.dtype.kind != "f" and (x.astype(d) == x).all())
     return f", e.g. samples.astype({next(fits, 'float32')!r})"

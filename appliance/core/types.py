@@ -1,6 +1,6 @@
-"""The format that every room shares: SweepFormat, Frames, Sweep, Verdict, Status. In and out: recorded sweeps on disk.
+"""The types that all packages share: SweepFormat, Frames, Sweep, Verdict, Status; recorded sweeps as files.
 
-Nothing here knows where frames come from. Times are nanoseconds of the host's `CLOCK_MONOTONIC`.
+Times are nanoseconds of the host's `CLOCK_MONOTONIC`.
 """
 
 from __future__ import annotations
@@ -23,21 +23,20 @@ from appliance.core import storage
 from appliance.core.errors import FormatError
 from appliance.core.schema import typed
 
-DIGITS = ("uint8", "int16", "uint16", "float32")
-"""Digit types of a taxel; the position in this tuple is the code on the wire (PROTOCOL.md)."""
+DATA_TYPES = ("uint8", "int16", "uint16", "float32")
+"""Data types of a taxel's raw count; the position in this tuple is its code in packets (PROTOCOL.md)."""
 
 EPOCH_BITS = 40
-"""An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`: frames of two plug-ins never look adjacent."""
-
-
+"""An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two enumerations of the
+board are never adjacent."""
 SCHEMA = 2
-"""Of a recorded sweep's sidecar. Schema 1 holds the sweep alone, and is still read."""
+"""Version of a recorded sweep's sidecar. Version 1 holds nothing but the sweep and is still read."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
-"""What numpy makes of a broken .npy, beside OSError; the last where it names a size that no machine has."""
+"""What numpy raises for a broken .npy, beside OSError; MemoryError if its header names an impossible size."""
 
 
 class Status(StrEnum):
-    """What became of a sweep. One list for sentences, lines and files; PROTOCOL.md explains each, a test compares."""
+    """The outcome of a sweep, in sentences, lines and files. PROTOCOL.md explains each; a test compares the lists."""
 
     OK = "ok"
     UNSURE = "unsure"
@@ -59,16 +58,16 @@ class Status(StrEnum):
 
     @property
     def classified(self) -> bool:
-        """True where a label was computed."""
+        """True if a label was computed."""
         return self in (Status.OK, Status.UNSURE, Status.UNDECIDED)
 
 
 @dataclass(frozen=True, slots=True)
 class SweepFormat:
-    """Form of a sweep: `rows` x `cols` taxels, `rate_hz` frames a second, `window` frames used, digits of type `dtype`.
+    """Format of a sweep: `rows` x `cols` taxels, `rate_hz` frames per second, `window` frames used, counts of `dtype`.
 
-    It belongs to a bundle: another skin is another format, not other code.
-    Raises FormatError where a value makes no sense.
+    It is part of a bundle: another skin needs another bundle, not other code.
+    Raises FormatError for a value out of range.
     """
 
     rows: int
@@ -78,18 +77,18 @@ class SweepFormat:
     dtype: str
 
     def __post_init__(self) -> None:
-        if self.dtype not in DIGITS:
-            raise FormatError(f"digit type {self.dtype!r} is unknown; use one of {', '.join(DIGITS)}")
+        if self.dtype not in DATA_TYPES:
+            raise FormatError(f"data type {self.dtype!r} is unknown; use one of {', '.join(DATA_TYPES)}")
         if not (1 <= self.rows <= 255 and 1 <= self.cols <= 255):
             raise FormatError(f"a grid of {self.rows} x {self.cols} taxels is out of range; use 1 to 255 each way")
-        if not 1e-3 <= self.rate_hz <= 1e6:  # a board tells thousandths
+        if not 1e-3 <= self.rate_hz <= 1e6:  # a board sends thousandths of 1 Hz
             raise FormatError(f"a rate of {self.rate_hz} Hz is out of range; use 0.001 to 1e6")
         if self.window < 1:
             raise FormatError(f"a window of {self.window} frames is empty; use at least 1")
 
     @property
     def digits(self) -> np.dtype[Any]:
-        """numpy type of one taxel, little-endian."""
+        """numpy type of one raw count, little-endian."""
         return np.dtype(self.dtype).newbyteorder("<")
 
     @property
@@ -99,7 +98,7 @@ class SweepFormat:
 
     @property
     def skin(self) -> tuple[int, int, str]:
-        """What a readout board must agree to: rows, columns, digit type."""
+        """What a readout board must have in common with a bundle: rows, columns, data type."""
         return self.rows, self.cols, self.dtype
 
     def __str__(self) -> str:
@@ -108,7 +107,7 @@ class SweepFormat:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """A run of frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped, taxels [n, R, C] digits."""
+    """n frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped numbers, taxels [n, R, C] raw counts."""
 
     t_ns: NDArray[np.int64]
     seq: NDArray[np.int64]
@@ -125,20 +124,21 @@ class Frames:
 
     @classmethod
     def joined(cls, runs: Sequence[Frames]) -> Frames:
-        """Several runs as one."""
+        """Several runs of frames as one."""
         return cls(*(np.concatenate([getattr(run, name) for run in runs]) for name in cls.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """One sweep as the recorder cut it. `frames` is the middle window where `status` is ok, and empty otherwise.
+    """One sweep as SweepCutter cut it. frames: the middle window if `status` is ok, otherwise empty.
 
-    share: 1, or less for a sweep that still goes on: so much of a window's frames, counted from `sweep.lead_ms` after
-    the start edge; `frames` are these, all that there are.
-    start_ns, stop_ns: trigger edges, host monotonic (equal where one is missing; before the stop edge the last frame).
-    lost: frames of the window that never came; where `status` is ok they were interpolated.
-    complete_ns: when the last thing needed (stop edge or frame) was in hand.
-    object: counts NEW OBJECT signals; 0 before the first, when sweeps stand alone and are not fused.
+    share: 1; less for a sweep that is still going on: the share of a window's frames that has come, counted from
+    `sweep.lead_ms` after the start edge; `frames` then are these frames.
+    start_ns, stop_ns: trigger edges, host monotonic (equal if one is missing; before the stop edge the last frame).
+    lost: frames of the window that never arrived; if `status` is ok they were interpolated.
+    complete_ns: when the last thing needed (stop edge or frame) had arrived.
+    object: number of NEW OBJECT signals so far; 0 before the first, when sweeps are not fused.
+    material, position, session: labels given while recording, "" for none.
     """
 
     id: int
@@ -159,12 +159,13 @@ class Sweep:
 class Verdict:
     """The answer to one sweep.
 
-    scores: float64 [C] probabilities of this sweep, or of all fused sweeps; empty where nothing was classified.
-    margin: probability of the label minus that of the next one. detail: what the status is about ("taxel 2,3").
-    latency_ns: from `Sweep.complete_ns` to the verdict. share: how much of the window was used: less
-    than 1 in an early answer. own: float64 [C] probabilities of this sweep alone; empty where nothing was classified.
-    moved: how far the contact lies from where training had it ("moved 2.1 mm too far towards row 4"), "" where it does
-    not, or the bundle cannot tell.
+    scores: float64 [K] probabilities of the K labels for this sweep, or for all fused sweeps; empty if nothing was
+    classified. margin: probability of the label minus that of the next one. detail: what the status refers to
+    ("taxel 2.3"). fused: number of sweeps in `scores`. lost: as in Sweep. latency_ns: from `Sweep.complete_ns` to the
+    verdict. bundle: id of the bundle. share: share of the window that was used, less than 1 in an early answer.
+    own: float64 [K] probabilities of this sweep alone; empty if nothing was classified.
+    moved: distance of the contact from its position in training ("moved 2.1 mm too far towards row 4"); "" if it is in
+    place, or if the bundle does not hold the positions.
     """
 
     sweep: int
@@ -184,7 +185,8 @@ class Verdict:
     moved: str = ""
 
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
-        """All fields by name, as JSON holds them; numbers come back bit for bit. arrays: with `scores` and `own`, as lists."""
+        """All fields by name, for JSON, which keeps numbers bit for bit. arrays: include `scores` and `own`, as
+        lists."""
         values = {name: getattr(self, name) for name in Verdict.__slots__}
         lists = {name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)}
         return values | lists if arrays else {name: v for name, v in values.items() if name not in lists}
@@ -195,42 +197,42 @@ def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
 
 
 def save(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Write `sweep` as `path` (.npy, one record a frame) and a JSON sidecar beside it, whole or not at all.
+    """Write `sweep` as `path` (.npy, one record per frame) with a JSON sidecar beside it, completely or not at all.
 
-    The sidecar takes its name first, so an .npy never lacks its description. about: what else it shall hold, under names
-    that a Sweep does not have. Raises OSError where writing fails, and then leaves nothing behind.
+    The sidecar gets its name first, so that an .npy always has one. about: further content of the sidecar, under names
+    that Sweep does not use. Raises OSError if writing fails, and then leaves nothing behind.
     """
     table = np.zeros(len(sweep.frames), _record_dtype(fmt))
     table["t_ns"], table["seq"], table["taxels"] = sweep.frames.t_ns, sweep.frames.seq, sweep.frames.taxels
     own = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"}
-    packed = io.BytesIO()  # into a file np.save writes past Python, and a full disk has no errno then
+    packed = io.BytesIO()  # np.save writes to a file without Python's I/O, and a full disk then gives no errno
     np.save(packed, table, allow_pickle=False)
-    told = {**about, **own, "format": asdict(fmt), "crc32": crc32(packed.getvalue()), "schema": SCHEMA}
-    storage.put_all({path.with_suffix(".json"): json.dumps(told, indent=1).encode(), path: packed.getvalue()})
+    content = {**about, **own, "format": asdict(fmt), "crc32": crc32(packed.getvalue()), "schema": SCHEMA}
+    storage.put_all({path.with_suffix(".json"): json.dumps(content, indent=1).encode(), path: packed.getvalue()})
 
 
 def sidecar(path: Path) -> dict[str, Any]:
-    """All that the sidecar of the .npy at `path` holds. Raises FormatError where it is missing or broken."""
+    """The content of the sidecar of the .npy at `path`. Raises FormatError if it is missing or broken."""
     try:
-        told = json.loads(path.with_suffix(".json").read_text("utf-8"))
-        if not isinstance(told, dict):
-            raise TypeError(f"{type(told).__name__} instead of an object")
-        return told
+        content = json.loads(path.with_suffix(".json").read_text("utf-8"))
+        if not isinstance(content, dict):
+            raise TypeError(f"{type(content).__name__} instead of an object")
+        return content
     except (ValueError, OSError, TypeError, RecursionError) as e:
         raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e
 
 
 def load(path: Path) -> tuple[Sweep, SweepFormat]:
-    """Read a sweep that `save` wrote. Raises FormatError where a file is missing, broken or of another form."""
-    told = sidecar(path)
+    """Read a sweep that `save` wrote. Raises FormatError if a file is missing, broken or of another form."""
+    content = sidecar(path)
     try:
         data = path.read_bytes()
-        if told.get("crc32", crc32(data)) != crc32(data):
+        if content.get("crc32", crc32(data)) != crc32(data):
             raise FormatError("its bytes are not those that were recorded: the file was altered")
         table = np.load(io.BytesIO(data), allow_pickle=False)
-        fmt = typed(SweepFormat, told.pop("format"))
-        schema = told.pop("schema")
-        status = Status(told.pop("status"))
+        fmt = typed(SweepFormat, content.pop("format"))
+        schema = content.pop("schema")
+        status = Status(content.pop("status"))
         if type(schema) is not int or not 1 <= schema <= SCHEMA:
             raise FormatError(
                 f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update one of them"
@@ -238,7 +240,7 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
         if table.dtype != _record_dtype(fmt) or table.ndim != 1:
             raise FormatError(f"records of {table.dtype} do not fit the format {fmt} of its sidecar")
         frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
-        own = told if schema == 1 else {name: told[name] for name in Sweep.__slots__ if name in told}
+        own = content if schema == 1 else {name: content[name] for name in Sweep.__slots__ if name in content}
         return typed(Sweep, own | {"status": status, "frames": frames}), fmt
     except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
         raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e

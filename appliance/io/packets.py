@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from appliance.core.types import DIGITS, EPOCH_BITS
+from appliance.core.types import DATA_TYPES, EPOCH_BITS
 
 MAGIC = b"\x50\xc1"
 VERSION = 1
@@ -26,7 +26,7 @@ MAX_FRAMES = 255
 RECENT = 1 << 16
 """A packet at most this many frames behind the newest is a repetition; one further behind is a count that restarted."""
 
-_DTYPES = tuple(np.dtype(d).newbyteorder("<") for d in DIGITS)
+_DTYPES = tuple(np.dtype(d).newbyteorder("<") for d in DATA_TYPES)
 _IDENTITY = struct.Struct("<BBBB16s16s")
 _FORMAT = struct.Struct("<BBBxIII")
 
@@ -226,7 +226,7 @@ def unpack_identity(payload: bytes) -> Identity:
 
 def pack_format(skin: SkinFormat) -> bytes:
     """Payload of the FORMAT reply."""
-    digit, rate_mhz = DIGITS.index(skin.dtype), round(skin.rate_hz * 1000)
+    digit, rate_mhz = DATA_TYPES.index(skin.dtype), round(skin.rate_hz * 1000)
     return _FORMAT.pack(skin.rows, skin.cols, digit, rate_mhz, skin.fifo_frames, skin.packet_frames)
 
 
@@ -235,9 +235,9 @@ def unpack_format(payload: bytes) -> SkinFormat:
     if len(payload) < _FORMAT.size:
         raise FormatError(f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the firmware")
     rows, cols, digit, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
-    if digit >= len(DIGITS):
-        raise FormatError(f"digit type {digit} is not on the list 0..{len(DIGITS) - 1}; update the appliance")
-    return SkinFormat(rows, cols, DIGITS[digit], rate_mhz / 1000, fifo_frames, packet_frames)
+    if digit >= len(DATA_TYPES):
+        raise FormatError(f"digit type {digit} is not on the list 0..{len(DATA_TYPES) - 1}; update the appliance")
+    return SkinFormat(rows, cols, DATA_TYPES[digit], rate_mhz / 1000, fifo_frames, packet_frames)
 
 
 def _text(raw: bytes) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from appliance.bundle import bundle
 from appliance.core import config
-from appliance.core.types import DIGITS, Frames, Status, Sweep, SweepFormat, save
+from appliance.core.types import DATA_TYPES, Frames, Status, Sweep, SweepFormat, save
 from appliance.io import packets, robot_link
 from appliance.io.trigger import Edge, EdgeKind
 from appliance.recording.capture import MAGIC, CaptureWriter
@@ -33,7 +33,7 @@ def unpack() -> list[bytes]:
     """Packets of a simulated sweep, of other skins, of a board that starts anew, and broken ones."""
     frames = next(iter(script.tubes(1, 1))).frames[:60]
     sent = [packets.pack(2**32 - 12 + 6 * i, 2**32 - 16_000 + 8000 * i, frames[6 * i : 6 * i + 6]) for i in range(5)]
-    others = [packets.pack(7, 9, np.arange(12).reshape(2, 2, 3).astype(d), packets.Flag.OVERFLOW) for d in DIGITS]
+    others = [packets.pack(7, 9, np.arange(12).reshape(2, 2, 3).astype(d), packets.Flag.OVERFLOW) for d in DATA_TYPES]
     who = packets.pack_identity(packets.Identity(1, (1, 2, 3), "Palpate skin", "0042"))
     form = packets.pack_format(packets.SkinFormat(4, 4, "uint8", 750, 750, 6))
     replies = packets.pack_reply(packets.Request.IDENTITY, who) + packets.pack_reply(packets.Request.FORMAT, form)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.core.errors import FormatError
-from appliance.core.types import DIGITS, EPOCH_BITS
+from appliance.core.types import DATA_TYPES, EPOCH_BITS
 from appliance.io import packets as wire
 from tests.factories.paths import ROOT
 
@@ -50,10 +50,10 @@ def test_document_names_the_numbers():
     assert all(f"| {r.value} | {r.name} |" in text for r in wire.Request)
     assert f"| 1 | IDENTITY | {len(wire.pack_identity(wire.Identity(1, (1, 2, 3), 'b', 's')))} bytes" in text
     assert f"| 2 | FORMAT | {len(wire.pack_format(wire.SkinFormat(4, 4, 'uint8', 750, 750, 4)))} bytes" in text
-    assert "data type: " + ", ".join(f"{i} {d}" for i, d in enumerate(DIGITS)) in text
+    assert "data type: " + ", ".join(f"{i} {d}" for i, d in enumerate(DATA_TYPES)) in text
 
 
-@pytest.mark.parametrize("dtype", DIGITS)
+@pytest.mark.parametrize("dtype", DATA_TYPES)
 def test_every_digit_type_survives(dtype: str):
     """Digits of each type arrive as they were sent."""
     sent = stream(2, dtype=dtype)
@@ -173,7 +173,7 @@ def test_identity_and_format_survive():
     [
         (wire.unpack_identity, b"\x01", "36"),
         (wire.unpack_format, b"\x01", "16"),
-        (wire.unpack_format, b"\x04\x04\x09" + bytes(13), "digit type 9"),
+        (wire.unpack_format, b"\x04\x04\x09" + bytes(13), "data type 9"),
     ],
 )
 def test_broken_replies_are_named(call, value, hint):
