@@ -45,12 +45,12 @@ class Alignment:
         self._latest = Frames.empty(self._model.format).taxels
         self._lowest = np.full(self._shape, np.inf)
         self._full = SHOWN * abs(self._model.manifest.thresholds.contact)
-        self._enumerations = self._sensor.tally.enumerations
+        self._enumerations = self._sensor.counters.enumerations
 
     def read(self) -> None:
         """Read frames from the skin; waits at most `sensor.timeout_ms`."""
         frames = self._sensor.read()
-        if self._sensor.tally.enumerations != self._enumerations:
+        if self._sensor.counters.enumerations != self._enumerations:
             self._reset()
         self._latest = np.concatenate([self._latest, frames.taxels])[-self._span :]
 

@@ -1,1 +1,2 @@
-"""Skin, GPIO lines and serial port: bytes and levels to frames, edges and sentences, and back."""
+"""Drivers: the skin on USB, GPIO lines and the serial port; bytes and levels to frames, edges and sentences, and
+back."""

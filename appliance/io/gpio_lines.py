@@ -1,5 +1,5 @@
-"""The lines room: GPIO by name. In: line names and the module gpiod. Out: requests, and READY, BUSY, FAULT, DECIDED,
-class bits, RESULT VALID as levels.
+"""GPIO lines by name. In: line names and the module gpiod. Out: line requests; READY, BUSY, FAULT, DECIDED, class bits
+and RESULT VALID as levels.
 
 Everything goes through libgpiod v2; the module itself (`import gpiod`, or the simulator's double) is passed in.
 """
@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from appliance.core.config import OutputConfig
 
 MAX_CHIPS = 256
-"""The kernel makes no more GPIO devices (GPIO_DEV_MAX)."""
+"""Largest number of GPIO devices in the kernel (GPIO_DEV_MAX)."""
 QUEUE = 1024
-"""Events that the kernel may hold for one request; it grants no more. Then it drops the oldest."""
+"""Length of the kernel's event queue of one request, the largest that it grants; when full it drops the oldest
+event."""
 _ADVICE = {
     errno.EACCES: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
     errno.EPERM: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
@@ -35,7 +36,7 @@ _ADVICE = {
 
 
 def check_binding(gpio: Any) -> None:
-    """Raise LineError unless `gpio` is the libgpiod v2 binding or does as it does."""
+    """Raise LineError unless `gpio` is the libgpiod v2 binding or a double of it."""
     if not (hasattr(gpio, "request_lines") and hasattr(gpio, "LineSettings")):
         raise LineError(
             f"module gpiod {getattr(gpio, '__version__', 'of unknown version')} is not the libgpiod v2 binding; "
@@ -44,9 +45,10 @@ def check_binding(gpio: Any) -> None:
 
 
 def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
-    """Name -> (path of its chip, offset there), over all chips of this machine.
+    """Name -> (path of its chip, offset on it), searched on all chips of this machine.
 
-    Raises LineError for a name given twice, missing or ambiguous, for chips that may not be opened, and for no chip.
+    Raises LineError for a name that is given twice, missing or ambiguous, for chips that may not be opened, and if
+    there is no chip.
     """
     if len(set(names)) < len(names):
         raise LineError(f"a gpio line is given two roles in {', '.join(names)}; give each role its own line")
@@ -69,7 +71,7 @@ def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
 
 
 def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
-    """All named lines with their places, and the chips that may not be opened."""
+    """All named lines with their (chip path, offset), and the paths of chips that may not be opened."""
     places: dict[str, list[tuple[str, int]]] = {}
     denied = []
     chips = set()
@@ -77,7 +79,7 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
         try:
             with gpio.Chip(path) as chip:
                 info = chip.get_info()
-                if info.name in chips:  # a link to a chip that was seen already, as Raspberry Pi OS has
+                if info.name in chips:  # a second device name of the same chip, as Raspberry Pi OS has one
                     continue
                 chips.add(info.name)
                 for offset in range(info.num_lines):
@@ -93,14 +95,14 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
 
 
 def line_error(doing: str, names: Iterable[str], e: OSError) -> LineError:
-    """What an errno means to a person, with the lines that it befell."""
+    """A LineError that explains an errno and names the lines it concerns."""
     advice = _ADVICE.get(e.errno or 0, "see the kernel log (dmesg)")
     return LineError(f"cannot {doing} gpio lines {', '.join(names)}: {e.strerror} (errno {e.errno}); {advice}")
 
 
 @contextmanager
 def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
-    """Make a LineError that names the lines of any OSError."""
+    """Turn an OSError into a LineError that names the lines."""
     try:
         yield
     except OSError as e:
@@ -108,12 +110,12 @@ def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
 
 
 def request_lines(
-    gpio: Any, names: Sequence[str], settings: Any, stack: ExitStack, *, apart: bool = False
+    gpio: Any, names: Sequence[str], settings: Any, stack: ExitStack, *, separate: bool = False
 ) -> list[tuple[LineRequest, dict[int, str]]]:
-    """One request per chip, or with `apart` one per line, each with {offset: name}; `stack` releases them."""
+    """One request per chip, or with `separate` one per line, each with its {offset: name}; `stack` releases them."""
     groups: dict[tuple[str, str], dict[int, str]] = {}
     for name, (path, offset) in find_lines(gpio, names).items():
-        groups.setdefault((path, name if apart else ""), {})[offset] = name
+        groups.setdefault((path, name if separate else ""), {})[offset] = name
     requests = []
     for (path, _), lines in groups.items():
         with naming("request", lines.values()):
@@ -124,20 +126,20 @@ def request_lines(
 
 
 class Lines:
-    """The box's answer on GPIO; all lines are low at first. An empty name is a line that is not wired.
+    """The box's output lines; all are low at first. An empty name is a line that is not wired.
 
-    Raises LineError where lines cannot be found, requested or written.
+    Raises LineError if lines cannot be found, requested or written.
     """
 
     def __init__(self, config: OutputConfig, gpio: Any, clock: Clock) -> None:
         check_binding(gpio)
-        self._panel = config.ready, config.busy, config.fault, config.decided
+        self._status_lines = config.ready, config.busy, config.fault, config.decided
         self._valid, self._bits = config.result_valid, config.class_bits
         self._settle_ns = config.settle_us * 1000
         self._clock, self._value = clock, gpio.line.Value
-        names = [name for name in (*self._panel, self._valid, *self._bits) if name]
+        names = [name for name in (*self._status_lines, self._valid, *self._bits) if name]
         self._levels = dict.fromkeys(names, False)
-        self._shown = False, False, False, False
+        self._status = False, False, False, False
         settings = gpio.LineSettings(direction=gpio.line.Direction.OUTPUT, output_value=self._value.INACTIVE)
         with ExitStack() as stack:
             self._requests = request_lines(gpio, names, settings, stack)
@@ -145,22 +147,22 @@ class Lines:
 
     @property
     def capacity(self) -> int:
-        """How many codes the class bits can tell apart: 2 to the number of bits."""
+        """Number of codes that the class bits can represent: 2 to the number of bits."""
         return 1 << len(self._bits)
 
     def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
-        """Drive READY, BUSY, FAULT, DECIDED; writes only what has changed. RESULT VALID falls when a sweep begins."""
-        if (ready, busy, fault, decided) == self._shown:
+        """Set READY, BUSY, FAULT and DECIDED; only changes are written. RESULT VALID falls when BUSY rises."""
+        if (ready, busy, fault, decided) == self._status:
             return
-        if busy and not self._shown[1]:
+        if busy and not self._status[1]:
             self.result(None)
-        self._shown = ready, busy, fault, decided
-        self._write(dict(zip(self._panel, self._shown, strict=True)))
+        self._status = ready, busy, fault, decided
+        self._write(dict(zip(self._status_lines, self._status, strict=True)))
 
     def result(self, code: int | None) -> None:
-        """Show a class: RESULT VALID falls, the class bits change, and `settle_us` later RESULT VALID rises.
+        """Output a class code: RESULT VALID falls, the class bits change, and `settle_us` later RESULT VALID rises.
 
-        None only lets it fall. A code outside 0..capacity-1 does the same and raises LineError.
+        With None RESULT VALID only falls. A code outside 0..capacity-1 lets it fall, too, and raises LineError.
         """
         self._write({self._valid: False})
         if code is None:
@@ -174,7 +176,7 @@ class Lines:
         self._write({self._valid: True})
 
     def close(self) -> None:
-        """All low, then give the lines back: what a chip does with a line that nobody holds is its own affair."""
+        """Set all lines low, then release them; the level of a line that nobody holds is up to its chip."""
         try:
             self._write(dict.fromkeys(self._levels, False))
         finally:
@@ -184,13 +186,13 @@ class Lines:
     def _write(self, wanted: dict[str, bool]) -> None:
         new = {name: level for name, level in wanted.items() if self._levels.get(name, level) != level}
         for request, names in self._requests:
-            mine = {offset: name for offset, name in names.items() if name in new}
-            if mine:
-                with naming("write", mine.values()):
+            changed = {offset: name for offset, name in names.items() if name in new}
+            if changed:
+                with naming("write", changed.values()):
                     request.set_values(
-                        {o: self._value.ACTIVE if new[n] else self._value.INACTIVE for o, n in mine.items()}
+                        {o: self._value.ACTIVE if new[n] else self._value.INACTIVE for o, n in changed.items()}
                     )
-                self._levels.update({name: new[name] for name in mine.values()})
+                self._levels.update({name: new[name] for name in changed.values()})
 
     def __enter__(self) -> Self:
         return self

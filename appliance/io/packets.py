@@ -1,6 +1,7 @@
-"""Bytes <-> frames: firmware_config/PROTOCOL.md part 1 in pure functions. In: bytes. Out: packets and what was lost.
+"""Packets of the readout board (firmware_config/PROTOCOL.md, part 1) in pure functions. In: bytes. Out: packets, and
+how many bytes and frames were lost.
 
-Nothing here raises on what a wire can bring, and a frame is given out only where its packet's CRC is right.
+No received bytes make `unpack` or `follow` raise, and only frames of packets with a correct CRC are returned.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ CRC = struct.Struct("<I")
 MAX_PAYLOAD = 4096
 MAX_FRAMES = 255
 RECENT = 1 << 16
-"""A packet at most this many frames behind the newest is a repetition; one further behind is a count that restarted."""
+"""A packet at most this many frames behind the newest is a repetition; further behind, the board has restarted its
+count."""
 
 _DTYPES = tuple(np.dtype(d).newbyteorder("<") for d in DATA_TYPES)
 _IDENTITY = struct.Struct("<BBBB16s16s")
@@ -46,7 +48,7 @@ class Flag(IntFlag):
 
 
 class Request(IntEnum):
-    """Control requests: bRequest of a vendor device, one byte on the bulk OUT endpoint of a CDC-ACM board."""
+    """Requests: bRequest of a vendor device, or one byte on the bulk OUT endpoint of a CDC-ACM board."""
 
     IDENTITY = 1
     FORMAT = 2
@@ -56,7 +58,8 @@ class Request(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """Frames in a row: seq and t_us (32 bits, as sent) of the first, flags (bits of Flag), taxels [n, R, C] digits."""
+    """Consecutive frames. seq, t_us: sequence number and time of the first, 32 bits as sent. flags: bits of Flag.
+    taxels: raw counts [n, R, C]."""
 
     seq: int
     t_us: int
@@ -74,7 +77,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Unpacked:
-    """What a run of bytes held: packets and replies in order, bytes that belonged to none, and the unfinished rest."""
+    """What bytes contained: packets and replies in order, the number of bytes outside them, and the unfinished rest."""
 
     packets: list[Packet]
     replies: list[Reply]
@@ -84,7 +87,7 @@ class Unpacked:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who a readout board says it is."""
+    """A readout board's answer to IDENTITY: protocol version, firmware version, board name, serial number."""
 
     protocol: int
     firmware: tuple[int, int, int]
@@ -94,7 +97,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class SkinFormat:
-    """What a readout board sends: grid, digit type, frames a second, frames in its FIFO and in a packet."""
+    """What a readout board sends: grid, data type, frames per second, frames in its FIFO and in a packet."""
 
     rows: int
     cols: int
@@ -106,7 +109,8 @@ class SkinFormat:
 
 @dataclass(frozen=True, slots=True)
 class StreamPosition:
-    """Where in the stream we are: number of the enumeration, and the unwrapped number of the next frame if any came."""
+    """Position in the stream: number of the enumeration, and the unwrapped number of the next frame; None before the
+    first."""
 
     epoch: int
     next: int | None = None
@@ -117,34 +121,37 @@ def _seal(head: bytes, payload: bytes) -> bytes:
 
 
 def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
-    """A frame packet; taxels [n, R, C] of a digit type on the list. seq and t_us are taken modulo 2**32."""
+    """A frame packet. taxels: raw counts [n, R, C] of one of DATA_TYPES. seq and t_us are sent modulo 2**32.
+
+    Raises FormatError if the frames do not fit one packet.
+    """
     n, rows, cols = taxels.shape
-    digit = _DTYPES.index(taxels.dtype.newbyteorder("<"))
-    payload = taxels.astype(_DTYPES[digit], copy=False).tobytes()
+    code = _DTYPES.index(taxels.dtype.newbyteorder("<"))
+    payload = taxels.astype(_DTYPES[code], copy=False).tobytes()
     if not 0 < n <= MAX_FRAMES or len(payload) > MAX_PAYLOAD:
         raise FormatError(
             f"{n} frames of {rows} x {cols} taxels do not fit a packet of {MAX_PAYLOAD} bytes; send fewer"
         )
     head = HEADER.pack(
-        MAGIC, VERSION, PacketKind.FRAMES, len(payload), flags, n, rows, cols, digit, seq % (1 << 32), t_us % (1 << 32)
+        MAGIC, VERSION, PacketKind.FRAMES, len(payload), flags, n, rows, cols, code, seq % (1 << 32), t_us % (1 << 32)
     )
     return _seal(head, payload)
 
 
 def pack_reply(request: Request, payload: bytes, version: int = VERSION) -> bytes:
-    """A reply packet, as a CDC-ACM board answers a request byte."""
+    """A reply packet: a CDC-ACM board's answer to a request byte."""
     return _seal(HEADER.pack(MAGIC, version, PacketKind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0), payload)
 
 
 def unpack(data: bytes) -> Unpacked:
-    """Find all whole packets in `data`. Feed the leftover back in front of what comes next."""
+    """Find all complete packets in `data`. Put the leftover in front of the next bytes."""
     packets: list[Packet] = []
     replies: list[Reply] = []
     garbage = at = 0
     while True:
         start = data.find(MAGIC, at)
         if start < 0:
-            # the last byte may be the first half of a magic
+            # the last byte may be the first half of MAGIC
             keep = 1 if data[at:].endswith(MAGIC[:1]) else 0
             garbage += len(data) - at - keep
             return Unpacked(packets, replies, garbage, data[len(data) - keep :])
@@ -162,13 +169,13 @@ def unpack(data: bytes) -> Unpacked:
 
 
 def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
-    """The packet at `at` and its size; (None, 0) where more bytes are needed, (None, 1) where it is none."""
+    """The packet at `at` and its size; (None, 0) if more bytes are needed, (None, 1) if there is no packet."""
     if len(data) - at < HEADER.size:
         return None, 0
-    _, version, kind, length, flags, count, rows, cols, digit, seq, t_us = HEADER.unpack_from(data, at)
-    frames = kind == PacketKind.FRAMES and version == VERSION and digit < len(_DTYPES) and count > 0 and rows * cols > 0
+    _, version, kind, length, flags, count, rows, cols, code, seq, t_us = HEADER.unpack_from(data, at)
+    frames = kind == PacketKind.FRAMES and version == VERSION and code < len(_DTYPES) and count > 0 and rows * cols > 0
     if frames:
-        frames = length == count * rows * cols * _DTYPES[digit].itemsize
+        frames = length == count * rows * cols * _DTYPES[code].itemsize
     if length > MAX_PAYLOAD or not (frames or kind == PacketKind.REPLY):
         return None, 1
     end = at + HEADER.size + length
@@ -179,34 +186,36 @@ def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
     size = end + CRC.size - at
     if kind == PacketKind.REPLY:
         return Reply(count, data[at + HEADER.size : end]), size
-    taxels = np.frombuffer(data, _DTYPES[digit], count * rows * cols, at + HEADER.size).reshape(count, rows, cols)
+    taxels = np.frombuffer(data, _DTYPES[code], count * rows * cols, at + HEADER.size).reshape(count, rows, cols)
     return Packet(seq, t_us, flags, taxels), size
 
 
-def follow(packets: list[Packet], place: StreamPosition) -> tuple[list[tuple[int, Packet]], StreamPosition, int, int]:
-    """Unwrap sequence numbers: ([(unwrapped number of the first frame, packet)], new place, lost frames, stale frames).
+def follow(
+    packets: list[Packet], position: StreamPosition
+) -> tuple[list[tuple[int, Packet]], StreamPosition, int, int]:
+    """Unwrap sequence numbers: ([(unwrapped number of the first frame, packet)], new position, lost and stale frames).
 
-    A packet that lies behind is stale (repeated or late) and left out; one that lies far behind starts a new epoch,
-    since the board's count has restarted. Frames are `lost` where the count jumps ahead.
+    A packet behind the position is stale (repeated or late) and is left out. One that is more than RECENT frames behind
+    begins a new epoch, since the board has restarted its count. Frames are lost where the count jumps ahead.
     """
     fresh: list[tuple[int, Packet]] = []
     lost = stale = 0
     for p in packets:
         n = len(p.taxels)
-        ahead = 0 if place.next is None else (p.seq - place.next + (1 << 31)) % (1 << 32) - (1 << 31)
+        ahead = 0 if position.next is None else (p.seq - position.next + (1 << 31)) % (1 << 32) - (1 << 31)
         if -RECENT <= ahead < 0:
             stale += n
             continue
         if ahead < 0:
-            place = StreamPosition(place.epoch + 1)
-        if place.next is None:
-            first = (place.epoch << EPOCH_BITS) + p.seq
+            position = StreamPosition(position.epoch + 1)
+        if position.next is None:
+            first = (position.epoch << EPOCH_BITS) + p.seq
         else:
-            first = place.next + ahead
+            first = position.next + ahead
             lost += ahead
         fresh.append((first, p))
-        place = StreamPosition(place.epoch, first + n)
-    return fresh, place, lost, stale
+        position = StreamPosition(position.epoch, first + n)
+    return fresh, position, lost, stale
 
 
 def pack_identity(who: Identity) -> bytes:
@@ -215,7 +224,7 @@ def pack_identity(who: Identity) -> bytes:
 
 
 def unpack_identity(payload: bytes) -> Identity:
-    """Read an IDENTITY reply. Raises FormatError where it is too short; a newer board may send a longer one."""
+    """Read an IDENTITY reply. Raises FormatError if it is too short; a newer board may send a longer one."""
     if len(payload) < _IDENTITY.size:
         raise FormatError(
             f"identity of {len(payload)} bytes; protocol {VERSION} has {_IDENTITY.size}: check the firmware"
@@ -226,18 +235,18 @@ def unpack_identity(payload: bytes) -> Identity:
 
 def pack_format(skin: SkinFormat) -> bytes:
     """Payload of the FORMAT reply."""
-    digit, rate_mhz = DATA_TYPES.index(skin.dtype), round(skin.rate_hz * 1000)
-    return _FORMAT.pack(skin.rows, skin.cols, digit, rate_mhz, skin.fifo_frames, skin.packet_frames)
+    code, rate_mhz = DATA_TYPES.index(skin.dtype), round(skin.rate_hz * 1000)
+    return _FORMAT.pack(skin.rows, skin.cols, code, rate_mhz, skin.fifo_frames, skin.packet_frames)
 
 
 def unpack_format(payload: bytes) -> SkinFormat:
-    """Read a FORMAT reply. Raises FormatError where it is too short or its digit type is not on the list."""
+    """Read a FORMAT reply. Raises FormatError if it is too short or the code of its data type is unknown."""
     if len(payload) < _FORMAT.size:
         raise FormatError(f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the firmware")
-    rows, cols, digit, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
-    if digit >= len(DATA_TYPES):
-        raise FormatError(f"digit type {digit} is not on the list 0..{len(DATA_TYPES) - 1}; update the appliance")
-    return SkinFormat(rows, cols, DATA_TYPES[digit], rate_mhz / 1000, fifo_frames, packet_frames)
+    rows, cols, code, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
+    if code >= len(DATA_TYPES):
+        raise FormatError(f"data type {code} is not on the list 0..{len(DATA_TYPES) - 1}; update the appliance")
+    return SkinFormat(rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo_frames, packet_frames)
 
 
 def _text(raw: bytes) -> str:

@@ -1,7 +1,7 @@
-"""Verdict -> sentence on the serial line, code on GPIO lines. Commands come back in over the serial line.
+"""The serial line to the robot. In: verdicts, and bytes of the robot controller. Out: sentences, and its commands.
 
-Sentences are formed and read by pure functions (PROTOCOL.md, part 2); the port is never waited for: a peer that does
-not read costs dropped and counted sentences, and not one frame.
+Pure functions write and read sentences (PROTOCOL.md, part 2). Nothing here waits for the port: if the peer does not
+read, sentences are dropped and counted, and no frame is lost.
 """
 
 from __future__ import annotations
@@ -28,26 +28,28 @@ from appliance.core.types import Verdict
 
 TALKER = "PPLP"
 COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD")
-TOLD = ("MATERIAL", "POSITION", "SESSION")
-"""Those that have a text after a comma."""
+LABEL_COMMANDS = ("MATERIAL", "POSITION", "SESSION")
+"""The commands that have a text after a comma."""
 MAX_LINE = 128
+"""Characters of a sentence or command."""
 RETRY_NS = 1_000_000_000
-"""How often a port that is gone is tried again."""
+"""Time between two attempts to open a port that is gone."""
 PSEUDO_TERMINALS = range(136, 144)
-"""Their major device numbers."""
+"""Major device numbers of pseudo-terminals."""
 _UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 
 
 class ResultSink(Protocol):
-    """Whatever takes verdicts."""
+    """Receives verdicts."""
 
     def send(self, verdict: Verdict) -> None:
-        """Pass a verdict on without waiting."""
+        """Output a verdict without waiting."""
         ...
 
 
 class Port(ResultSink, Protocol):
-    """A line to the robot controller: verdicts and other sentences out, commands in."""
+    """A line to the robot controller: verdicts and other sentences out, commands in. dropped: sentences that were not
+    sent. trouble: why the line does not work, "" where it does."""
 
     dropped: int
     trouble: str
@@ -61,13 +63,14 @@ class Port(ResultSink, Protocol):
         ...
 
     def close(self) -> None:
-        """Let the line go."""
+        """Release the line."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A line from the robot controller: one of COMMANDS, with its text where it has one; or `error`: why it is none."""
+    """A line from the robot controller: one of COMMANDS with its text if it has one, or `error`: why it is no
+    command."""
 
     name: str
     text: str = ""
@@ -75,23 +78,24 @@ class Command:
 
     @property
     def line(self) -> str:
-        """As it stands in a sentence or a capture."""
-        return f"{self.name},{self.text}" if self.name in TOLD else self.name
+        """The command as it is written in a sentence or a capture."""
+        return f"{self.name},{self.text}" if self.name in LABEL_COMMANDS else self.name
 
 
 def checksum(body: str) -> str:
-    """NMEA 0183: exclusive or of the characters between $ and *, two hex digits."""
+    """Checksum of NMEA 0183: exclusive or of the characters between $ and *, as two hexadecimal digits."""
     return f"{reduce(xor, body.encode('ascii'), 0):02X}"
 
 
 def sentence(kind: str, *fields: object) -> bytes:
-    """`$PPLP,KIND,field,…*hh` with CR and LF. What NMEA reserves becomes a space; too long a last field is cut."""
+    """`$PPLP,KIND,field,…*hh` with CR and LF. Characters that NMEA reserves become spaces; a line that is too long is
+    cut."""
     body = ",".join([TALKER, kind, *(_UNSAFE.sub(" ", str(f)) for f in fields)])[: MAX_LINE - 6]
     return f"${body}*{checksum(body)}\r\n".encode("ascii")
 
 
 def result(v: Verdict, source: str) -> bytes:
-    """The RES sentence of a verdict; `source` says where the frames came from (usb, sim, replay)."""
+    """The RES sentence of a verdict. source: where the frames came from (usb, sim, replay)."""
     return sentence(
         "RES", v.sweep, f"{v.time_ns / 1e9:.3f}", v.status, v.label, f"{v.probability:.3f}", f"{v.margin:.3f}",
         v.fused, v.lost, f"{v.latency_ns / 1e6:.2f}", v.bundle, source, f"{v.share:.2f}", v.detail,
@@ -99,15 +103,16 @@ def result(v: Verdict, source: str) -> bytes:
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
-    """Commands in `data`, which goes on where `rest` ended, and the new unfinished rest.
+    """The commands in `data`, which continues `rest`, and the new unfinished rest.
 
-    A checksum may be left out by a person, but not be wrong. One Command a line, however it is cut: a line of over
-    MAX_LINE characters is told once; the rest then holds one more than these, so that its end is not taken for a line.
+    A checksum may be missing, so that a person can type commands, but not wrong. Each line gives one Command, however
+    it is split. A line of over MAX_LINE characters is reported once; the rest then holds one character more than these,
+    so that the end of the line is not taken for a command.
     """
-    told = len(rest) > MAX_LINE
+    reported = len(rest) > MAX_LINE
     *lines, rest = re.split(rb"[\r\n]+", rest + data)
-    commands = [_command(line) for line in lines[told:] if line]
-    if len(rest) > MAX_LINE and (lines or not told):
+    commands = [_command(line) for line in lines[reported:] if line]
+    if len(rest) > MAX_LINE and (lines or not reported):
         commands.append(_command(rest))
     return commands, rest[: MAX_LINE + 1]
 
@@ -115,33 +120,33 @@ def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
 def _command(line: bytes) -> Command:
     if len(line) > MAX_LINE:
         return Command("", error=f"line of over {MAX_LINE} characters without an end")
-    # a name of letters only: it is sent back, and what noise held in its place could take the answer's fields away
-    # a sentence begins at its $: what noise or a break has left before it is no part of it
+    # the name holds letters only: it is sent back, and noise in its place could displace the fields of the answer
+    # a sentence begins at its $: noise or a break may have left bytes before it
     match = re.fullmatch(rb"(?s:.*\$)?PPLP,([A-Za-z]{0,16})(?:,([ -#%-)+-~]*))?(?:\*([0-9A-Fa-f]{2}))?", line.strip())
     if not match:
         return Command("", error=f"not a command; send for example $PPLP,ID*{checksum('PPLP,ID')}")
     name = match[1].decode()
     text, given = (None if group is None else group.decode() for group in match.group(2, 3))
-    said = f"{TALKER},{name}" + ("" if text is None else f",{text}")
-    if given and given.upper() != checksum(said):
-        return Command(name, error=f"checksum {given} should be {checksum(said)}")
+    body = f"{TALKER},{name}" + ("" if text is None else f",{text}")
+    if given and given.upper() != checksum(body):
+        return Command(name, error=f"checksum {given} should be {checksum(body)}")
     return command(name, text)
 
 
 def command(name: str, text: str | None = None) -> Command:
-    """The command `name` with its text, or one that says why there is none."""
+    """The command `name` with its text, or a Command whose `error` says why there is none."""
     if name not in COMMANDS or _UNSAFE.search(text or ""):
         return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
-    if (name in TOLD) != (text is not None):
-        want = f"{TALKER},{name}" + (",TEXT" if name in TOLD else "")
+    if (name in LABEL_COMMANDS) != (text is not None):
+        want = f"{TALKER},{name}" + (",TEXT" if name in LABEL_COMMANDS else "")
         return Command(name, error=f"send it as ${want}")
     return Command(name, text or "")
 
 
 class StdoutPort:
-    """Sentences on standard output, where no serial port is configured.
+    """Sentences on standard output, used if no serial port is configured.
 
-    commands: where they come from; nobody can command on standard output itself.
+    commands: another source of commands, since standard output has none.
     """
 
     def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
@@ -157,17 +162,18 @@ class StdoutPort:
         sys.stdout.buffer.flush()
 
     def commands(self) -> list[Command]:
-        """Whatever the other source has."""
+        """Commands of the other source."""
         return self._commands()
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Standard output stays open."""
 
 
 class SerialSink:
-    """Sentences out of and commands into a serial port that may come and go.
+    """Sentences to and commands from a serial port, which may be unplugged and come back.
 
-    opener: makes a `serial.Serial`; passed in so that a test can refuse. dropped: sentences that nobody took.
+    opener: creates a `serial.Serial`; passed in so that a test can refuse. dropped: sentences that the peer did not
+    read.
     """
 
     def __init__(
@@ -179,15 +185,15 @@ class SerialSink:
         self._port: Any = None
         self._retry_ns = clock.now_ns()
         self._queue: deque[bytes] = deque()
-        self._begun = 0  # bytes of the first sentence in the queue that are out already
+        self._begun = 0  # bytes of the first sentence in the queue that were sent already
         self._rest = b""
 
     def send(self, verdict: Verdict) -> None:
-        """Queue a verdict's sentence and hand over what the port takes."""
+        """Queue a verdict's sentence and send what the port accepts now."""
         self.say(result(verdict, self._source))
 
     def say(self, line: bytes) -> None:
-        """Queue a sentence; with a full queue the oldest that has not begun is dropped and counted."""
+        """Queue a sentence; if the queue is full the oldest one that was not begun is dropped and counted."""
         if len(self._queue) >= self._config.queue:
             del self._queue[1 if self._begun else 0]
             self.dropped += 1
@@ -195,7 +201,7 @@ class SerialSink:
         self._flush()
 
     def commands(self) -> list[Command]:
-        """Hand over what waits, and the commands that have come in since the last call."""
+        """Send what is queued; returns the commands that have come in since the last call."""
         self._flush()
         if not self._port:
             return []
@@ -210,11 +216,11 @@ class SerialSink:
         return found
 
     def close(self) -> None:
-        """Close the port; what it has not taken is dropped."""
+        """Close the port; sentences that were not sent are lost."""
         if self._port:
             port, self._port = self._port, None
             with contextlib.suppress(OSError):  # a port that is gone cannot be closed properly
-                # another program may have it open from before us; then this outlives us, and would keep us out, too
+                # if another program opened the port before, the exclusive mode would outlast us and lock us out, too
                 fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
             with contextlib.suppress(OSError):
                 port.close()
@@ -224,7 +230,7 @@ class SerialSink:
             return
         while self._queue:
             try:
-                # not Serial.write: with write_timeout=0 pyserial 3.5 spins for as long as the peer does not read
+                # not Serial.write: with write_timeout=0 pyserial 3.5 busy-waits as long as the peer does not read
                 self._begun += os.write(self._port.fileno(), self._queue[0][self._begun :])
             except BlockingIOError:
                 return
@@ -259,9 +265,10 @@ class SerialSink:
 
 
 def _keep_others_out(port: int) -> None:
-    """Nobody but root may open `port` from now on: who reads it takes commands away, and a lock binds only who asks.
+    """Make the kernel refuse any further open of `port`, except by root: another reader would take commands away, and a
+    lock only binds programs that ask for it.
 
-    Not a pseudo-terminal: it would stay shut, also for us, if we were killed while its other end is open.
+    Pseudo-terminals are left out: one would stay locked, also for us, if we were killed while its other end is open.
     """
     if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
         fcntl.ioctl(port, termios.TIOCEXCL)

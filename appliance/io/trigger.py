@@ -1,6 +1,7 @@
-"""The trigger room. In: the robot's GPIO edges, stamped by the kernel. Out: START, STOP, NEW OBJECT, settled, in order.
+"""The robot's trigger lines. In: GPIO edges, time-stamped by the kernel. Out: START, STOP and NEW OBJECT, debounced and
+in order of time.
 
-What the kernel dropped or a storm buried is told as LOST; nothing is made up for it.
+Edges that the kernel dropped or that came in a storm are reported as LOST; nothing is invented in their place.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class EdgeKind(StrEnum):
-    """What an edge says. LOST: edges were dropped or came in a storm; what happened in between is unknown."""
+    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that what the robot signalled is unknown."""
 
     START = "start"
     STOP = "stop"
@@ -29,11 +30,10 @@ class EdgeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """One settled edge. t_ns: kernel time stamp, `CLOCK_MONOTONIC`, of the first edge of its burst.
+    """One debounced edge. t_ns: kernel time stamp, `CLOCK_MONOTONIC`, of the first edge of its burst.
 
-    LOST is stamped with the edge at which the loss or the storm was found out. What was told before it is certain.
-    Nothing comes after it until every line has been quiet for `glitch_us`; then the levels are read anew, which makes
-    no edge.
+    LOST has the time of the edge at which the loss or the storm was detected. Edges reported before it are certain.
+    No edge follows it until every line has been quiet for `glitch_us`; the levels are then read again, without an edge.
     """
 
     kind: EdgeKind
@@ -41,10 +41,10 @@ class Edge:
 
 
 class Trigger(Protocol):
-    """Where the recorder gets its edges from."""
+    """The source of trigger edges."""
 
     def edges(self, now_ns: int) -> list[Edge]:
-        """Edges that have settled by `now_ns`, in order of time; never waits."""
+        """Edges that are settled at `now_ns`, in order of time; never waits."""
         ...
 
     @property
@@ -54,35 +54,36 @@ class Trigger(Protocol):
 
 
 _Meaning = tuple[EdgeKind | None, EdgeKind | None]
-"""What a line's fall and its rise say; None: nothing."""
+"""Meaning of a line's falling and of its rising edge; None: no meaning."""
 
 
 @dataclass(slots=True)
 class _Line:
-    """An input line: its kernel queue, its settled level, and the burst of edges that has not settled yet."""
+    """An input line: its request, its settled level, and the burst of edges that has not settled yet."""
 
     request: LineRequest
     offset: int
     name: str
     meaning: _Meaning
-    seqno: int = 0  # of the newest event that was taken
-    known_ns: int = 0  # all events up to here were taken
+    seqno: int = 0  # of the newest event that was read
+    known_ns: int = 0  # all events up to this time were read
     level: bool = False
     count: int = 0  # edges in the burst
     first_ns: int = 0
     last_ns: int = 0
-    after: bool = False  # level after the last of them
+    after: bool = False  # level after the last edge of the burst
 
 
 class GpioTrigger:
-    """The robot's lines as clean edges.
+    """Debounces the robot's lines.
 
-    A burst is a run of edges on one line with less than `glitch_us` between neighbours. It has settled `glitch_us`
-    after its last edge. If the level is another one then, it was one edge, stamped with the burst's first; if not, a
-    glitch. So a clean edge is told `glitch_us` late, with its exact stamp (the kernel's own debouncing would move the
-    stamp). An edge waits for older bursts on other lines, so that order never inverts.
+    A burst is a series of edges on one line with less than `glitch_us` between neighbours. It is settled `glitch_us`
+    after its last edge. If the level then differs from the level before, the burst was one edge, with the time stamp of
+    the first; otherwise it was a glitch. A clean edge is therefore reported `glitch_us` late but with its exact time
+    (the kernel's own debouncing would shift the time stamp). An edge waits for older bursts on other lines, so that
+    edges are always in order of time.
 
-    A call reads at most `storm_edges` events. Raises LineError where lines cannot be found, requested or read.
+    A call reads at most `storm_edges` events. Raises LineError if lines cannot be found, requested or read.
     """
 
     def __init__(self, config: TriggerConfig, gpio: Any) -> None:
@@ -94,10 +95,11 @@ class GpioTrigger:
         self._blind_ns: int | None  # newest edge since the levels became unknown; None: they are known
         roles = _roles(config)
         with ExitStack() as stack:
-            # apart: in a request of several lines the interrupt numbers an edge and its thread tells it; of two edges
-            # before the thread has run one number is never told, so every bounce would look like a loss
+            # separate: with several lines in a request the interrupt handler counts an edge and its thread delivers it;
+            # of two edges before the thread has run one count is never delivered, and each bounce would look like a
+            # loss
             names = [name for name, _ in roles]
-            requests = request_lines(gpio, names, _input_settings(config, gpio), stack, apart=True)
+            requests = request_lines(gpio, names, _input_settings(config, gpio), stack, separate=True)
             meaning = dict(roles)
             self._lines = [_Line(r, o, name, meaning[name]) for r, found in requests for o, name in found.items()]
             self._active, self._rising = gpio.line.Value.ACTIVE, gpio.EdgeEvent.Type.RISING_EDGE
@@ -106,7 +108,7 @@ class GpioTrigger:
 
     @property
     def glitches(self) -> int:
-        """Bursts that changed nothing."""
+        """Bursts that did not change the level."""
         return self._glitches
 
     @property
@@ -121,13 +123,13 @@ class GpioTrigger:
 
     @property
     def blind(self) -> bool:
-        """True from LOST until all lines were quiet and their levels are known again."""
+        """True from LOST until all lines have been quiet and their levels are known again."""
         return self._blind_ns is not None
 
     def edges(self, now_ns: int) -> list[Edge]:
-        """Edges that have settled by `now_ns` (read before the call), in order of time; never waits."""
+        """Edges that are settled at `now_ns` (the time before the call), in order of time; never waits."""
         for line in self._lines:
-            try:  # not `naming`, whose generator costs more than a look at an empty queue
+            try:  # not `naming`: its generator costs more than polling an empty queue
                 self._read(line, now_ns)
             except OSError as e:
                 raise line_error("read", [line.name], e) from e
@@ -137,7 +139,7 @@ class GpioTrigger:
         for line in self._lines:
             if line.count and horizon_ns - line.last_ns >= self._glitch_ns:
                 self._settle(line)
-        # the levels are those of now: first read everything that led to them
+        # the levels are read now, so all events that led to them must have been read before
         if self._blind_ns is not None and horizon_ns >= max(now_ns, self._blind_ns + self._glitch_ns):
             self._read_levels()
         until_ns = min([horizon_ns, *(line.first_ns for line in self._lines if line.count)])
@@ -147,7 +149,7 @@ class GpioTrigger:
         return due
 
     def close(self) -> None:
-        """Give the lines back."""
+        """Release the lines."""
         self._open.close()
 
     def __enter__(self) -> Self:
@@ -157,7 +159,7 @@ class GpioTrigger:
         self.close()
 
     def _read(self, line: _Line, now_ns: int) -> None:
-        """Take the line's share of events."""
+        """Read the line's share of the `storm_edges` events of a call."""
         left = max(1, self._storm_edges // len(self._lines))
         while left > 0 and line.request.wait_edge_events(0):
             events = line.request.read_edge_events(left)
@@ -181,14 +183,14 @@ class GpioTrigger:
             self._settle(line)
         if not line.count:
             line.first_ns = t_ns
-        # a rise may follow a rise: the kernel looks at the level only after the interrupt, so the newest word is right
+        # a rise may follow a rise: the kernel reads the level only after the interrupt, so the newest event is right
         line.count, line.last_ns, line.after = line.count + 1, t_ns, event.event_type is self._rising
         if line.count > self._storm_edges:
             self._storms += 1
             self._lose(t_ns)
 
     def _settle(self, line: _Line) -> None:
-        """The burst is over: an edge, if it changed the level."""
+        """The burst has ended: report an edge if it changed the level."""
         line.count = 0
         if line.after == line.level:
             self._glitches += 1
@@ -198,7 +200,7 @@ class GpioTrigger:
             self._pending.append(Edge(kind, line.first_ns))
 
     def _lose(self, t_ns: int) -> None:
-        """Tell LOST at `t_ns` and believe nothing later, on any line: a STOP may be missing as well as a START."""
+        """Report LOST at `t_ns` and discard later edges on all lines: a STOP may be missing as well as a START."""
         if self._blind_ns is None:
             self._pending = [edge for edge in self._pending if edge.t_ns <= t_ns] + [Edge(EdgeKind.LOST, t_ns)]
             self._blind_ns = t_ns
@@ -206,7 +208,7 @@ class GpioTrigger:
             line.count = 0
 
     def _read_levels(self) -> None:
-        """Begin anew from the lines' levels."""
+        """Start again from the lines' present levels."""
         for line in self._lines:
             with naming("read", [line.name]):
                 line.level = line.request.get_values([line.offset]) == [self._active]
@@ -214,7 +216,7 @@ class GpioTrigger:
 
 
 def _roles(config: TriggerConfig) -> list[tuple[str, _Meaning]]:
-    """Each wired line with the meaning of its fall and of its rise."""
+    """Each wired line with the meaning of its falling and of its rising edge."""
     if config.mode == "one-line":
         roles: list[tuple[str, _Meaning]] = [(config.start, (EdgeKind.STOP, EdgeKind.START))]
     else:
@@ -225,7 +227,7 @@ def _roles(config: TriggerConfig) -> list[tuple[str, _Meaning]]:
 
 
 def _input_settings(config: TriggerConfig, gpio: Any) -> Any:
-    """Both edges, stamped by the kernel on the host's monotonic clock, not debounced."""
+    """Both edges, time-stamped by the kernel with the monotonic clock, not debounced."""
     return gpio.LineSettings(
         direction=gpio.line.Direction.INPUT,
         edge_detection=gpio.line.Edge.BOTH,

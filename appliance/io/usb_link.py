@@ -1,6 +1,6 @@
-"""The USB side of a readout board: finds, opens and claims it, sends requests, reads bulk transfers, explains errnos.
+"""A readout board on USB: finds, opens and claims it, sends requests, reads bulk transfers (PROTOCOL.md, part 1).
 
-In: a pyusb backend. Out: bytes, or SensorError where a board cannot be used. PROTOCOL.md, part 1, "Requests".
+In: a pyusb backend. Out: bytes, or a SensorError that explains the errno.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from appliance.core.errors import SensorAbsent, SensorBusy, SensorDenied, Sensor
 from appliance.io import packets
 
 REPLY_MS = 500
-"""Longest wait for the answer to a request."""
+"""Longest wait for the reply to a request."""
 
 
 class VendorLink:
@@ -34,13 +34,13 @@ class VendorLink:
         return [self._number]
 
     def request(self, request: packets.Request, length: int) -> bytes:
-        """Send a request; its reply where `length` asks for one."""
+        """Send a request; returns a reply of at most `length` bytes, b"" for length 0."""
         kind = usb.util.CTRL_TYPE_VENDOR | usb.util.CTRL_RECIPIENT_INTERFACE | (0x80 if length else 0)
         reply = self._device.ctrl_transfer(kind, request, 0, self._number, length or None, REPLY_MS)
         return bytes(reply) if length else b""
 
     def read(self, size: int, timeout_ms: int) -> bytes:
-        """One bulk transfer of at most `size` bytes. An endpoint that has stalled is cleared, for whoever reads next."""
+        """One bulk transfer of at most `size` bytes. A stalled endpoint is cleared for the next read."""
         try:
             return bytes(self._device.read(self._in, size, timeout_ms))
         except usb.core.USBError as e:
@@ -50,25 +50,26 @@ class VendorLink:
             raise
 
     def close(self) -> None:
-        """Ask the board to stop and release it; a board that is gone cannot be asked."""
+        """Ask the board to stop, unless it is gone, and release it."""
         with contextlib.suppress(usb.core.USBError):
             self.request(packets.Request.STOP, 0)
         usb.util.dispose_resources(self._device)
 
 
 class AcmLink(VendorLink):
-    """An opened CDC-ACM board: the same requests as single bytes on bulk OUT, their replies among the packets."""
+    """An opened CDC-ACM board: requests are single bytes on bulk OUT, replies come as packets on bulk IN."""
 
     def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
         self._out = _endpoint(interface, usb.util.ENDPOINT_OUT)
         super().__init__(device, interface, clock)
 
     def _claimed(self) -> list[int]:
-        # the kernel's cdc_acm holds the control interface beside the data interface
+        # the kernel's cdc_acm holds both the control and the data interface
         return [i.bInterfaceNumber for i in self._device.get_active_configuration() if i.bInterfaceClass in (2, 10)]
 
     def request(self, request: packets.Request, length: int) -> bytes:
-        """Send a request byte; its reply where `length` asks for one. The board is idle, so no frames are lost here."""
+        """Send a request byte; returns the reply, b"" for length 0. The board is not streaming, so no frames are
+        lost."""
         self._device.write(self._out, bytes([request]), REPLY_MS)
         data, until_ns = b"", self._clock.now_ns() + REPLY_MS * 1_000_000
         while length:
@@ -76,7 +77,7 @@ class AcmLink(VendorLink):
             for reply in packets.unpack(data).replies:
                 if reply.request == request:
                     return reply.payload
-            # a few bytes now and then would go on for ever
+            # without a limit a board that sends a few bytes now and then would keep this loop running
             if len(data) > 4 * packets.MAX_PAYLOAD or self._clock.now_ns() >= until_ns:
                 raise SensorMismatch(
                     f"the skin sends frames but does not answer request {request.name}; check its firmware"
@@ -85,7 +86,7 @@ class AcmLink(VendorLink):
 
 
 def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
-    """Find and claim the configured board."""
+    """Find and claim the configured board. Raises SensorError if it is absent, held, refused or of another kind."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
     try:
         found = list(usb.core.find(True, backend, idVendor=config.vendor_id, idProduct=config.product_id))
@@ -115,7 +116,7 @@ def _serial(device: usb.core.Device) -> str:
         raise explain(e) from e
     except UnicodeDecodeError as e:
         raise SensorMismatch(f"the skin's serial number is no text ({e}); check its firmware") from e
-    except ValueError as e:  # pyusb's answer where the string descriptors may not be read
+    except ValueError as e:  # pyusb raises it if the string descriptors may not be read
         raise SensorDenied(
             f"the skin's serial number cannot be read ({e}); install the udev rule, join group plugdev"
         ) from e
@@ -152,7 +153,7 @@ def _claim(device: usb.core.Device, number: int) -> None:
 
 
 def explain(e: usb.core.USBError) -> SensorError:
-    """What an errno of libusb means to a person."""
+    """The SensorError that explains an errno of libusb."""
     if e.errno == errno.EACCES:
         return SensorDenied(
             "the skin may not be opened by this user (errno 13); install the udev rule, join group plugdev"

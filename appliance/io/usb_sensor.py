@@ -1,6 +1,6 @@
-"""UsbSensor: frames from pyusb, through unplug and replug. In: a pyusb backend, a clock. Out: Frames, state, trouble.
+"""The skin on USB, also when it is unplugged and plugged in again. In: a pyusb backend, a clock. Out: Frames, state.
 
-`read` never raises for what a bus can do: it gives no frames, says why in `state` and `trouble`, and tries again.
+No failure of the bus makes `read` raise: it returns no frames, `state` and `trouble` say why, and it tries again.
 """
 
 from __future__ import annotations
@@ -19,16 +19,22 @@ from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
 from appliance.io import packets, usb_link
 
 RATE_TOLERANCE = 0.01
-"""How far a board's rate may be from the bundle's: one per cent, as crystals and timers differ."""
+"""Largest relative difference between the board's rate and the bundle's: 1 %, since crystals and timers differ."""
 STAMPS_NS = 5_000_000
-"""How far a board's stamps may waver: it may stamp in milliseconds, or late under an interrupt. That moves no window."""
+"""Largest jitter of a board's time stamps: it may count milliseconds, or be delayed by an interrupt. Windows do not
+move by that."""
 
 _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 
 
 @dataclass(slots=True)
 class SensorCounters:
-    """What was counted since the program started, in the unit of each name."""
+    """Counts since the program started.
+
+    frames: received. lost_frames: missing in the count of sequence numbers. stale_frames: repeated or late ones, left
+    out. garbage_bytes: bytes in no packet. overflows: transfers larger than the read. fifo_overflows: packets whose
+    OVERFLOW flag says that the board's FIFO was full. enumerations: times the board was found and started.
+    """
 
     frames: int = 0
     lost_frames: int = 0
@@ -40,21 +46,21 @@ class SensorCounters:
 
 
 class Sensor(Protocol):
-    """What the box asks of a skin."""
+    """The source of frames, as the loop uses it."""
 
     @property
     def state(self) -> str:
-        """`streaming`, or what keeps it from that (PROTOCOL.md, states of the skin)."""
+        """`streaming`, or what prevents it (PROTOCOL.md, states of the skin)."""
         ...
 
     @property
     def trouble(self) -> SensorError | None:
-        """Why it is not streaming, and what to do."""
+        """Why it is not streaming and what to do; None while it streams."""
         ...
 
     @property
     def identity(self) -> packets.Identity | None:
-        """Who the board says it is, once it was asked."""
+        """The board's name and version, once it was asked."""
         ...
 
     @property
@@ -63,17 +69,17 @@ class Sensor(Protocol):
         ...
 
     @property
-    def tally(self) -> SensorCounters:
-        """What was counted since the start."""
+    def counters(self) -> SensorCounters:
+        """Counts since the program started."""
         ...
 
     def read(self) -> Frames:
-        """The frames since the last call; none after a bounded wait."""
+        """The frames since the last call; an empty Frames after a bounded wait."""
         ...
 
 
 class TransferObserver(Protocol):
-    """Takes note of what comes in, for captures."""
+    """Observes what the sensor receives, for captures."""
 
     def transfer(self, t_ns: int, data: bytes) -> None:
         """A bulk transfer has ended."""
@@ -85,21 +91,24 @@ class TransferObserver(Protocol):
 
 
 class Stream:
-    """Bytes of one board -> Frames with unwrapped numbers and host times; no I/O. What is not intact is counted."""
+    """Converts the bytes of one board to Frames with unwrapped numbers and host times; no I/O. Damaged data is
+    counted."""
 
-    def __init__(self, fmt: SweepFormat, tally: SensorCounters) -> None:
-        self._format, self._tally = fmt, tally
-        self._grid, self._digits = (fmt.rows, fmt.cols), fmt.digits
-        self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(np.int64)
-        self._place = packets.StreamPosition(-1)
+    def __init__(self, fmt: SweepFormat, counters: SensorCounters) -> None:
+        self._format, self._counters = fmt, counters
+        self._grid, self._dtype = (fmt.rows, fmt.cols), fmt.digits
+        self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(
+            np.int64
+        )  # time of frame i of a packet after its first
+        self._position = packets.StreamPosition(-1)
         self._device = DeviceClock()
         self._leftover = b""
         self._mark: tuple[int, int] | None = None  # (number, device ns) of a frame at most a second ago
 
     def restart(self) -> None:
-        """A new enumeration, the first one too: numbers get the next epoch, the device's clock starts anew."""
-        self._tally.enumerations += 1
-        self._place = packets.StreamPosition(self._place.epoch + 1)
+        """Begin an enumeration, also the first: frame numbers get the next epoch, the device clock starts again."""
+        self._counters.enumerations += 1
+        self._position = packets.StreamPosition(self._position.epoch + 1)
         self._device, self._mark = DeviceClock(), None
         self._leftover = b""
 
@@ -109,30 +118,30 @@ class Stream:
         return self._device.quality()
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
-        """Frames of a transfer that ended at `arrival_ns`.
+        """The frames of a transfer that ended at `arrival_ns`.
 
-        Raises SensorMismatch where they have another form, or where the board's clock does not go with its count.
+        Raises SensorMismatch if they have another format, or if the board's clock disagrees with its frame count.
         """
-        got = packets.unpack(self._leftover + data)
-        self._leftover = got.leftover
-        self._tally.garbage_bytes += got.garbage
-        for p in got.packets:
-            if p.taxels.shape[1:] != self._grid or p.taxels.dtype != self._digits:
+        unpacked = packets.unpack(self._leftover + data)
+        self._leftover = unpacked.leftover
+        self._counters.garbage_bytes += unpacked.garbage
+        for p in unpacked.packets:
+            if p.taxels.shape[1:] != self._grid or p.taxels.dtype != self._dtype:
                 form = f"{p.taxels.shape[1:]} {p.taxels.dtype}"
                 raise SensorMismatch(f"the skin sent {form}, but it had announced {self._format}; check its firmware")
-            self._tally.fifo_overflows += bool(p.flags & packets.Flag.OVERFLOW.value)
-        fresh, place, lost, stale = packets.follow(got.packets, self._place)
-        if place.epoch != self._place.epoch:
+            self._counters.fifo_overflows += bool(p.flags & packets.Flag.OVERFLOW.value)
+        fresh, position, lost, stale = packets.follow(unpacked.packets, self._position)
+        if position.epoch != self._position.epoch:
             self._device, self._mark = DeviceClock(), None
-        self._place = place
-        now = [item for item in fresh if item[0] >> EPOCH_BITS == place.epoch]
-        # what came before the board started anew, in the same transfer, has no host time any more
-        self._tally.lost_frames += lost + sum(len(p.taxels) for _, p in fresh) - sum(len(p.taxels) for _, p in now)
-        self._tally.stale_frames += stale
+        self._position = position
+        now = [item for item in fresh if item[0] >> EPOCH_BITS == position.epoch]
+        # frames from before a restart of the board in the same transfer have no host time and count as lost
+        self._counters.lost_frames += lost + sum(len(p.taxels) for _, p in fresh) - sum(len(p.taxels) for _, p in now)
+        self._counters.stale_frames += stale
         return self._stamp(now, arrival_ns)
 
     def _stamp(self, fresh: list[tuple[int, packets.Packet]], arrival_ns: int) -> Frames:
-        """Put numbers and host times to packets [(first number, packet)] of one epoch."""
+        """Frames of packets [(number of the first frame, packet)] of one epoch, with numbers and host times."""
         if not fresh:
             return Frames.empty(self._format)
         starts = [self._device.unwrap(p.t_us) * 1000 for _, p in fresh]
@@ -142,14 +151,16 @@ class Stream:
         runs = []
         for start, (first, p) in zip(starts, fresh, strict=True):
             n = len(p.taxels)
-            self._tally.frames += n
+            self._counters.frames += n
             runs.append(Frames(self._device.to_host_ns(start) + self._within_ns[:n], first + _COUNT[:n], p.taxels))
         return runs[0] if len(runs) == 1 else Frames.joined(runs)
 
     def _check_pace(self, first: int, start_ns: int) -> None:
-        """Hold the board's clock against its count. Where they part, no host time is right, and a window cut by it is wrong.
+        """Compare the board's clock with its frame count. If they disagree, host times and the windows cut by them are
+        wrong.
 
-        Compared with a frame up to a second ago: a jump of either is seen at once, another pace within that second.
+        The reference is a frame up to one second ago: a jump of either is detected at once, a wrong rate within that
+        second. Raises SensorMismatch.
         """
         self._mark = self._mark or (first, start_ns)
         counted_ns = round((first - self._mark[0]) * self._format.period_ns)
@@ -167,8 +178,8 @@ class Stream:
 class UsbSensor:
     """The skin's readout board on USB (PROTOCOL.md, part 1).
 
-    States: `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent` with `trouble` saying what to do, or `streaming`.
-    A board that comes back is a new enumeration: its frames get a new epoch in `seq` and a new device clock.
+    States: `streaming`, or `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent`, where `trouble` says what to do.
+    A board that is plugged in again is a new enumeration: its frames get a new epoch in `seq` and a new device clock.
     """
 
     def __init__(
@@ -182,12 +193,12 @@ class UsbSensor:
         self.state = "absent"
         self.trouble: SensorError | None = None
         self.identity: packets.Identity | None = None
-        self.tally = SensorCounters()
+        self.counters = SensorCounters()
         self._config, self._format, self._clock, self._backend, self._tap = config, fmt, clock, backend, tap
-        self._stream = Stream(fmt, self.tally)
+        self._stream = Stream(fmt, self.counters)
         self._link: usb_link.VendorLink | None = None
         self._retry_ns = clock.now_ns()
-        self._quiet_ns = 0  # spent listening since the last frame
+        self._quiet_ns = 0  # time spent reading since the last frame
 
     @property
     def clock(self) -> dict[str, float] | None:
@@ -195,13 +206,13 @@ class UsbSensor:
         return self._stream.clock
 
     def read(self) -> Frames:
-        """Frames that came since the last call; waits `timeout_ms` at most for them."""
+        """Frames that have come since the last call; waits at most `timeout_ms`."""
         if self._link is None and not self._connect():
             return Frames.empty(self._format)
         begun = self._clock.now_ns()
         data = self._transfer()
         now = self._clock.now_ns()
-        # a read that took longer than it was told to had no processor: the skin may have sent all the while
+        # a read that took longer than its timeout was not scheduled: the skin may have been sending all the time
         self._quiet_ns += min(now - begun, self._config.timeout_ms * 1_000_000)
         frames = Frames.empty(self._format)
         if data:
@@ -214,13 +225,13 @@ class UsbSensor:
         return frames
 
     def close(self) -> None:
-        """Stop the board and let it go."""
+        """Stop the board and release it."""
         if self._link:
             board, self._link = self._link, None
             board.close()
 
     def _connect(self) -> bool:
-        """Find, open, check and start the board; False and a state where that fails."""
+        """Find, open, check and start the board; False, with state and trouble set, if that fails."""
         now = self._clock.now_ns()
         if now < self._retry_ns:
             self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
@@ -261,7 +272,7 @@ class UsbSensor:
         return who
 
     def _transfer(self) -> bytes:
-        """One bulk transfer; b"" where nothing came, and a dropped link where the board has failed."""
+        """One bulk transfer; b"" if nothing came. If the board has failed the link is dropped."""
         assert self._link
         try:
             return self._link.read(self._config.read_bytes, self._config.timeout_ms)
@@ -269,8 +280,8 @@ class UsbSensor:
             return b""
         except usb.core.USBError as e:
             if e.errno == errno.EOVERFLOW:
-                # more bytes than were asked for: this transfer is gone, the sequence numbers will say what was in it
-                self.tally.overflows += 1
+                # more bytes than requested: this transfer is lost, sequence numbers show how many frames it held
+                self.counters.overflows += 1
             else:
                 self._drop(usb_link.explain(e))
             return b""
@@ -283,13 +294,13 @@ class UsbSensor:
             return Frames.empty(self._format)
 
     def _check_silence(self) -> None:
-        """Start a board anew that is there but has sent no whole packet in `silence_ms` of listening."""
+        """Restart a board that is connected but has sent no complete packet in `silence_ms` of reading."""
         quiet_ms = self._quiet_ns // 1_000_000
         if self._link and quiet_ms > self._config.silence_ms:
             self._drop(SensorSilent(f"the skin is there but sent no frame for {quiet_ms} ms; starting it again"))
 
     def _drop(self, why: SensorError) -> None:
-        """Let the board go, remember why, and try again after `retry_ms`."""
+        """Release the board, keep the reason, and try again after `retry_ms`."""
         self.close()
         self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000
         self._set_state(why.state, why)

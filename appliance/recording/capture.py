@@ -112,8 +112,8 @@ class Playback:
         self.state = "absent"
         self.trouble: SensorError | None = None
         self.identity: Identity | None = None
-        self.tally = SensorCounters()
-        self._stream = Stream(self.format, self.tally)
+        self.counters = SensorCounters()
+        self._stream = Stream(self.format, self.counters)
         self._records = deque(_records(path, data, begin))
         self._now_ns = self._records[0][1] if self._records else 0
 

@@ -82,9 +82,9 @@ class Box:
         self._troubles: dict[str, str] = {}
 
     @property
-    def tally(self) -> SensorCounters:
+    def counters(self) -> SensorCounters:
         """What the sensor has counted since the start."""
-        return self._sensor.tally
+        return self._sensor.counters
 
     @property
     def format(self) -> SweepFormat:
@@ -191,12 +191,12 @@ class Box:
     @property
     def health(self) -> Health:
         """How it is now."""
-        sensor, tally = self._sensor, self._sensor.tally
+        sensor, counters = self._sensor, self._sensor.counters
         return Health(
             time_ns=self._clock.now_ns(), skin=sensor.state, trouble=str(sensor.trouble or ""),
-            streams=sensor.state == "streaming" and tally.frames > 0, sweeping=self._recorder.sweeping,
-            answered=self.answered, frames=tally.frames, lost_frames=tally.lost_frames,
-            garbage_bytes=tally.garbage_bytes, enumerations=tally.enumerations,
+            streams=sensor.state == "streaming" and counters.frames > 0, sweeping=self._recorder.sweeping,
+            answered=self.answered, frames=counters.frames, lost_frames=counters.lost_frames,
+            garbage_bytes=counters.garbage_bytes, enumerations=counters.enumerations,
             dropped=self._port.dropped if self._port else 0, bundle=self._classifier.bundle.id, source=self._source,
         )  # fmt: skip
 

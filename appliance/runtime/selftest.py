@@ -74,12 +74,12 @@ def _skin(settings: Config, bundle: Bundle, world: Devices) -> str:
     try:
         while world.clock.now_ns() < until_ns:
             sensor.read()
-        if sensor.trouble or not sensor.tally.frames:
+        if sensor.trouble or not sensor.counters.frames:
             raise sensor.trouble or SensorError(f"the skin sent no frame within {LISTEN_S} s; replug it")
         who = sensor.identity
-        tally = sensor.tally
+        counters = sensor.counters
         name = f"{who.board} {who.serial}" if who else ""
-        return f"{name}, {tally.frames} frames in {LISTEN_S} s, {tally.lost_frames} lost"
+        return f"{name}, {counters.frames} frames in {LISTEN_S} s, {counters.lost_frames} lost"
     finally:
         sensor.close()
 

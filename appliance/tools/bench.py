@@ -94,7 +94,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
         while not world.finished(box.answered):
             box.step()
             drain(far_end)
-        lost = box.tally.lost_frames
+        lost = box.counters.lost_frames
     pairs = zip(watch.verdicts, world.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
     return {

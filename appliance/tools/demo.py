@@ -69,7 +69,7 @@ class Demo:
                 self._next_ns = self._clock.now_ns() + FRAME_NS
                 self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""])
         if not self._raw and self.score.total:
-            lost = f"  frames lost     {box.tally.lost_frames} of {box.tally.frames + box.tally.lost_frames}"
+            lost = f"  frames lost     {box.counters.lost_frames} of {box.counters.frames + box.counters.lost_frames}"
             touch = [f"  touch time      {self.score.touch(box.format.rate_hz)}"] if self.score.early else []
             self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}", *touch)
 

@@ -59,7 +59,10 @@ def unpack() -> list[bytes]:
 
 def command() -> list[bytes]:
     """Each command as a program and as a person sends it, the document's sentences, and lines that are none."""
-    sealed = [robot_link.sentence(name, *["plastic rough"] * (name in robot_link.TOLD)) for name in robot_link.COMMANDS]
+    sealed = [
+        robot_link.sentence(name, *["plastic rough"] * (name in robot_link.LABEL_COMMANDS))
+        for name in robot_link.COMMANDS
+    ]
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
     written = [s.encode() + b"\r\n" for s in re.findall(r"`(\$PPLP[^`]*)`", protocol)]
     by_hand = [b"PPLP," + name.encode() + b"\n" for name in robot_link.COMMANDS]

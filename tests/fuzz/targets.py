@@ -100,8 +100,8 @@ def unpack(data: bytes, folder: Path) -> None:
 
 def _stream(data: bytes, cut: int, sent: int) -> None:
     """Frames that a sensor makes of it: numbers rise, and each frame that came is out, stale or lost."""
-    tally = usb_sensor.SensorCounters()
-    stream = usb_sensor.Stream(SKIN, tally)
+    counters = usb_sensor.SensorCounters()
+    stream = usb_sensor.Stream(SKIN, counters)
     stream.restart()
     numbers = [-1]
     try:
@@ -109,12 +109,12 @@ def _stream(data: bytes, cut: int, sent: int) -> None:
             frames = stream.feed(part, (i + 1) * 8_000_000)
             assert len(frames.t_ns) == len(frames.seq) == len(frames.taxels)
             numbers += frames.seq.tolist()
-        assert tally.frames + tally.stale_frames + tally.lost_frames >= sent, f"{tally} for {sent} frames"
+        assert counters.frames + counters.stale_frames + counters.lost_frames >= sent, f"{counters} for {sent} frames"
     except SensorMismatch as e:
         one_line(e)
     assert all(a < b for a, b in pairwise(numbers)), f"numbers {numbers} do not rise"
-    assert tally.frames == len(numbers) - 1
-    assert tally.garbage_bytes <= len(data)
+    assert counters.frames == len(numbers) - 1
+    assert counters.garbage_bytes <= len(data)
 
 
 def _follow(packets: list[wire.Packet]) -> None:
@@ -168,7 +168,7 @@ def _is_command(line: bytes, name: str) -> bool:
         body.startswith(b"PPLP,")
         and said == name
         and name in robot_link.COMMANDS
-        and bool(comma) == (name in robot_link.TOLD)
+        and bool(comma) == (name in robot_link.LABEL_COMMANDS)
     )
     # what a sentence may not hold (PROTOCOL.md); a command has one field
     known = known and "," not in text and not re.search(rb"[^ -~]|[!\\~^]", body)

@@ -184,7 +184,7 @@ def test_the_robot_stops_and_is_faster(rigged: Callable[..., Rigged]):
     for frames, n in zip(touched, (20, 40), strict=False):
         assert LEAD + n < frames <= LEAD + n + 3 + 3  # the rest of a packet, 20 ms to react, and up to the next frame
     assert touched[2] == SLIDE
-    assert box.box.tally.lost_frames == 0
+    assert box.box.counters.lost_frames == 0
 
 
 def test_lines_tell_it_in_order(rigged: Callable[..., Rigged]):

@@ -147,11 +147,11 @@ def test_streams_without_a_gap(need: Need):
         assert frames.taxels.shape[1:] == (u.format.rows, u.format.cols)
         assert frames.taxels.dtype == u.format.digits
         check_content(u, frames)
-        assert reader.sensor.tally.lost_frames == reader.sensor.tally.garbage_bytes == 0
+        assert reader.sensor.counters.lost_frames == reader.sensor.counters.garbage_bytes == 0
         assert reader.sensor.identity
         # an emulator may be too late with a first answer, so what matters is that it streamed unbroken once it did
         assert reader.states[-1] == "streaming"
-        assert reader.sensor.tally.enumerations == 1
+        assert reader.sensor.counters.enumerations == 1
     with Reader(u) as reader:  # closing has let go of all that the first one held
         check_content(u, reader.frames(100))
 
@@ -187,7 +187,7 @@ def test_unplugged_in_mid_read(need: Need):
         assert second.t_ns[0] > first.t_ns[-1]
         check_content(u, first)
         check_content(u, second)
-        assert reader.sensor.tally.enumerations == 2
+        assert reader.sensor.counters.enumerations == 2
 
 
 def test_serial_number_chooses(need: Need):
@@ -255,7 +255,7 @@ def test_a_silent_skin_is_started_again(need: Need):
         reader.state("silent")
         check_content(u, reader.frames(100))
         assert reader.states == ["streaming", "silent", "streaming"]
-        assert reader.sensor.tally.enumerations == 2
+        assert reader.sensor.counters.enumerations == 2
 
 
 def test_garbage_on_the_cable(need: Need):
@@ -267,9 +267,9 @@ def test_garbage_on_the_cable(need: Need):
         frames = reader.frames(500)
         u.garble(False)
         frames = Frames.joined([frames, reader.frames(100)])
-        tally = reader.sensor.tally
-        assert tally.garbage_bytes > 0
-        assert 0 < (np.diff(frames.seq) - 1).sum() <= tally.lost_frames
+        counters = reader.sensor.counters
+        assert counters.garbage_bytes > 0
+        assert 0 < (np.diff(frames.seq) - 1).sum() <= counters.lost_frames
         check_content(u, frames)
         assert reader.states == ["streaming"]
 

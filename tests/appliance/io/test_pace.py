@@ -102,7 +102,7 @@ def test_a_count_that_jumps(ahead: int):
     _, states = read_for(sensor, world, 2)
     assert states == {"streaming", "mismatch"}
     assert sensor.state == "streaming"
-    assert sensor.tally.enumerations == 2
+    assert sensor.counters.enumerations == 2
 
 
 @pytest.mark.parametrize("ppm", [-500, 0, 500])
@@ -117,8 +117,8 @@ def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
     world.clock.sleep_until(world.clock.now_ns() + 2 * SECOND)
     states |= read_for(sensor, world, 4)[1]
     assert states == {"streaming"}
-    assert sensor.tally.lost_frames > 1000
-    assert sensor.tally.enumerations == 1
+    assert sensor.counters.lost_frames > 1000
+    assert sensor.counters.enumerations == 1
 
 
 @pytest.mark.parametrize(("rate_hz", "packet_frames"), [(2000, 1), (2000, 8), (35.61, 1)])
@@ -214,7 +214,7 @@ def test_a_box_that_had_no_processor_does_not_call_the_skin_silent():
         sensor.read()
         world.backend.bulk_read = bulk_read
         assert len(sensor.read())
-    assert sensor.tally.enumerations == 1
-    assert sensor.tally.lost_frames == 0
+    assert sensor.counters.enumerations == 1
+    assert sensor.counters.lost_frames == 0
     world.backend.board.running = False
     assert "silent" in read_for(sensor, world, 1)[1]

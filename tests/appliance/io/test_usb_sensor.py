@@ -125,12 +125,12 @@ def test_unplug_and_replug_in_mid_read():
     assert sensor.state in ("lost", "absent")
     later = read_for(sensor, world, 2)
     assert sensor.state == "streaming"
-    assert sensor.tally.enumerations == 2
+    assert sensor.counters.enumerations == 2
     assert set(frames.seq >> EPOCH_BITS) == {0}
     assert set(later.seq >> EPOCH_BITS) == {1}
     check_content(frames)
     check_content(later)
-    assert sensor.tally.lost_frames == 0
+    assert sensor.counters.lost_frames == 0
 
 
 def test_timeouts_with_partial_data():
@@ -152,7 +152,7 @@ def test_timeouts_with_partial_data():
     assert (np.diff(frames.seq) == 1).all()
     assert len(frames) > 2200
     check_content(frames)
-    assert sensor.tally.garbage_bytes == 0
+    assert sensor.counters.garbage_bytes == 0
 
 
 def test_zero_length_packets():
@@ -181,8 +181,8 @@ def test_overflow_loses_one_transfer():
     world.backend.mangle = lambda data: next(once, data)
     frames = read_for(sensor, world, 1)
     assert sensor.state == "streaming"
-    assert sensor.tally.overflows == 1
-    assert sensor.tally.lost_frames == 4
+    assert sensor.counters.overflows == 1
+    assert sensor.counters.lost_frames == 4
     check_content(frames)
 
 
@@ -193,8 +193,8 @@ def test_garbage_on_the_cable():
     count = iter(range(10**6))
     world.backend.mangle = lambda data: bytes(len(data)) if next(count) % 10 == 9 else data
     frames = read_for(sensor, world, 3)
-    assert sensor.tally.garbage_bytes > 0
-    assert sensor.tally.lost_frames == 4 * (next(count) // 10)
+    assert sensor.counters.garbage_bytes > 0
+    assert sensor.counters.lost_frames == 4 * (next(count) // 10)
     check_content(frames)
 
 
@@ -205,8 +205,8 @@ def test_a_host_that_pauses_too_long():
     read_for(sensor, world, 1)
     world.clock.sleep_until(world.clock.now_ns() + 2 * SECOND)
     frames = read_for(sensor, world, 1)
-    assert sensor.tally.fifo_overflows == 1
-    assert sensor.tally.lost_frames == pytest.approx(1500 - 188, abs=8)
+    assert sensor.counters.fifo_overflows == 1
+    assert sensor.counters.lost_frames == pytest.approx(1500 - 188, abs=8)
     check_content(frames)
 
 
@@ -322,7 +322,7 @@ def test_a_board_whose_clock_starts_anew(replugged: bool):
     world.backend.at(now + 3 * SECOND, swap)
     read_for(sensor, world, 3.2)
     frames = read_for(sensor, world, 2)
-    assert sensor.tally.enumerations == 1 + replugged
+    assert sensor.counters.enumerations == 1 + replugged
     assert set(frames.seq >> EPOCH_BITS) == {1}
     truth = np.array([world.backend.board.frame_ns(int(s) & ((1 << EPOCH_BITS) - 1)) for s in frames.seq])
     assert np.abs(frames.t_ns - truth).max() < 1_000_000

@@ -388,7 +388,7 @@ def test_a_disk_that_is_full_costs_no_answer(recorded: Callable[..., Rigged], mo
     box.seconds(0.1)
     assert len(verdicts) == 2
     assert [rec[1] for rec in heard(box)] == ["full", "full"]
-    assert box.box.tally.lost_frames == 0
+    assert box.box.counters.lost_frames == 0
 
 
 def test_numbers_in_a_verdict_come_back_bit_for_bit():

@@ -63,7 +63,7 @@ def test_sweeps_become_sentences(rigged: Callable[..., Rigged]):
     assert [a.label for a in heard] == [v.label for v in verdicts]
     assert {a.status for a in heard} <= {"ok", "unsure"}
     assert sum(a.lost for a in heard) == 0
-    assert box.box.tally.lost_frames == 0
+    assert box.box.counters.lost_frames == 0
     for line in box.heard:
         pynmea2.parse(line, check=True)
     assert all(",sim," in line for line in box.heard if ",RES," in line)
@@ -180,7 +180,7 @@ def test_storm_of_edges(rigged: Callable[..., Rigged]):
     heard = answers(box)
     assert "edges-lost" in {a.status for a in heard[:-1]}
     assert heard[-1].status in ("ok", "unsure")
-    assert box.box.tally.lost_frames == 0
+    assert box.box.counters.lost_frames == 0
 
 
 @pytest.mark.parametrize(("packet_frames", "statuses"), [(2, {"ok", "unsure"}), (4, {"gap"})])
@@ -195,7 +195,7 @@ def test_missing_frames(rigged: Callable[..., Rigged], packet_frames: int, statu
     box.seconds(0.1)
     (answer,) = answers(box)
     assert answer.status in statuses
-    assert answer.lost == box.box.tally.lost_frames == packet_frames
+    assert answer.lost == box.box.counters.lost_frames == packet_frames
 
 
 def spoiled(how: str) -> np.ndarray:
@@ -305,7 +305,7 @@ def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]
     while not world.finished(box.box.answered):
         box.box.step()
     assert box.port.dropped > 0
-    assert box.box.tally.lost_frames == 0
+    assert box.box.counters.lost_frames == 0
     assert box.box.answered == 20
 
 
