@@ -9,7 +9,7 @@ DESKTOP := $(VENV)/desktop.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
+.PHONY: help demo test test-fast check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
   deploy install wheel lock clean
 
 help: ## this list
@@ -20,6 +20,9 @@ demo: $(RUNTIME) ## watch simulated sweeps being classified, live
 
 test: $(DESKTOP) ## run the tests (set PALPATE_DATA to the folder of real sweeps to run those as well)
 	$(BIN)/python -m pytest -q -n auto --dist loadfile
+
+test-fast: $(DESKTOP) ## run the tests that are not marked `slow`
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not slow"
 
 check: lint types test ## lint, types and tests
 
@@ -76,7 +79,7 @@ lint: $(DESKTOP) ## ruff, and which package may import which
 machines: $(DESKTOP) ## the same bundles on older x86 and on arm64 (emulated; gets what that needs)
 	PALPATE_MACHINES=1 $(BIN)/python -m pytest -q -rP tests/campaigns/test_machines.py
 
-types: $(DESKTOP) ## mypy --strict on the appliance
+types: $(DESKTOP) ## mypy --strict
 	$(BIN)/mypy
 
 bench: $(DESKTOP) ## measure this machine; the figures go to build/bench.json

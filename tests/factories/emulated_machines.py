@@ -71,7 +71,8 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
     if platform.machine() != "x86_64":
         raise Missing("other processors are compared with an x86")
     run = [qemu(kind), "-cpu", processor]
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")}  # of this processor
+    env = kept | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     if kind == platform.machine():
         return [*run, sys.executable, __file__, *map(str, args)], env
     usr = folder() / "root" / "usr"
