@@ -25,9 +25,9 @@ class Simulated:
 
     def __init__(self, stack: ExitStack) -> None:
         self.clock = rig.VirtualClock()
-        world = devices.build(self.format, [], self.clock, "sim")
-        settings = world.wire(config.load(None, site=NO_SITE))
-        self.gpio, self.backend = world.gpio, world.backend
+        sim = devices.build(self.format, [], self.clock, "sim")
+        settings = sim.wire(config.load(None, site=NO_SITE))
+        self.gpio, self.backend = sim.gpio, sim.backend
         self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
         self._far = tty.PseudoTerminalEnd(stack)
         self.serial = replace(settings.serial, port=str(self._far.path))

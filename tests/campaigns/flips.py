@@ -146,10 +146,12 @@ def campaign(folder: Path, manifest_bits: int | None, seed: int, every: int = 0)
     counts: dict[str, Counter[str]] = {}
     for n, case in enumerate(cases(box, manifest_bits, seed), 1):
         count = counts.setdefault(case[0], Counter(tried=0, accepted=0, believed=0, changed=0))
-        said = tried(box, case)
+        message = tried(box, case)
         count["tried"] += 1
-        count["accepted"] += not said
-        count["believed"] += case[0] == FLIPPED and "does not fit the manifest" not in said and believed(box, case[2])
+        count["accepted"] += not message
+        count["believed"] += (
+            case[0] == FLIPPED and "does not fit the manifest" not in message and believed(box, case[2])
+        )
         count["changed"] += box.store.current != current
         if every and n % every == 0:
             print(f"{n}: {case[0]}, {case[1]}", flush=True)
@@ -172,9 +174,9 @@ def main() -> int:
     total = {
         name: sum(count[name] for count in found.values()) for name in ("tried", "accepted", "believed", "changed")
     }
-    told = {"total": total, "kinds": found, "seed": args.seed, "commit": commit(), "machine": platform.machine()}
+    result = {"total": total, "kinds": found, "seed": args.seed, "commit": commit(), "machine": platform.machine()}
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    put(args.out, (json.dumps(told, indent=1) + "\n").encode())
+    put(args.out, (json.dumps(result, indent=1) + "\n").encode())
     print("\n".join(f"{kind}: {count}" for kind, count in [*found.items(), ("total", total)]))
     return int(total["accepted"] + total["believed"] + total["changed"] > 0)
 

@@ -108,9 +108,9 @@ class Fuzz:
         """What becomes of `count` models from number `first` on, in their order."""
         at, end = first, first + count
         while at < end:
-            for told in self._child(range(at, min(at + BATCH, end))):
-                yield told
-                at = told["number"] + 1
+            for result in self._child(range(at, min(at + BATCH, end))):
+                yield result
+                at = result["number"] + 1
 
     def _child(self, numbers: range) -> Iterator[dict[str, Any]]:
         """A child tries these; the last result is of the model that ended it, where one did."""
@@ -150,8 +150,8 @@ class Fuzz:
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # onnxruntime tells what it refuses
             for number in numbers:
-                told = {"number": number} | tried(*self.model(number))
-                os.write(out, json.dumps(told).encode() + b"\n")
+                result = {"number": number} | tried(*self.model(number))
+                os.write(out, json.dumps(result).encode() + b"\n")
             code = 0
         finally:
             os._exit(code)
@@ -164,15 +164,15 @@ def fresh(seed: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def note(record: dict[str, Any], told: dict[str, Any]) -> None:
+def note(record: dict[str, Any], result: dict[str, Any]) -> None:
     """One result more."""
-    outcome = told["outcome"]
+    outcome = result["outcome"]
     record["done"] += 1
     record["outcomes"][outcome] = record["outcomes"].get(outcome, 0) + 1
     for key, value in (("slowest_check_ms", "check_ms"), ("slowest_s", "s"), ("most_mb", "mb")):
-        record[key] = max(record[key], round(told[value], 3))
-    if outcome not in SORRY or told["mb"] > MOST_MORE >> 20:
-        record["finds"].append(told)
+        record[key] = max(record[key], round(result[value], 3))
+    if outcome not in SORRY or result["mb"] > MOST_MORE >> 20:
+        record["finds"].append(result)
 
 
 def main() -> int:
@@ -186,8 +186,8 @@ def main() -> int:
     if record["seed"] != args.seed:
         parser.error(f"{args.out} is of seed {record['seed']}; name another file")
     fuzz = Fuzz(own_models(), args.seed)
-    for told in fuzz.results(record["done"], args.count - record["done"]):
-        note(record, told)
+    for result in fuzz.results(record["done"], args.count - record["done"]):
+        note(record, result)
         if record["done"] % BATCH == 0 or record["done"] == args.count:
             storage.put(args.out, (json.dumps(record, indent=1) + "\n").encode())
             print(f"{record['done']} of {args.count}: {record['outcomes']}, finds {len(record['finds'])}", flush=True)

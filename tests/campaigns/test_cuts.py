@@ -113,13 +113,13 @@ def test_a_symlink_is_swapped_in_one_step(play: Makes):
 
 def test_a_kill_comes_before_its_call(play: Makes):
     """What is killed on entry to a renaming has not renamed; the judge gets what was said before."""
-    told = []
+    judged = []
     played = play("print('now'); sys.stdout.flush(); (f / 'a').rename(f / 'b'); print('then')", "(f / 'a').touch()",
-                  lambda found: told.append((tree.read(found.folder), found.heard)) or [])  # fmt: skip
+                  lambda found: judged.append((tree.read(found.folder), found.heard)) or [])  # fmt: skip
     (moment, end) = played.moments()
     played.kill(moment)
-    assert told == [({"a": b""}, "\nnow\n")]
-    assert (moment.call.name, end.call, end.said) == ("rename", None, "\nnow\nthen\n")
+    assert judged == [({"a": b""}, "\nnow\n")]
+    assert (moment.call.name, end.call, end.output) == ("rename", None, "\nnow\nthen\n")
     with pytest.raises(NotFollowed, match="was not killed at its rename number 2"):
         played.kill(replace(moment, call=replace(moment.call, nth=2)))
 

@@ -90,9 +90,9 @@ def overflowing(folder: Path) -> None:
 @pytest.fixture(scope="session")
 def here(given: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
     """What this machine says."""
-    told = tmp_path_factory.mktemp("here") / "told.npz"
-    emulated_machines.work(given, told)
-    with np.load(told) as z:
+    results_file = tmp_path_factory.mktemp("here") / "told.npz"
+    emulated_machines.work(given, results_file)
+    with np.load(results_file) as z:
         return dict(z)
 
 
@@ -102,31 +102,31 @@ def there(
 ) -> tuple[str, dict[str, np.ndarray]]:
     """A machine's name, and what it says."""
     insist = os.environ.get("PALPATE_MACHINES") == "1"
-    told = tmp_path_factory.mktemp("there") / "told.npz"
+    results_file = tmp_path_factory.mktemp("there") / "told.npz"
     try:
         if insist:
             emulated_machines.set_up()
         emulated_machines.command(request.param)
     except emulated_machines.Missing as e:
         (pytest.fail if insist else pytest.skip)(str(e))
-    args, env = emulated_machines.command(request.param, request.getfixturevalue("given"), told)
+    args, env = emulated_machines.command(request.param, request.getfixturevalue("given"), results_file)
     done = subprocess.run(args, env=env, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-    with np.load(told) as z:
+    with np.load(results_file) as z:
         return request.param, dict(z)
 
 
 def test_a_bundle_says_the_same_on_every_machine(here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]):
     """Golden sweeps and others: the same labels, and probabilities within what the box's own test allows."""
-    name, said = there
-    assert said.keys() == here.keys()
+    name, there_result = there
+    assert there_result.keys() == here.keys()
     for what in here:
         if not what.endswith(("/golden", "/sweeps")):
             continue
-        apart = np.abs(softmax(said[what]) - softmax(here[what])).max()
+        apart = np.abs(softmax(there_result[what]) - softmax(here[what])).max()
         print(f"{name}: {what}: {len(here[what])} sweeps, probabilities {apart:.2g} apart, "
-              f"logits {np.abs(said[what] - here[what]).max():.2g}")  # fmt: skip
-        np.testing.assert_array_equal(said[what].argmax(1), here[what].argmax(1))
+              f"logits {np.abs(there_result[what] - here[what]).max():.2g}")  # fmt: skip
+        np.testing.assert_array_equal(there_result[what].argmax(1), here[what].argmax(1))
         assert apart <= bundle.GOLDEN_TOLERANCE
 
 
@@ -134,16 +134,16 @@ def test_what_int8_computes_is_the_same_to_the_bit(
     here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]
 ):
     """The tensors inside: hardly one in ten thousand is another, where float rounding before it fell the other way."""
-    name, said = there
+    name, there_result = there
     for what in here:
         if what.endswith(" inside/shown"):
-            other = np.abs(said[what].astype(int) - here[what])
+            other = np.abs(there_result[what].astype(int) - here[what])
             print(f"{name}: {what}: {np.count_nonzero(other)} of {other.size} differ, by up to {other.max()}")
             assert np.mean(other > 0) < 1e-4
 
 
 def test_an_x86_without_vnni_is_one(there: tuple[str, dict[str, np.ndarray]]):
     """Eight-bit weights overflow there, and only there: the machine is what it is called, and would show a difference."""
-    name, said = there
+    name, there_result = there
     exact = round(32 * 5 * 127 * 255 / 2**15)
-    assert (said[f"{EIGHT_BITS}/shown"] == exact).all() == (name != "x86, AVX2 without VNNI")
+    assert (there_result[f"{EIGHT_BITS}/shown"] == exact).all() == (name != "x86, AVX2 without VNNI")

@@ -118,9 +118,9 @@ def sums(run: soak_judge.SoakRun) -> dict:
     return soak_judge.sums(json.loads(json.dumps({"runs": [soak.asdict(run)]})))
 
 
-def missed(told: dict) -> list[int]:
+def missed(result: dict) -> list[int]:
     """Numbers of the targets that were not reached."""
-    return [i for i, (*_, met) in enumerate(soak_judge.targets(told)) if met is False]
+    return [i for i, (*_, met) in enumerate(soak_judge.targets(result)) if met is False]
 
 
 def on(number: int, new: Callable[[str], list[str]]) -> Callable[[str], list[str]]:
@@ -142,20 +142,26 @@ def clean() -> soak_judge.SoakRun:
 
 def test_a_box_without_fault_reaches_every_target(clean):
     """All sweeps answered, the last one as aborted; nothing lost, nothing noted; memory of three minutes is not told."""
-    told = sums(clean)
-    assert told["due"] == told["answers"] > 40
-    assert (told["cut"], told["unanswered"], told["faults"], told["unaccounted"], told["differs"]) == (1, 0, 0, 0, 0)
-    assert told["right"]["n"] + told["refused"]["n"] + told["wrong"]["n"] == told["answers"] - 1
-    assert [met for *_, met in soak_judge.targets(told)] == [True] * 5 + [None, True]
+    result = sums(clean)
+    assert result["due"] == result["answers"] > 40
+    assert (result["cut"], result["unanswered"], result["faults"], result["unaccounted"], result["differs"]) == (
+        1,
+        0,
+        0,
+        0,
+        0,
+    )
+    assert result["right"]["n"] + result["refused"]["n"] + result["wrong"]["n"] == result["answers"] - 1
+    assert [met for *_, met in soak_judge.targets(result)] == [True] * 5 + [None, True]
     assert clean.ended == "time"
     assert clean.length_s >= 150
 
 
 def test_a_missing_answer_is_found():
     """A sweep that gets no sentence is unanswered, and the number that was left out is noted."""
-    told = sums(soaked(FakeBox(on(17, lambda line: []))))
-    assert told["unanswered"] == 1
-    assert missed(told) == [UNANSWERED, ORDER]
+    result = sums(soaked(FakeBox(on(17, lambda line: []))))
+    assert result["unanswered"] == 1
+    assert missed(result) == [UNANSWERED, ORDER]
 
 
 def test_a_missed_start_edge_is_found():
@@ -163,24 +169,24 @@ def test_a_missed_start_edge_is_found():
     box = FakeBox()
     run = soaked(box)
     del run.answers[-1]
-    told = sums(run)
-    assert told["unanswered"] == 1
-    assert missed(told) == [UNANSWERED]
+    result = sums(run)
+    assert result["unanswered"] == 1
+    assert missed(result) == [UNANSWERED]
 
 
 def test_a_double_answer_is_found():
     """The same sentence twice is noted; the sweep is answered all the same."""
-    told = sums(soaked(FakeBox(on(17, lambda line: [line, line]))))
-    assert told["unanswered"] == 0
-    assert missed(told) == [ORDER]
+    result = sums(soaked(FakeBox(on(17, lambda line: [line, line]))))
+    assert result["unanswered"] == 0
+    assert missed(result) == [ORDER]
 
 
 @pytest.mark.parametrize("number", [16, 18, 40])
 def test_a_wrong_number_is_found(number):
     """An answer with the number of another sweep, before or after, is noted, and its own sweep has none."""
-    told = sums(soaked(FakeBox(on(17, lambda line: [renumbered(line, number)]))))
-    assert UNANSWERED in missed(told)
-    assert ORDER in missed(told)
+    result = sums(soaked(FakeBox(on(17, lambda line: [renumbered(line, number)]))))
+    assert UNANSWERED in missed(result)
+    assert ORDER in missed(result)
 
 
 def test_a_number_too_many_makes_no_answer_wrong(clean):
@@ -219,9 +225,9 @@ def test_frames_that_nobody_counted_are_found():
     box, late = FakeBox(), FakeBox()
     box.dropped = lambda s: 50 * (s > 70)
     late.dropped = lambda s: 50 * (30 < s < 80 or 115 < s < 135)
-    told = sums(soaked(box))
-    assert told["unaccounted"] == 50
-    assert missed(told) == [LOST]
+    result = sums(soaked(box))
+    assert result["unaccounted"] == 50
+    assert missed(result) == [LOST]
     assert missed(sums(soaked(late))) == []
 
 
@@ -234,12 +240,12 @@ def test_frames_out_of_nowhere_are_found():
 
 def test_wrong_verdicts_beyond_the_network_by_itself_are_found(clean):
     """A box that errs where its network does not leaves the band; refusals are not wrong."""
-    told, refused = copy.deepcopy(clean), copy.deepcopy(clean)
-    for row in told.answers[:12]:
+    result, refused = copy.deepcopy(clean), copy.deepcopy(clean)
+    for row in result.answers[:12]:
         row[3], row[4] = "ok", next(m for m in skin.MATERIALS if m != row[2])
     for row in refused.answers[:12]:
         row[3], row[4] = "unknown", ""
-    assert missed(sums(told)) == [WRONG]
+    assert missed(sums(result)) == [WRONG]
     assert missed(sums(refused)) == []
     assert sums(refused)["differs"] > 0
 
@@ -311,11 +317,11 @@ def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
 def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
     """The first run is kept as it was, a second one takes what is left with the next seed, a third has nothing to do."""
     box, lines = FakeBox(), []
-    how = {"clock": box.clock, "log": lines.append}
-    path = soak.soak(box, 7, 0.05, tmp_path, stopped=lambda: box.now_s > 170, **how)
+    settings = {"clock": box.clock, "log": lines.append}
+    path = soak.soak(box, 7, 0.05, tmp_path, stopped=lambda: box.now_s > 170, **settings)
     first = json.loads(path.read_text())
     assert [run["ended"] for run in first["runs"]] == ["interrupted"]
-    soak.soak(box, 7, 0.05, tmp_path, **how)
+    soak.soak(box, 7, 0.05, tmp_path, **settings)
     both = json.loads(path.read_text())
     assert both["runs"][0] == first["runs"][0]
     assert both["started"] == first["started"]
@@ -323,7 +329,7 @@ def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
     assert both["runs"][1]["began_s"] == first["runs"][0]["length_s"]
     assert 180 <= sum(run["length_s"] for run in both["runs"]) < 190
     assert missed(soak_judge.sums(both)) == []
-    soak.soak(box, 7, 0.05, tmp_path, **how)
+    soak.soak(box, 7, 0.05, tmp_path, **settings)
     assert box.runs == 2
     assert "are there already" in lines[-1]
 
@@ -343,9 +349,9 @@ def test_a_soak_that_is_killed_leaves_a_whole_record():
 def test_another_seed_begins_anew(tmp_path):
     """Runs of other acts, code or machines are not put together."""
     box = FakeBox()
-    how = {"clock": box.clock, "log": lambda line: None}
-    soak.soak(box, 7, 0.01, tmp_path, **how)
-    path = soak.soak(box, 8, 0.01, tmp_path, **how)
+    settings = {"clock": box.clock, "log": lambda line: None}
+    soak.soak(box, 7, 0.01, tmp_path, **settings)
+    path = soak.soak(box, 8, 0.01, tmp_path, **settings)
     assert [run["seed"] for run in json.loads(path.read_text())["runs"]] == [8]
 
 
@@ -374,13 +380,13 @@ def test_the_script_tells_what_is_touched_and_what_the_network_says():
 
 def test_a_simulated_world_that_remembers_nothing_stays_as_large_as_it_is():
     """Of twenty sweeps one act and no written line are held; the script has ended, and its end is known all the same."""
-    world = devices.build(skin.FORMAT, script.tubes(1, 20), VirtualClock(), "sim", remember=False)
+    sim = devices.build(skin.FORMAT, script.tubes(1, 20), VirtualClock(), "sim", remember=False)
     with ExitStack() as stack:
         settings = config.load(None, [], site=NO_SITE)
-        box = assembly.box(settings, bundle.load(bundle.DEFAULT), world, StdoutPort("sim"), stack)
-        while not world.finished(box.answered):
+        box = assembly.box(settings, bundle.load(bundle.DEFAULT), sim, StdoutPort("sim"), stack)
+        while not sim.finished(box.answered):
             box.step()
-    assert (world.robot.acts, box.answered, len(world.robot.played), len(world.gpio.written)) == (20, 20, 1, 0)
+    assert (sim.robot.acts, box.answered, len(sim.robot.played), len(sim.gpio.written)) == (20, 20, 1, 0)
 
 
 def test_a_process_is_read_from_proc():
@@ -419,7 +425,7 @@ def test_this_machine_sweeps_answers_and_ends():
 
 
 @pytest.fixture
-def told(clean) -> dict:
+def result(clean) -> dict:
     """Results of two boxes, the second interrupted and with a fault, a third left out."""
     run, other = soak.asdict(clean), soak.asdict(copy.deepcopy(clean))
     other["faults"] = [[3.0, "answer 7 came again"]]
@@ -432,9 +438,9 @@ def told(clean) -> dict:
             "boxes": {name: box | {"sums": soak_judge.sums(box)} for name, box in boxes.items()}}  # fmt: skip
 
 
-def test_the_page_needs_nothing_else_and_tells_all(told):
+def test_the_page_needs_nothing_else_and_tells_all(result):
     """Both boxes, every target, the fault and what was left out; no address, no script; the picture is sound XML."""
-    html, svg = soak_page.tell(told)
+    html, svg = soak_page.tell(result)
     assert {e.tag.rpartition("}")[2] for e in ET.fromstring(svg).iter()} >= {"svg", "title", "path", "text"}
     assert not re.search(r"<script|<link|<img|@import|url\((?!#)|href=\"(?!#)", html)
     for text in ("this machine", "virtual box", "third box; it was not there", "answer 7 came again", "not reached",
@@ -444,13 +450,13 @@ def test_the_page_needs_nothing_else_and_tells_all(told):
     assert len(svg) < 60_000
 
 
-def test_a_day_of_sweeps_stays_a_small_picture(told):
+def test_a_day_of_sweeps_stays_a_small_picture(result):
     """Of 25,000 sweeps the slowest of each few is drawn, and the slowest of all is among them."""
-    rows = told["boxes"]["this machine"]["runs"][0]["answers"]
+    rows = result["boxes"]["this machine"]["runs"][0]["answers"]
     many = [[3.45 * i, i + 1, *rows[0][2:6], 1.5, 0] for i in range(25_000)]
     many[12_345][6] = 700.0
-    told["boxes"]["this machine"]["runs"][0]["answers"] = many
-    dots = soak_page.dots(told["boxes"]["this machine"])
+    result["boxes"]["this machine"]["runs"][0]["answers"] = many
+    dots = soak_page.dots(result["boxes"]["this machine"])
     assert len(dots[0]) <= soak_page.DOTS
     assert max(dots[1]) == 700.0
 

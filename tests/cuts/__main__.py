@@ -77,8 +77,8 @@ class CrashPointLog:
             file.write(json.dumps(asdict(point)) + "\n")
 
 
-def _point(told: dict[str, Any]) -> CrashPoint:
-    return CrashPoint(**told | {"wrong": tuple(told["wrong"])})
+def _point(reported: dict[str, Any]) -> CrashPoint:
+    return CrashPoint(**reported | {"wrong": tuple(reported["wrong"])})
 
 
 def _head() -> dict[str, str]:
@@ -113,12 +113,12 @@ def figures(points: Iterable[CrashPoint]) -> Iterator[str]:
         for name in (f"{point.scene}: {point.step}", "all"):
             steps.setdefault(name, []).append(point)
     for name in sorted(steps, key="all".__eq__):
-        told = []
+        reported = []
         for how in HOWS:
             of_it = [point for point in steps[name] if point.how == how]
             states, wrong = sum(point.states for point in of_it), sum(bool(point.wrong) for point in of_it)
-            told.append(f"{how.replace('_', ' ')} at {len(of_it)} moments, {states} folders, wrong {wrong}")
-        yield f"{name}: {'; '.join(told)}"
+            reported.append(f"{how.replace('_', ' ')} at {len(of_it)} moments, {states} folders, wrong {wrong}")
+        yield f"{name}: {'; '.join(reported)}"
 
 
 if __name__ == "__main__":

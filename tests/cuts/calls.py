@@ -63,7 +63,7 @@ class TracedRun:
     """How a command went: its calls, all that it wrote to standard output and standard error, its exit code."""
 
     calls: tuple[SystemCall, ...]
-    said: str
+    output: str
     code: int
 
 
@@ -92,10 +92,10 @@ def run(
     calls = tuple(_calls(log.read_text("ascii").splitlines(), str(log.parent)))
     if at and not any(c.result is None and (c.process, c.name, c.nth) == (at.process, at.name, at.nth) for c in calls):
         raise NotFollowed(f"was not killed at its {at.name} number {at.nth}: it ended with {done.returncode}")
-    return TracedRun(calls, "".join(map(said, calls)), done.returncode)
+    return TracedRun(calls, "".join(map(output, calls)), done.returncode)
 
 
-def said(call: SystemCall) -> str:
+def output(call: SystemCall) -> str:
     """What the command writes to standard output or standard error by this call; its children do not count."""
     heard = call.process == 0 and call.name in ("write", "writev") and call.descriptor in (1, 2) and call.result
     return call.data[: call.result].decode("utf-8", "replace") if heard else ""

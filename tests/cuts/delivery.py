@@ -70,10 +70,10 @@ class Shop:
 
     def words(self, folder: Path, *words: str | Path) -> list[str]:
         """A command of the box in `folder`. @: where bundles are copied to."""
-        said = [str(word).replace("@", f"{folder / INCOMING}/") for word in words]
+        output = [str(word).replace("@", f"{folder / INCOMING}/") for word in words]
         where = f"store.folder={folder / STORE}", f"store.signers={self.folder / 'signers'}"
         how = "store.status=", f"store.trial_sweeps={PROBATION}"
-        return said + [word for value in (*where, *how) for word in ("--set", value)]
+        return output + [word for value in (*where, *how) for word in ("--set", value)]
 
     def palpate(self, name: str, *words: str, way: str = "") -> SceneStep:
         """A command of the box, in one of WAYS or as it is."""
@@ -123,42 +123,42 @@ class Shop:
         step = self.palpate("install another", "install", str(self.at("second")), way=way)
         return self._scene(self._delivered, [("first second", step)])
 
-    def _scene(self, prepare: Callable[[Path], None], told: list[tuple[str, SceneStep]]) -> CutScene:
-        may = {step.name: names.split() for names, step in told}
+    def _scene(self, prepare: Callable[[Path], None], reported: list[tuple[str, SceneStep]]) -> CutScene:
+        may = {step.name: names.split() for names, step in reported}
         ids = {name: bundle.load(self.at(name)).id for name in NAMES}
 
         def judge(found: Found) -> list[str]:
             ran = {found.heard} if found.heard else {ids[name] for name in may[found.step]}
             return self._comes_back(found.folder, ran) or self._takes_another(found.folder, ids["last"])
 
-        return CutScene("delivery", prepare, tuple(step for _, step in told), judge, APART, _promised)
+        return CutScene("delivery", prepare, tuple(step for _, step in reported), judge, APART, _promised)
 
     def _delivered(self, folder: Path) -> None:
         """A box that runs the first bundle."""
         _bare(folder)
         for words in (("install", self.at("first")), START_AND_COMMIT):
-            code, said = _apart(self.words(folder, *words))
+            code, output = _apart(self.words(folder, *words))
             if code:
-                raise NotFollowed(f"{words[0]} ended with {code}: {_end(said)}")
+                raise NotFollowed(f"{words[0]} ended with {code}: {_end(output)}")
 
     def _comes_back(self, folder: Path, ids: set[str]) -> list[str]:
         """What is wrong with the box when it starts twice."""
         return [wrong for time in ("first", "second") for wrong in self._answers(folder, f"{time} start", ids)]
 
     def _answers(self, folder: Path, when: str, ids: set[str]) -> list[str]:
-        code, said = _apart(self.words(folder, *START))
-        names = ANSWER.findall(said)
+        code, output = _apart(self.words(folder, *START))
+        names = ANSWER.findall(output)
         if code or len(names) != 1 or not set(names) <= ids:
-            return [f"{when}: exit code {code}, answers by {names} instead of {sorted(ids)}: {_end(said)}"]
+            return [f"{when}: exit code {code}, answers by {names} instead of {sorted(ids)}: {_end(output)}"]
         return []
 
     def _takes_another(self, folder: Path, last: str) -> list[str]:
         """What is wrong with the box when the last bundle is delivered and committed."""
         again = folder / INCOMING / "again"
         shutil.copytree(self.at("last"), again)
-        code, said = _apart(self.words(folder, "install", again))
+        code, output = _apart(self.words(folder, "install", again))
         if code:
-            return [f"the next delivery ends with {code}: {_end(said)}"]
+            return [f"the next delivery ends with {code}: {_end(output)}"]
         left = [path.name for path in (folder / STORE).iterdir() if path.suffix == storage.PART]
         left += [path.name for path in (folder / STORE / "bundles").iterdir() if not SHA.fullmatch(path.name)]
         return [f"{name} is left" for name in left] + self._answers(folder, "after the next delivery", {last})
@@ -168,30 +168,30 @@ def _bare(folder: Path) -> None:
     (folder / INCOMING).mkdir(parents=True)
 
 
-def _promised(said: str) -> str:
+def _promised(output: str) -> str:
     """The bundle that is to run from the next start on, where the command that is cut has just said so."""
-    told = PROMISE.fullmatch(said.splitlines()[-1])
-    return told[1] if told else ""
+    reported = PROMISE.fullmatch(output.splitlines()[-1])
+    return reported[1] if reported else ""
 
 
-def _end(said: str) -> str:
-    return said.strip().rpartition("\n")[2][-300:]
+def _end(output: str) -> str:
+    return output.strip().rpartition("\n")[2][-300:]
 
 
 def _apart(words: list[str]) -> tuple[int, str]:
     """Run a command of the box in a child that has its libraries already; exit code, and all that it said."""
-    told = os.memfd_create("told")
+    reported = os.memfd_create("told")
     sys.stdout.flush()  # or the child says it, too
     child = os.fork()
     if not child:
         signal.alarm(DEADLINE_S)
-        sys.stdout = sys.stderr = os.fdopen(told, "w", 1)
+        sys.stdout = sys.stderr = os.fdopen(reported, "w", 1)
         try:
             os._exit(main(words))
         finally:
             os._exit(DIED)
     _, status = os.waitpid(child, 0)
-    with os.fdopen(told, "rb") as file:
+    with os.fdopen(reported, "rb") as file:
         file.seek(0)
         return os.waitstatus_to_exitcode(status), file.read().decode("utf-8", "replace")
 

@@ -221,7 +221,7 @@ class Disk:
 
     def left(self) -> Iterator[Tree]:
         """Each folder that may be found if the power goes now, once."""
-        told = set()
+        reported = set()
         for happened in self._happened():
             there = list(_walk(self._root, _overlay(happened)))
             unsure = [
@@ -233,8 +233,8 @@ class Disk:
                 ways += [ways[0] | {id(one): "synced"}, ways[1] | {id(one): "all"}]
             for way in ways if unsure else [{}]:
                 found: Tree = {path: _held(inode, way.get(id(inode), "all")) for path, inode in there}
-                if (name := digest(found, self._apart)) not in told:
-                    told.add(name)
+                if (name := digest(found, self._apart)) not in reported:
+                    reported.add(name)
                     yield found
 
     def _happened(self) -> list[tuple[Change, ...]]:

@@ -96,7 +96,7 @@ def judge(found: Found) -> list[str]:
     """What is wrong with the sweeps that were found, and with what the next run makes of them."""
     folder = found.folder / KEPT
     wrong, there = read(folder)
-    owed, gone = told(found.heard)
+    owed, gone = reported(found.heard)
     for name, which in owed.items():
         if there.get(name) != which:
             wrong.append(f"{name}, {which} was stored, and {there.get(name, 'nothing')} is there")
@@ -117,14 +117,14 @@ def read(folder: Path) -> tuple[list[str], dict[str, str]]:
     return wrong, there
 
 
-def told(said: str) -> tuple[dict[str, str], dict[str, str]]:
+def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
     """What a robot has heard: session and number of the sweeps that are stored, and of the discarded ones. What is being
     discarded is neither.
     """
     owed: dict[str, str] = {}
     gone: dict[str, str] = {}
     leaving = ""
-    for heard in HEARD.finditer(said):
+    for heard in HEARD.finditer(output):
         if heard["name"]:
             owed[heard["name"]] = f"{heard['session']} {heard['id']}"
         elif heard["how"] == "discarding":

@@ -89,7 +89,7 @@ class Moment:
     step: int
     number: int
     call: SystemCall | None
-    said: str
+    output: str
     disk: Disk
 
 
@@ -101,7 +101,7 @@ class ScenePlay:
 
     scene: CutScene
     work: Path
-    said: str = ""
+    output: str = ""
     before: list[tree.Tree] = field(default_factory=list)
     runs: list[TracedRun] = field(default_factory=list)
     judged: dict[tuple[str, str, str], tuple[str, ...]] = field(default_factory=dict)
@@ -114,7 +114,7 @@ class ScenePlay:
             self.before.append(tree.read(self.folder))
             run = self._run(step, step.killed)
             if not step.killed and step.code not in (None, run.code):
-                raise NotFollowed(f"{step.name} ended with {run.code}: {run.said[-2000:]}")
+                raise NotFollowed(f"{step.name} ended with {run.code}: {run.output[-2000:]}")
             self.runs.append(run)
 
     @property
@@ -124,26 +124,26 @@ class ScenePlay:
 
     def moments(self) -> Iterator[Moment]:
         """All moments in their order. What the command before the last one has done is on the disk by then."""
-        said = self.said
+        output = self.output
         for i, run in enumerate(self.runs):
             disk = Disk(self.folder, self.before[max(i - 1, 0)], self.scene.apart)
             disk.follow(self.runs[i - 1].calls if i else ())
-            said += BETWEEN
+            output += BETWEEN
             number = 0
             for call in run.calls:
-                said += calls.said(call)
+                output += calls.output(call)
                 if effect := disk.effect(call):
-                    yield Moment(i, number, call, said, disk)
+                    yield Moment(i, number, call, output, disk)
                     effect()
                     number += 1
-            yield Moment(i, number, None, said, disk)
+            yield Moment(i, number, None, output, disk)
 
     def power(self, moment: Moment) -> CrashPoint:
         """The power goes: each folder that may be left is judged."""
         step, wrong, states = self.scene.steps[moment.step], [], 0
         for left in moment.disk.left():
             states += 1
-            wrong += self._judged(left, step, moment.said)
+            wrong += self._judged(left, step, moment.output)
         return self._point("power", moment, states, wrong)
 
     def kill(self, moment: Moment) -> CrashPoint:
@@ -151,8 +151,8 @@ class ScenePlay:
         step = self.scene.steps[moment.step]
         self._restore(self.before[moment.step])
         run = self._run(step, moment.call)
-        said = "".join(BETWEEN + run.said for run in (*self.runs[: moment.step], run))
-        return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, said))
+        output = "".join(BETWEEN + run.output for run in (*self.runs[: moment.step], run))
+        return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, output))
 
     def kill_then_power(self, moment: Moment) -> CrashPoint:
         """The command is killed there, and started again: it goes on with what is left, and at each of its moments the
@@ -166,7 +166,7 @@ class ScenePlay:
             play = ScenePlay(
                 twice,
                 Path(work),
-                said="".join(BETWEEN + run.said for run in self.runs[: moment.step]),
+                output="".join(BETWEEN + run.output for run in self.runs[: moment.step]),
                 judged=self.judged,
             )
             for point in (play.power(later) for later in play.moments() if later.step):
@@ -189,9 +189,9 @@ class ScenePlay:
         self.folder.mkdir()
         tree.write(held, self.folder)
 
-    def _judged(self, left: tree.Tree, step: SceneStep, said: str) -> tuple[str, ...]:
+    def _judged(self, left: tree.Tree, step: SceneStep, output: str) -> tuple[str, ...]:
         """What is wrong with a folder; each is looked at once."""
-        heard = self.scene.hears(said)
+        heard = self.scene.hears(output)
         key = tree.digest(left, self.scene.apart), step.name, heard
         if key not in self.judged:
             with TemporaryDirectory(dir=self.work) as aside:
@@ -204,6 +204,6 @@ class ScenePlay:
     def _point(self, how: str, moment: Moment, states: int, wrong: Sequence[str]) -> CrashPoint:
         call = moment.call
         names = [str(Path(path).relative_to(self.folder)) for path in call.paths] if call else []
-        told = " ".join([call.name, *names]) if call else "the end"
+        reported = " ".join([call.name, *names]) if call else "the end"
         step = self.scene.steps[moment.step].name
-        return CrashPoint(self.scene.name, step, how, moment.number, told, states, tuple(dict.fromkeys(wrong)))
+        return CrashPoint(self.scene.name, step, how, moment.number, reported, states, tuple(dict.fromkeys(wrong)))

@@ -35,10 +35,10 @@ def write(found: Tree, folder: Path) -> None:
 
 def digest(found: Tree, apart: re.Pattern[str] = NOTHING) -> str:
     """The same for the same. Paths that are `apart` do not count, nor do the names that tempfile makes up."""
-    told = hashlib.sha256()
+    digested = hashlib.sha256()
     for name, held in sorted(
         (MADE_UP.sub("-*", name), held) for name, held in found.items() if not apart.fullmatch(name)
     ):
         data = held if isinstance(held, bytes) else repr(held).encode()
-        told.update(f"{name}\0{type(held).__name__}\0{len(data)}\0".encode("utf-8", "surrogateescape") + data)
-    return told.hexdigest()
+        digested.update(f"{name}\0{type(held).__name__}\0{len(data)}\0".encode("utf-8", "surrogateescape") + data)
+    return digested.hexdigest()

@@ -170,8 +170,8 @@ def played(data: bytes, folder: Path) -> None:
         assert frames.taxels.shape[1:] == (play.format.rows, play.format.cols)
         for edge in play.edges(play.now_ns()):
             assert 0 <= edge.t_ns < 1 << 63, f"an edge at {edge.t_ns} ns"
-        for told in play.commands():
-            assert told.name in robot_link.COMMANDS, f"{told.name!r} is no command"
+        for command in play.commands():
+            assert command.name in robot_link.COMMANDS, f"{command.name!r} is no command"
         assert play.state.isprintable(), f"{play.state!r} cannot be shown"
         assert 0 <= play.now_ns() < 1 << 63
     assert play.finished, "it does not come to an end"

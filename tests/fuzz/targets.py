@@ -150,10 +150,10 @@ def command(data: bytes, folder: Path) -> None:
     *lines, last = re.split(rb"[\r\n]+", data)
     lines = [line for line in lines if line]
     assert len(got) == len(lines) + (len(last) > LINE)
-    for line, told in zip(lines, got, strict=False):
-        assert bool(told.error) != _is_command(line, told.name), f"{line!r} was taken as {told}"
-    for told in got:
-        _answer(told)
+    for line, parsed in zip(lines, got, strict=False):
+        assert bool(parsed.error) != _is_command(line, parsed.name), f"{line!r} was taken as {parsed}"
+    for parsed in got:
+        _answer(parsed)
     for cut in cuts(data):
         first, left = robot_link.parse(data[:cut])
         then, left = robot_link.parse(data[cut:], left)
@@ -163,10 +163,10 @@ def command(data: bytes, folder: Path) -> None:
 def _is_command(line: bytes, name: str) -> bool:
     """Whether a line is a command by PROTOCOL.md, and this one."""
     body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
-    said, comma, text = body.removeprefix(b"PPLP,").decode("ascii", "replace").partition(",")
+    head, comma, text = body.removeprefix(b"PPLP,").decode("ascii", "replace").partition(",")
     known = (
         body.startswith(b"PPLP,")
-        and said == name
+        and head == name
         and name in robot_link.COMMANDS
         and bool(comma) == (name in robot_link.LABEL_COMMANDS)
     )
@@ -176,16 +176,16 @@ def _is_command(line: bytes, name: str) -> bool:
     return known and sealed and len(line) <= LINE
 
 
-def _answer(told: robot_link.Command) -> None:
+def _answer(parsed: robot_link.Command) -> None:
     """The sentence that answers a command has all its fields, whatever stood in the line."""
-    line = robot_link.sentence("ANS", told.name, "error" if told.error else "ok", told.error)
+    line = robot_link.sentence("ANS", parsed.name, "error" if parsed.error else "ok", parsed.error)
     assert len(line) <= LINE
     body, given = line.removeprefix(b"$").removesuffix(b"\r\n").split(b"*")
     assert body.decode("ascii").isprintable()
     assert given == b"%02X" % reduce(xor, body, 0)
-    kind, name, how, _ = body.decode().split(",", 4)[1:5]
-    assert (kind, how) == ("ANS", "error" if told.error else "ok")
-    assert told.error or name == told.name
+    kind, name, outcome, _ = body.decode().split(",", 4)[1:5]
+    assert (kind, outcome) == ("ANS", "error" if parsed.error else "ok")
+    assert parsed.error or name == parsed.name
 
 
 TARGETS: dict[str, Target] = {

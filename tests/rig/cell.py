@@ -89,10 +89,10 @@ class Cell:
         self.acts = script.tubes(seed)
         self.packet_frames = 6
 
-    def board(self, **how: Any) -> rig.Board:
+    def board(self, **arguments: Any) -> rig.Board:
         """A board in the robot's hand: how are the arguments of sim.rig.Board (ppm, latency, serial, …)."""
         usual = {"fifo_frames": FIFO, "packet_frames": self.packet_frames}
-        return rig.Board(skin.FORMAT, self.hand, self.clock, **usual | how)
+        return rig.Board(skin.FORMAT, self.hand, self.clock, **usual | arguments)
 
     def plug(self, board: rig.Board | None = None) -> rig.Board:
         """Plug a board in, a sound one if none is given. An old one goes first, and a box that runs has seen it: FAULT."""

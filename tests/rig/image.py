@@ -108,21 +108,21 @@ def _need(tools: Iterable[str]) -> None:
 
 def _ground_name() -> str:
     parts = [emulated_machines.LOCK, HERE / "arm.py", GUEST / "agent.py", GUEST / "agent.service", GUEST / "init"]
-    said = repr((SUITE, PACKAGES, MODULES, EARLY, LINES, DISK, MACHINE))
-    return f"ground-{_hash(parts, said)}"
+    key = repr((SUITE, PACKAGES, MODULES, EARLY, LINES, DISK, MACHINE))
+    return f"ground-{_hash(parts, key)}"
 
 
 def _box_name() -> str:
     parts = [
-        p for room in ("appliance", "systemd", "firmware_config") for p in sorted((ROOT / room).rglob("*"))
+        p for folder in ("appliance", "systemd", "firmware_config") for p in sorted((ROOT / folder).rglob("*"))
         if p.is_file() and "__pycache__" not in p.parts
     ]  # fmt: skip
     parts += [ROOT / "pyproject.toml", GUEST / "install.sh", GUEST / "palpate.toml", HERE / "machine.py"]
     return f"box-{_hash(parts, _ground_name())}"
 
 
-def _hash(parts: Iterable[Path], said: str) -> str:
-    total = hashlib.sha256(said.encode())
+def _hash(parts: Iterable[Path], key: str) -> str:
+    total = hashlib.sha256(key.encode())
     for part in parts:
         total.update(hashlib.sha256(part.read_bytes()).digest() + part.name.encode())
     return total.hexdigest()[:16]
@@ -180,13 +180,13 @@ def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> li
         run("depmod", "-b", kernel, version)
     found: dict[Path, None] = {}
     for name in names:
-        told = subprocess.run(
+        listing = subprocess.run(
             ["modprobe", "-d", kernel, "-S", version, "--show-depends", name],
             capture_output=True,
             text=True,
             check=False,
         ).stdout
-        found |= dict.fromkeys(Path(line.split()[1]) for line in told.splitlines() if line.startswith("insmod"))
+        found |= dict.fromkeys(Path(line.split()[1]) for line in listing.splitlines() if line.startswith("insmod"))
     for file in found:
         place = target / file.relative_to(source)
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -226,8 +226,8 @@ def _make_box(part: Path, on: Path) -> None:
     code.mkdir()
     source.mkdir()
     emulated_machines.wheel(code, source)
-    for room in ("systemd", "firmware_config"):
-        shutil.copytree(ROOT / room, code / room)
+    for folder in ("systemd", "firmware_config"):
+        shutil.copytree(ROOT / folder, code / folder)
     for file in ("install.sh", "palpate.toml"):
         shutil.copy(GUEST / file, code)
     disk = part / "disk.qcow2"

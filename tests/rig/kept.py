@@ -103,8 +103,8 @@ class CampaignLog:
         self._path, self._box = ROOT / "build" / "rig" / f"{name}.jsonl", box.parent.name
         self.lines: list[dict[str, Any]] = []
         with suppress(FileNotFoundError):
-            told = [json.loads(line) for line in self._path.read_text().splitlines()]
-            self.lines = [line for line in told if line["box"] == self._box]
+            events = [json.loads(line) for line in self._path.read_text().splitlines()]
+            self.lines = [line for line in events if line["box"] == self._box]
 
     def add(self, **what: Any) -> None:
         """Write an event down."""

@@ -165,8 +165,8 @@ class Guest:
         except TimeoutError as e:
             raise GuestFailed(f"the guest said nothing for {timeout_s + START_S:.0f} s to: {line}") from e
         answer, _, self._rest = self._rest.partition(b"\n")
-        told = json.loads(answer)
-        done = Done(told["rc"], base64.b64decode(told["out"]).decode(errors="replace"))
+        reply = json.loads(answer)
+        done = Done(reply["rc"], base64.b64decode(reply["out"]).decode(errors="replace"))
         if check and done.rc:
             raise GuestFailed(f"rc {done.rc} of: {line}\n{done.out[-2000:]}")
         return done
@@ -183,9 +183,9 @@ class Guest:
         """Keep the running guest in its disk as the snapshot `ready`, without what hangs on its USB, and end."""
         self.qmp("device_del", id="cable")
         self.run("udevadm settle")
-        said = self.qmp("human-monitor-command", **{"command-line": "savevm ready"})
-        if said.strip():
-            raise GuestFailed(f"qemu: savevm: {said}")
+        text = self.qmp("human-monitor-command", **{"command-line": "savevm ready"})
+        if text.strip():
+            raise GuestFailed(f"qemu: savevm: {text}")
         self.close()
 
     def bench(self) -> socket.socket:

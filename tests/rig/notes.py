@@ -30,9 +30,9 @@ def table(file: Path = FILE) -> list[str]:
     """Lines of a Markdown table, the faults of one test file together. Raises OSError where nothing was noted."""
     best: dict[tuple[str, str], dict[str, Any]] = {}
     for line in file.read_text().splitlines():
-        told = json.loads(line)
-        key = told["test"].partition("::")[0], told["fault"]
-        if key not in best or told["times"] >= best[key]["times"]:
-            best[key] = told
-    rows = [f"| {fault} | {told['outcome']} | {told['times']} |" for (_, fault), told in sorted(best.items())]
+        event = json.loads(line)
+        key = event["test"].partition("::")[0], event["fault"]
+        if key not in best or event["times"] >= best[key]["times"]:
+            best[key] = event
+    rows = [f"| {fault} | {event['outcome']} | {event['times']} |" for (_, fault), event in sorted(best.items())]
     return ["| fault | what the box did | times |", "|---|---|---|", *rows]

@@ -159,11 +159,11 @@ def record(
 
 def progress(run: SoakRun) -> str:
     """A run in a line."""
-    told = soak_judge.sums({"runs": [asdict(run)]})
-    memory = f"{told['rss_kib'][-1] / 1024:.1f} MiB, " if told["rss_kib"] else ""
+    results = soak_judge.sums({"runs": [asdict(run)]})
+    memory = f"{results['rss_kib'][-1] / 1024:.1f} MiB, " if results["rss_kib"] else ""
     return (
-        f"{run.length_s / 60:.0f} min, {told['answers']} sweeps, {told['unanswered']} unanswered, {told['wrong']['n']} "
-        f"wrong, {memory}{told['lost']} frames lost, {told['unaccounted']} unaccounted for, {told['faults']} faults"
+        f"{run.length_s / 60:.0f} min, {results['answers']} sweeps, {results['unanswered']} unanswered, {results['wrong']['n']} "
+        f"wrong, {memory}{results['lost']} frames lost, {results['unaccounted']} unaccounted for, {results['faults']} faults"
     )
 
 
@@ -225,19 +225,19 @@ def draw(work: Path, out: Path) -> bool:
     paths = [work / f"{name.replace(' ', '-')}.json" for name in BOXES]
     records = [json.loads(path.read_text()) for path in paths if path.exists()]
     boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}
-    told = {
+    results = {
         "columns": {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE},
         "left_out": {
             name: kind.missing() or "it was not recorded" for name, kind in BOXES.items() if name not in boxes
         },
         "boxes": boxes,
     }
-    html, svg = soak_page.tell(told)
-    write(out / "results.json", told)
+    html, svg = soak_page.tell(results)
+    write(out / "results.json", results)
     (out / "index.html").write_text(html)
     (out / "soak.svg").write_text(svg)
     reached = True
-    for name, box in told["boxes"].items():
+    for name, box in results["boxes"].items():
         for what, wanted, came, met in soak_judge.targets(box["sums"]):
             mark = {True: "ok  ", False: "FAIL", None: "    "}[met]
             print(
@@ -268,8 +268,8 @@ def main() -> int:
             signal.signal(number, lambda n, frame: got.append(n))
         soak(BOXES[args.box](), args.seed, hours, args.work, stopped=lambda: bool(got), log=partial(print, flush=True))
         return 0
-    how = ["--seed", str(args.seed), "--hours", repr(hours), "--work", str(args.work.resolve())]
-    recorded = args.draw or _together(how)
+    arguments = ["--seed", str(args.seed), "--hours", repr(hours), "--work", str(args.work.resolve())]
+    recorded = args.draw or _together(arguments)
     return 0 if draw(args.work, args.out) and recorded else 1
 
 

@@ -32,7 +32,7 @@ from appliance.inference.classifier import Classifier
 from appliance.sim import rig, script, skin
 from appliance.tools import pseudo_terminal
 from appliance.tools.score import Answer
-from tests.rig.soak_judge import said
+from tests.rig.soak_judge import short_answer
 
 STOP_S = 30
 """Longest wait for a box to end after it was told to."""
@@ -84,7 +84,7 @@ class Script:
         window = act.frames[first : first + skin.FORMAT.window]
         seq = np.arange(len(window))
         verdict = self._classifier(Sweep(1, 0, 1, Status.OK, Frames(seq, seq, window)))
-        return said(verdict.status, verdict.label)
+        return short_answer(verdict.status, verdict.label)
 
 
 class BoxUnderTest(Protocol):
@@ -188,7 +188,7 @@ class ThisMachine:
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
         """As BoxUnderTest."""
         if self._box.poll() is not None:
-            raise Gone(f"the box ended with {self._box.returncode}: {self._said()}")
+            raise Gone(f"the box ended with {self._box.returncode}: {self._log_text()}")
         return self._read(wait_s)
 
     def _read(self, wait_s: float) -> list[tuple[float, str]]:
@@ -200,7 +200,7 @@ class ThisMachine:
             self._robot.hear(at_s, line)
         return found
 
-    def _said(self) -> str:
+    def _log_text(self) -> str:
         return self._log.read_text(errors="replace").strip()[-300:]
 
     def edges(self, at_s: float) -> tuple[int, int]:
@@ -218,7 +218,7 @@ class ThisMachine:
             smaps, stat = ((place / name).read_text() for name in ("smaps_rollup", "stat"))
             return process(smaps, stat, len(os.listdir(place / "fd")))
         except (OSError, KeyError) as e:
-            raise Gone(f"the box cannot be looked at: {e}; it said {self._said()!r}") from e
+            raise Gone(f"the box cannot be looked at: {e}; it said {self._log_text()!r}") from e
 
     def about(self) -> Mapping[str, Any]:
         """As BoxUnderTest."""
@@ -234,7 +234,7 @@ class ThisMachine:
         self._box.terminate()
         lines = list(self._until_ended())
         if self._box.poll() != 0:
-            raise Gone(f"the box was told to end, and ended with {self._box.poll()}: {self._said()}")
+            raise Gone(f"the box was told to end, and ended with {self._box.poll()}: {self._log_text()}")
         return lines
 
     def close(self) -> None:

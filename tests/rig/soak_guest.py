@@ -140,11 +140,11 @@ class VirtualBox:
         """As BoxUnderTest."""
         place = f"/proc/{self._pid}"
         try:
-            told = self._guest.run(f"cat {place}/smaps_rollup {place}/stat && ls {place}/fd | wc -l", check=True).out
+            text = self._guest.run(f"cat {place}/smaps_rollup {place}/stat && ls {place}/fd | wc -l", check=True).out
         except (GuestFailed, OSError) as e:
             raise Gone(f"the box cannot be looked at: {e}; did it end?") from e
-        *_, stat, files = told.strip().splitlines()
-        return process(told, stat, int(files))
+        *_, stat, files = text.strip().splitlines()
+        return process(text, stat, int(files))
 
     def about(self) -> Mapping[str, Any]:
         """As BoxUnderTest; of the emulated machine alone, since the guest does not run yet."""

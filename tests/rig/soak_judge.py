@@ -77,7 +77,7 @@ def kind(status: str, label: str, touched: str) -> str:
     return "unsure" if status in (Status.UNSURE, Status.UNDECIDED) else "refused"
 
 
-def said(status: str, label: str) -> str:
+def short_answer(status: str, label: str) -> str:
     """An answer in a word: the label where it is sure, else the status."""
     return label if status == Status.OK else status
 
@@ -90,13 +90,13 @@ def sums(box: Json) -> dict[str, Any]:
     kinds = Counter(kind(*row) for row in zip(a["status"], a["label"], a["touched"], strict=True))
     judged = len(rows) - kinds["cut"]
     due = sum(run["due"] for run in runs)
-    told = {
+    result = {
         "hours": sum(run["length_s"] for run in runs) / 3600,
         "due": due,
         "answers": len(rows),
         "unanswered": sum(len({*range(1, run["due"] + 1)} - {row[1] for row in run["answers"]}) for run in runs),
         "cut": kinds["cut"],
-        "differs": sum(row[3] != Status.ABORTED and said(row[3], row[4]) != row[5] for row in rows),
+        "differs": sum(row[3] != Status.ABORTED and short_answer(row[3], row[4]) != row[5] for row in rows),
         "statuses": dict(Counter(a["status"])),
         "faults": sum(len(run["faults"]) for run in runs),
         "silence_s": max((run["silence_s"] for run in runs), default=0.0),
@@ -104,8 +104,8 @@ def sums(box: Json) -> dict[str, Any]:
         "memory": slope(runs),
         "wrong_band": band(rows)[1][-1] if judged else [0, 0],
     }  # fmt: skip
-    told |= {name: share(kinds[name], judged) for name in ("right", "wrong", "unsure", "refused")}
-    return told | _counted(runs)
+    result |= {name: share(kinds[name], judged) for name in ("right", "wrong", "unsure", "refused")}
+    return result | _counted(runs)
 
 
 def share(n: int, total: int) -> dict[str, Any]:
@@ -138,10 +138,10 @@ def slope(runs: Sequence[Json]) -> dict[str, Any]:
     interval is that of so many independent ones as their correlation leaves (Bartlett 1946, first order).
     """
     held = [columns(half, SAMPLE) for run in runs if len(half := run["samples"][len(run["samples"]) // 2 :]) > 1]
-    told = {"samples": sum(len(h["s"]) for h in held), "minutes": sum(h["s"][-1] - h["s"][0] for h in held) / 60}
-    n, fitted = told["samples"], len(held) + 1
+    result = {"samples": sum(len(h["s"]) for h in held), "minutes": sum(h["s"][-1] - h["s"][0] for h in held) / 60}
+    n, fitted = result["samples"], len(held) + 1
     if n <= fitted:
-        return told | {"kib_h": None, "low": None, "high": None}
+        return result | {"kib_h": None, "low": None, "high": None}
     x, y = (np.concatenate([np.subtract(v, np.mean(v)) for v in values])
             for values in ([h["s"] for h in held], [h["rss_kib"] for h in held]))  # fmt: skip
     x = x / 3600
@@ -152,19 +152,21 @@ def slope(runs: Sequence[Json]) -> dict[str, Any]:
     fewer = (1 + alike) / (1 - alike)
     error = math.sqrt(power / (n - fitted) / float(x @ x) * fewer)
     half = float(stats.t.ppf(0.975, max(n / fewer - fitted, 1))) * error
-    return told | {"kib_h": round(b, 1), "low": round(b - half, 1), "high": round(b + half, 1)}
+    return result | {"kib_h": round(b, 1), "low": round(b - half, 1), "high": round(b + half, 1)}
 
 
 def _counted(runs: Sequence[Json]) -> dict[str, Any]:
     """Counters of the box, and what the board took that it never counted."""
     last = [columns(run["samples"], SAMPLE) for run in runs if run["samples"]]
-    told: dict[str, Any] = {name: sum(c[name][-1] for c in last)
+    result: dict[str, Any] = {name: sum(c[name][-1] for c in last)
                             for name in ("received", "lost", "garbage", "enumerations", "dropped")}  # fmt: skip
-    told["unaccounted"] = sum(unaccounted(c["behind"]) for c in last)
-    told["cpu"] = sum(c["cpu_s"][-1] - c["cpu_s"][0] for c in last) / max(sum(c["s"][-1] - c["s"][0] for c in last), 1)
+    result["unaccounted"] = sum(unaccounted(c["behind"]) for c in last)
+    result["cpu"] = sum(c["cpu_s"][-1] - c["cpu_s"][0] for c in last) / max(
+        sum(c["s"][-1] - c["s"][0] for c in last), 1
+    )
     for name in ("rss_kib", "pss_kib", "files", "threads"):
-        told[name] = [c[name][i] for c in last[-1:] for i in (0, len(c[name]) // 2, -1)]
-    return told
+        result[name] = [c[name][i] for c in last[-1:] for i in (0, len(c[name]) // 2, -1)]
+    return result
 
 
 def unaccounted(behind: Sequence[float]) -> int:
@@ -179,16 +181,21 @@ def unaccounted(behind: Sequence[float]) -> int:
     return abs(more) if abs(more) > IN_FLIGHT else 0
 
 
-def targets(told: Json) -> Iterator[tuple[str, str, str, bool | None]]:
+def targets(result: Json) -> Iterator[tuple[str, str, str, bool | None]]:
     """(what, what is wanted, what came out, whether it was reached) of each target; None where the run was too short."""
-    yield "sweeps without an answer", "0", f"{told['unanswered']} of {told['due']}", told["unanswered"] == 0
-    yield "sentences out of order, broken or missing", "0", f"{told['faults']}", told["faults"] == 0
-    yield "frames lost and not accounted for", "0", f"{told['unaccounted']} of {_taken(told)}", told["unaccounted"] == 0
-    yield "sentences dropped", "0", f"{told['dropped']}", told["dropped"] == 0
-    most = told["wrong_band"][1]
-    wrong = told["wrong"]["n"]
+    yield "sweeps without an answer", "0", f"{result['unanswered']} of {result['due']}", result["unanswered"] == 0
+    yield "sentences out of order, broken or missing", "0", f"{result['faults']}", result["faults"] == 0
+    yield (
+        "frames lost and not accounted for",
+        "0",
+        f"{result['unaccounted']} of {_taken(result)}",
+        result["unaccounted"] == 0,
+    )
+    yield "sentences dropped", "0", f"{result['dropped']}", result["dropped"] == 0
+    most = result["wrong_band"][1]
+    wrong = result["wrong"]["n"]
     yield "wrong verdicts, against the network by itself", f"at most {most}", f"{wrong}", wrong <= most
-    m = told["memory"]
+    m = result["memory"]
     grown = "" if m["high"] is None else estimate(m["kib_h"], m["low"], m["high"])
     flat = grown and m["high"] < GROWTH_KIB_H
     yield (
@@ -197,8 +204,8 @@ def targets(told: Json) -> Iterator[tuple[str, str, str, bool | None]]:
         grown,
         bool(flat) if m["minutes"] >= SECURE_MIN else None,
     )
-    steady = all(told[name][-1] <= max(told[name][:2]) for name in ("files", "threads") if told[name])
-    held = ", ".join(str(told[name][-1]) for name in ("files", "threads") if told[name])
+    steady = all(result[name][-1] <= max(result[name][:2]) for name in ("files", "threads") if result[name])
+    held = ", ".join(str(result[name][-1]) for name in ("files", "threads") if result[name])
     yield "open files, threads", "no more", held, steady
 
 
@@ -207,5 +214,5 @@ def estimate(value: float, low: float, high: float) -> str:
     return f"{value:,.0f} [{low:,.0f}, {high:,.0f}]".replace("-", "−")
 
 
-def _taken(told: Json) -> str:
-    return f"{told['received'] + told['lost']:,}"
+def _taken(result: Json) -> str:
+    return f"{result['received'] + result['lost']:,}"

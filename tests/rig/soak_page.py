@@ -37,22 +37,24 @@ DOTS = 1500
 MARKS = {True: "reached", False: "not reached", None: "too short to tell"}
 
 
-def tell(told: Json) -> tuple[str, str]:
+def tell(results: Json) -> tuple[str, str]:
     """The page (HTML) and its picture (SVG)."""
-    picture = charts(told)
-    return html.page("Soak", opening(told), drawn(told, picture), figures(told), faults(told), run(told)), picture
+    picture = charts(results)
+    return html.page(
+        "Soak", opening(results), drawn(results, picture), figures(results), faults(results), run(results)
+    ), picture
 
 
-def opening(told: Json) -> str:
+def opening(results: Json) -> str:
     """What was asked and what came out, target by target."""
-    boxes = told["boxes"]
+    boxes = results["boxes"]
     rows = []
     for each in zip(*(targets(box["sums"]) for box in boxes.values()), strict=True):
         marks = [met for *_, met in each]
         reached = MARKS[False if False in marks else None if None in marks else True]
         rows.append([each[0][0], each[0][1], *(came for _, _, came, _ in each), reached])
     hours = ", ".join(f"{_hours(box['sums']['hours'])} on {_the(name)}" for name, box in boxes.items())
-    left = [html.text(f"Left out: {_the(name)}; {why}.", kind="note") for name, why in told["left_out"].items()]
+    left = [html.text(f"Left out: {_the(name)}; {why}.", kind="note") for name, why in results["left_out"].items()]
     return "\n".join([
         html.text(f"Sweeps without pause, in real time: {hours or 'none yet'}. The skin is simulated in both boxes; each sentence "
                   "is compared with what the robot did."),
@@ -61,9 +63,9 @@ def opening(told: Json) -> str:
     ])  # fmt: skip
 
 
-def drawn(told: Json, picture: str) -> str:
+def drawn(results: Json, picture: str) -> str:
     """The charts with what they show."""
-    names = " and ".join(f"{_the(name)} {'dashed' if i else 'in blue'}" for i, name in enumerate(told["boxes"]))
+    names = " and ".join(f"{_the(name)} {'dashed' if i else 'in blue'}" for i, name in enumerate(results["boxes"]))
     return html.heading("Over time") + html.figure(
         picture,
         f"{names[:1].upper()}{names[1:]}. Memory is resident memory, latency the box's own figure for each sweep, loss all "
@@ -72,9 +74,9 @@ def drawn(told: Json, picture: str) -> str:
     )
 
 
-def figures(told: Json) -> str:
+def figures(results: Json) -> str:
     """All sums."""
-    sums = [box["sums"] for box in told["boxes"].values()]
+    sums = [box["sums"] for box in results["boxes"].values()]
     statuses = dict.fromkeys(status for s in sums for status in s["statuses"])
     lines: list[tuple[str, Any]] = [
         ("hours", lambda s: f"{s['hours']:.2f}"),
@@ -98,7 +100,7 @@ def figures(told: Json) -> str:
         ("share of a core", lambda s: f"{s['cpu']:.3f}"),
     ]
     rows = [[what, *(of(s) for s in sums)] for what, of in lines]
-    return html.heading("Sums") + html.table(["", *told["boxes"]], rows, texts=(0,)) + html.text(
+    return html.heading("Sums") + html.table(["", *results["boxes"]], rows, texts=(0,)) + html.text(
         "Shares with 95 % Wilson intervals. Refused are all answers without a label, such as unknown, and count neither as right "
         f"nor as wrong. Memory is flat where the 95 % interval of its slope ends below {GROWTH_KIB_H:g} KiB an hour, a bound set "
         f"before the first run, and told only of second halves of {SECURE_MIN} minutes or more. Frames that the board "
@@ -106,24 +108,26 @@ def figures(told: Json) -> str:
     )  # fmt: skip
 
 
-def faults(told: Json) -> str:
+def faults(results: Json) -> str:
     """What must not be and was."""
-    rows = [[name, f"{at_s:.1f}", what] for name, box in told["boxes"].items() for run in box["runs"]
+    rows = [[name, f"{at_s:.1f}", what] for name, box in results["boxes"].items() for run in box["runs"]
             for at_s, what in run["faults"]]  # fmt: skip
     return html.heading("Faults") + html.table(["box", "s", "what"], rows, texts=(0, 2)) if rows else ""
 
 
-def run(told: Json) -> str:
+def run(results: Json) -> str:
     """What was run."""
     names = ("what", "machine", "versions", "commit", "seed", "format", "started", "runs")
-    rows = [[name, *(_about(box, name) for box in told["boxes"].values())] for name in names]
-    return html.heading("What was run") + html.table(["", *told["boxes"]], rows, texts=range(len(told["boxes"]) + 1))
+    rows = [[name, *(_about(box, name) for box in results["boxes"].values())] for name in names]
+    return html.heading("What was run") + html.table(
+        ["", *results["boxes"]], rows, texts=range(len(results["boxes"]) + 1)
+    )
 
 
-def charts(told: Json) -> str:
+def charts(results: Json) -> str:
     """Four small charts, memory and latency above loss and verdicts."""
     figure = Figure((WIDTH, 4.4))
-    boxes = list(told["boxes"].items())
+    boxes = list(results["boxes"].items())
     hours = max([box["sums"]["hours"] for _, box in boxes] or [0]) or 1
     by, unit = (1, "min") if hours < 4 else (60, "h")
     for i, (title, draw) in enumerate(

@@ -59,21 +59,21 @@ def not_wrong(touch: Touch, answer: Answer) -> str:
 
 def comes_back(cell: Cell) -> None:
     """READY by itself, then a right sweep. Raises AssertionError where that does not come."""
-    said = []
+    received = []
     for _ in range(TRIES):
         cell.until_ready()
         touch, answer = cell.sweep()
-        said.append(not_wrong(touch, answer))
+        received.append(not_wrong(touch, answer))
         if answer.status == "ok":
             return
         assert answer.status in LATE, f"a sound sweep was answered {answer}"
-    raise AssertionError(f"{TRIES} sound sweeps were answered {said}; the box says: {cell.journal()}")
+    raise AssertionError(f"{TRIES} sound sweeps were answered {received}; the box says: {cell.journal()}")
 
 
 def state(cell: Cell) -> dict[str, str]:
     """The fields of a state sentence, as of now."""
-    said = cell.serial.ask("$PPLP,STATE", 30).split("*")[0].split(",")[4:]
-    return dict(zip(FIELDS, said, strict=True))
+    received = cell.serial.ask("$PPLP,STATE", 30).split("*")[0].split(",")[4:]
+    return dict(zip(FIELDS, received, strict=True))
 
 
 def until_state(cell: Cell, wanted: str, timeout_s: float = 30) -> None:

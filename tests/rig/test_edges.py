@@ -129,7 +129,7 @@ def test_glitches(cell: Cell, count: Count, note: Note) -> None:
 
 def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: Note) -> None:
     """A start edge while a sweep is open: `no-stop`, and the new sweep is right, though glitches come all the time."""
-    said: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter()
     for _ in range(count(1, 10)):
         cell.until_ready()
         since = len(cell.serial.heard)
@@ -146,9 +146,9 @@ def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: No
             glitches += 2
             cell.wait(0.05)
         _, second = answers(cell, since, 2)
-        said[not_wrong(touch, second)] += 1
-    assert said["ok"], said
-    note("start edge while a sweep is open, glitches in the next", f"no-stop, then {dict(said)}", said.total())
+        outcomes[not_wrong(touch, second)] += 1
+    assert outcomes["ok"], outcomes
+    note("start edge while a sweep is open, glitches in the next", f"no-stop, then {dict(outcomes)}", outcomes.total())
 
 
 def test_stop_without_start(cell: Cell, note: Note) -> None:
@@ -197,8 +197,8 @@ def test_storm(cell: Cell, note: Note) -> None:
     seen = Counter(answer.status for answer in cell.answers(since))
     assert seen.keys() <= {"no-stop", "short", "no-start", "edges-lost", "not-ready"}, seen
     comes_back(cell)
-    told = ", ".join(f"{n} {status}" for status, n in seen.most_common())
-    note("storm of 10,000 edges", f"{told or 'nothing'}; then a right verdict", 1)
+    results = ", ".join(f"{n} {status}" for status, n in seen.most_common())
+    note("storm of 10,000 edges", f"{results or 'nothing'}; then a right verdict", 1)
 
 
 def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
@@ -217,10 +217,10 @@ def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
             toggle(cell, "STOP", 1000)
     cell.until_ready(20)
     cell.state()
-    said = [answer.status for answer in cell.answers(since)]
-    assert said in (["edges-lost"], ["not-ready", "edges-lost"])
+    outcomes = [answer.status for answer in cell.answers(since)]
+    assert outcomes in (["edges-lost"], ["not-ready", "edges-lost"])
     comes_back(cell)
-    note("event queue overrun", f"{', '.join(said)}; then a right verdict", 1)
+    note("event queue overrun", f"{', '.join(outcomes)}; then a right verdict", 1)
 
 
 def one_line_sweep(cell: Cell) -> tuple[Touch, int]:
@@ -248,18 +248,20 @@ def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
     cell.lines.set("START", False)
     assert statuses(cell, since, 1) == ["no-start"]
     pulse(cell, "STOP")  # NEW OBJECT
-    told = []
+    results = []
     for _ in range(2):
         begun = len(cell.lines.log)
         touch, since = one_line_sweep(cell)
-        told += [(touch, *answers(cell, since, 1))]
+        results += [(touch, *answers(cell, since, 1))]
         assert cell.lines.wait("READY", True, 10)
         cell.wait(max(0.0, (touch.stop_ns - time.monotonic_ns()) / 1e9) + 0.3)
         seen = [(name, level) for _, name, level in cell.lines.log[begun:]]
-        assert seen.index((BUSY, True)) < seen.index((DECIDED, True)) if told[-1][1].share < 1 else (BUSY, True) in seen
+        assert (
+            seen.index((BUSY, True)) < seen.index((DECIDED, True)) if results[-1][1].share < 1 else (BUSY, True) in seen
+        )
         assert seen.index((BUSY, False)) > seen.index((BUSY, True))
-    assert [answer.fused for _, answer in told] == [1, 2]
-    assert not_wrong(*told[0]) == "ok"
+    assert [answer.fused for _, answer in results] == [1, 2]
+    assert not_wrong(*results[0]) == "ok"
     note("one-line mode, NEW OBJECT, BUSY, DECIDED, high at start-up", "work; no-start for the fall", 2)
 
     since, begun = len(cell.serial.heard), len(cell.lines.log)

@@ -123,10 +123,10 @@ def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.
         machine.cut()
     code, files = found(machine.disk, folder)
     parts = sum(path.suffix == ".part" for path in files)
-    told = lost(cell.serial.heard, sweeps(files)) | {"parts": parts, "fsck": code}
+    counts = lost(cell.serial.heard, sweeps(files)) | {"parts": parts, "fsck": code}
     harmed = robot.harmed(kills)
-    ledger.add(doing="end", back=n, statuses=statuses(cell), harmed=harmed, **told)
-    assert {told[name] for name in ("lost", "parts", "fsck")} == {0}
+    ledger.add(doing="end", back=n, statuses=statuses(cell), harmed=harmed, **counts)
+    assert {counts[name] for name in ("lost", "parts", "fsck")} == {0}
     assert not harmed
 
 
@@ -181,10 +181,10 @@ def cut(
         machine.cut()
     code, files = found(disk, folder)
     kept = sweeps(files)
-    told = lost(cell.serial.heard, kept) | {"parts": parts, "fsck": code}
-    told["lost"] += max(0, had - len(kept))
-    ledger.add(doing=doing, back=int(not booting), cut=1, ready_s=ready_s, statuses=statuses(cell), **told)
-    assert {told[name] for name in ("lost", "parts", "fsck")} == {0}
+    counts = lost(cell.serial.heard, kept) | {"parts": parts, "fsck": code}
+    counts["lost"] += max(0, had - len(kept))
+    ledger.add(doing=doing, back=int(not booting), cut=1, ready_s=ready_s, statuses=statuses(cell), **counts)
+    assert {counts[name] for name in ("lost", "parts", "fsck")} == {0}
     return len(kept)
 
 

@@ -84,15 +84,15 @@ def sound(cell: Cell) -> Answer:
     raise AssertionError(f"no sweep is ok: {answers}")
 
 
-def said(cell: Cell, text: str) -> int:
+def journal_count(cell: Cell, text: str) -> int:
     """How many lines of the journal hold a text."""
     return int(cell.machine.run(f"journalctl -u palpate -o cat | grep -cF '{text}'", timeout_s=60).out)
 
 
-def until_said(cell: Cell, text: str, since: int = 0, timeout_s: float = START_S) -> None:
+def until_logged(cell: Cell, text: str, since: int = 0, timeout_s: float = START_S) -> None:
     """Wait until more than `since` lines hold it."""
     end = time.monotonic() + timeout_s
-    while said(cell, text) <= since:
+    while journal_count(cell, text) <= since:
         assert time.monotonic() < end, f"the box has not said {text!r}, but: {cell.journal()}"
         time.sleep(1)
 
@@ -114,25 +114,25 @@ def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
     sound(box)
     before, used = files(box), used_k(box)
     pages = (used - empty) // 4  # of a whole sweep; with one less it does not fit
-    rooms, first = [*(range(pages) if HOW == "full" else [pages - 1]), -1], 0
-    for n in rooms:
-        room = (f"{used + 4 * n}k", 1000) if n >= 0 else ("1m", 1 + len(before))
-        box.machine.run(ROOM.format(*room, KEPT), check=True)
+    limits, first = [*(range(pages) if HOW == "full" else [pages - 1]), -1], 0
+    for n in limits:
+        limit = (f"{used + 4 * n}k", 1000) if n >= 0 else ("1m", 1 + len(before))
+        box.machine.run(ROOM.format(*limit, KEPT), check=True)
         answer = sound(box)
         first = first or answer.sweep
-        assert said(box, f"record: sweep {first} is not stored: ") == 1
+        assert journal_count(box, f"record: sweep {first} is not stored: ") == 1
         assert files(box) == before
     box.machine.run(ROOM.format("1m", 1000, KEPT), check=True)
     sound(box)
     assert files(box).items() > before.items()
-    note("disk full while a sweep is kept (ENOSPC at each page, no inode)", "answered; told; nothing half", len(rooms))
+    note("disk full while a sweep is kept (ENOSPC at each page, no inode)", "answered; told; nothing half", len(limits))
 
 
 def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., None]):
     """The capture's disk is full: told once, it ends, sweeps go on, and what it holds can be played."""
-    until_said(box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here")
+    until_logged(box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here")
     sound(box)
-    assert said(box, "capture:") == said(box, "it ends here") == 1
+    assert journal_count(box, "capture:") == journal_count(box, "it ends here") == 1
     pieces = [box.machine.run(f"dd if={CAPTURE}/all bs=12k skip={n} count=1 2>/dev/null | base64") for n in range(8)]
     (tmp_path / "all").write_bytes(b"".join(base64.b64decode(piece.out) for piece in pieces))
     play, frames = Playback(tmp_path / "all"), 0
@@ -157,9 +157,9 @@ def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
         sound(box)
     finally:
         box.machine.run("rm -f /run/fill* /var/fill*")
-    told = said(box, "skin: ")
+    logged = journal_count(box, "skin: ")
     box.unplug()
-    until_said(box, "skin: ", told)
+    until_logged(box, "skin: ", logged)
     box.plug()
     box.until_ready()
     note("no room on any disk, journal included", "answered; replugged skin taken; journal goes on", 1)
@@ -207,7 +207,7 @@ def swept(cell: Cell) -> str:
 def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[..., None]):
     """Four programs that want all of both cores: each sweep is answered, what was lost is counted, none is wrong."""
     silent = "skin: the skin is there but sent no frame for"
-    lost, told = int(state(box)["lost"]), said(box, silent)
+    lost, logged = int(state(box)["lost"]), journal_count(box, silent)
     box.machine.run("for n in 1 2 3 4; do systemd-run -q --unit hog$n sh -c 'while :; do :; done'; done", check=True)
     try:
         answers = Counter(swept(box) for _ in range(count(1, 8)))
@@ -215,7 +215,7 @@ def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[.
         box.machine.run("systemctl stop 'hog*'", timeout_s=120, check=True)
     # without a turn for half a second it takes the skin for silent, and starts it again
     assert answers.keys() <= {"ok", "no-contact", "gap", "sensor-lost"}, box.journal(40)
-    assert answers["sensor-lost"] <= said(box, silent) - told
+    assert answers["sensor-lost"] <= journal_count(box, silent) - logged
     sound(box)
     more = int(state(box)["lost"]) - lost
     note("four busy loops on two cores", f"answered {dict(answers)}, {more} frames lost", answers.total())
@@ -234,14 +234,17 @@ def test_permission_lost(box: Cell, note: Callable[..., None]):
         until_state(box, "denied")
         assert box.lines.wait("FAULT", True, 10)
         assert by_hand(box) == "not-ready"
-        until_said(box, "skin may not be opened by this user (errno 13); install the udev rule, join group plugdev")
+        until_logged(box, "skin may not be opened by this user (errno 13); install the udev rule, join group plugdev")
     finally:
         guest.run(f"mv /root/rules {RULES} && udevadm control --reload && udevadm trigger -c add -s usb", check=True)
     box.until_ready()
     before = files(box)
     guest.run(f"chown root {KEPT}", check=True)
     answer = sound(box)
-    assert said(box, f"record: sweep {answer.sweep} is not stored: Permission denied; see that {KEPT} may be") == 1
+    assert (
+        journal_count(box, f"record: sweep {answer.sweep} is not stored: Permission denied; see that {KEPT} may be")
+        == 1
+    )
     assert files(box) == before
     guest.run(f"chown palpate {KEPT}", check=True)
     sound(box)
@@ -253,12 +256,12 @@ def test_permission_lost(box: Cell, note: Callable[..., None]):
 def test_memory_limit(box: Cell, note: Callable[..., None]):
     """The unit's memory is cut to nothing: the program is killed, started again, and READY once it has its memory."""
     restarts = "systemctl show -P NRestarts palpate"
-    before, streamed = int(box.machine.run(restarts).out), said(box, "skin: streaming")
+    before, streamed = int(box.machine.run(restarts).out), journal_count(box, "skin: streaming")
     limit = "systemctl set-property --runtime palpate MemoryMax="
     box.machine.run(limit + "4M", timeout_s=120)
-    until_said(box, "oom-kill")
+    until_logged(box, "oom-kill")
     box.machine.run(limit + "128M", timeout_s=120, check=True)
-    until_said(box, "skin: streaming", streamed)
+    until_logged(box, "skin: streaming", streamed)
     box.until_ready()
     sound(box)
     assert int(box.machine.run(restarts).out) > before
@@ -274,10 +277,10 @@ def test_settings_and_bundle_broken(box: Cell, note: Callable[..., None]):
     guest.put(SITE, settings + b'\n[classifier]\nbundel = "/run/bundle"\n')
     guest.run(again, check=True)
     assert box.lines.wait("READY", False, 60)
-    until_said(box, f"{SITE}: classifier.bundel is unknown; did you mean classifier.bundle?")
+    until_logged(box, f"{SITE}: classifier.bundel is unknown; did you mean classifier.bundle?")
     guest.put(SITE, settings + b'\n[classifier]\nbundle = "/run/bundle"\n')
     guest.run(again, check=True)
-    until_said(box, "/run/bundle: model.onnx was altered")
+    until_logged(box, "/run/bundle: model.onnx was altered")
     assert not box.lines.levels["READY"]
     guest.run(f"cp {BUNDLE}/model.onnx /run/bundle && {again}", check=True)
     box.until_ready(START_S)
@@ -288,8 +291,10 @@ def test_settings_and_bundle_broken(box: Cell, note: Callable[..., None]):
 
 def test_bundle_files_broken(box: Cell, note: Callable[..., None]):
     """Each file of a bundle cut short, empty, missing, altered by one bit: each is refused as a BundleError that names it."""
-    told = box.machine.run("cd / && /opt/palpate/bin/python -I -", stdin=DAMAGE.encode(), timeout_s=200, check=True).out
-    lines = told.splitlines()
+    logged = box.machine.run(
+        "cd / && /opt/palpate/bin/python -I -", stdin=DAMAGE.encode(), timeout_s=200, check=True
+    ).out
+    lines = logged.splitlines()
     assert len(lines) >= 12
     for line in lines:
         name, _, what, why = line.split(" ", 3)

@@ -74,17 +74,17 @@ def test_pulled_and_put_back(cell: Cell, count: Count, note: Note, when: Callabl
     """Unplugged at any moment of a sweep: one answer that says so, READY by itself, each time another enumeration."""
     wanted = {before: {"not-ready"}, during: {"sensor-lost"}, after: {"sensor-lost", "ok", "gap", "unsure"}}[when]
     n = count(1, 35 if when is during else 33)  # 101 in all
-    said = Counter[str]()
+    outcomes = Counter[str]()
     for i in range(n):
         had = int(state(cell)["enumerations"])
-        said[when(cell, i)] += 1
-        assert set(said) <= wanted
+        outcomes[when(cell, i)] += 1
+        assert set(outcomes) <= wanted
         cell.plug()
         cell.until_ready()
         assert int(state(cell)["enumerations"]) > had
         if i % 5 == 4:
             comes_back(cell)
-    note(f"skin unplugged and replugged {when.__name__} a sweep", f"{dict(said)}; back each time", n)
+    note(f"skin unplugged and replugged {when.__name__} a sweep", f"{dict(outcomes)}; back each time", n)
 
 
 def test_other_boards(cell: Cell, count: Count, note: Note):
@@ -120,7 +120,7 @@ def test_other_boards(cell: Cell, count: Count, note: Note):
 @pytest.mark.parametrize("what", RESETS if HOW == "full" else list(RESETS)[:1])
 def test_resets(cell: Cell, count: Count, note: Note, what: str):
     """The kernel takes the skin away for a moment, in mid sweep: the sweep is lost, the skin is taken up again."""
-    n, said = count(1, 3), Counter[str]()
+    n, outcomes = count(1, 3), Counter[str]()
     for _ in range(n):
         touch, since = begin(cell)
         cell.machine.run(RESETS[what], check=True, timeout_s=60)
@@ -129,9 +129,9 @@ def test_resets(cell: Cell, count: Count, note: Note, what: str):
         assert status == "sensor-lost" or not landed, status
         until(touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
-        said[status] += 1
+        outcomes[status] += 1
         comes_back(cell)
-    note(what, f"{dict(said)}; back each time", n)
+    note(what, f"{dict(outcomes)}; back each time", n)
 
 
 @pytest.fixture

@@ -42,12 +42,12 @@ class Fault:
     counter: str = ""
 
 
-def changed(how: Callable[[packets.Packet], tuple[int, int]]) -> Callable[[], Mangle]:
+def changed(change: Callable[[packets.Packet], tuple[int, int]]) -> Callable[[], Mangle]:
     """Transfers whose packets have another number and another time, as `how` says; all else is right, the CRC too."""
 
     def mangle(data: bytes) -> bytes:
         packet = packets.unpack(data).packets[0]
-        seq, t_us = how(packet)
+        seq, t_us = change(packet)
         return packets.pack(seq % COUNTS, t_us % COUNTS, packet.taxels, packet.flags)
 
     return lambda: mangle
@@ -59,11 +59,11 @@ def mirrored(pace: int) -> Callable[[], Mangle]:
     def make() -> Mangle:
         first: list[int] = []
 
-        def how(packet: packets.Packet) -> tuple[int, int]:
+        def change(packet: packets.Packet) -> tuple[int, int]:
             first[:] = first or [packet.t_us]
             return packet.seq, first[0] + pace * (packet.t_us - first[0])
 
-        return changed(how)()
+        return changed(change)()
 
     return make
 
@@ -138,7 +138,7 @@ def robot(shared: Cell) -> None:
 def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: str):
     """Harmed in mid sweep: one answer that says so, none that is wrong; what lies beside the window harms nothing."""
     n = count(1, 3)
-    fault, said = FAULTS[what], Counter[str]()
+    fault, outcomes = FAULTS[what], Counter[str]()
     for _ in range(n):
         had = int(state(cell)[fault.counter]) if fault.counter else 0
         touch, since = begin(cell)
@@ -148,14 +148,14 @@ def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: s
         assert len(cell.answers(since)) == 1
         assert cable.left < fault.transfers, "nothing was harmed"
         cell.cable.mangle = bytes
-        said[status] += 1
+        outcomes[status] += 1
         assert status in fault.statuses | {"gap"}, status
         if fault.counter:
             assert int(state(cell)[fault.counter]) > had
         cell.until_ready()
     if HOW == "full":
         comes_back(cell)
-    note(what, f"{dict(said)}; back each time", n)
+    note(what, f"{dict(outcomes)}; back each time", n)
 
 
 @pytest.mark.parametrize("what", ["halted", "silent"] if HOW == "full" else ["halted"])
