@@ -1,1 +1,1 @@
-"""What a person runs beside the robot: demo and bench, both on simulated devices."""
+"""What a person runs without a robot: demo and bench, both on simulated devices."""

@@ -1,7 +1,7 @@
-"""What `palpate bench` measures: latency, inference, memory, start, processor share, on the rig and this machine.
+"""`palpate bench`: latency, inference, memory, start and processor share of this machine, with the simulated skin.
 
-In: a way to build a box on the rig. Out: one line a figure, and all of them as JSON under plain keys.
-Memory, start and processor share are taken in processes of their own, so that no part of the bench is in them.
+In: a way to build a box on simulated devices. Out: a line for each figure, and all of them as JSON with plain keys.
+Memory, start and processor share are measured in separate processes, so that nothing of the bench is in them.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,24 +39,43 @@ from appliance.tools.bench_process import Build, drain
 SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
 
 
-def run(bundle: Bundle, build: Build, references: Path, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """All figures; `say` gets each as soon as it is there."""
+def run(bundle: Bundle, build: Build, references: Path, seed: int, report: Callable[[str], None]) -> dict[str, Any]:
+    """All figures; `report` gets a line for each as soon as it is there.
+
+    references: folder of the models that are timed beside the bundle, made if it is not there. seed: of the simulated
+    sweeps. Raises BundleError where the references cannot be made.
+    """
+    load_before = os.getloadavg()
     figures: dict[str, Any] = {"commit": commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id}
 
     def add(more: dict[str, Any]) -> None:
         figures.update(more)
         for key, value in more.items():
-            say(f"{key:<24} {json.dumps(value)}")
+            report(f"{key:<24} {json.dumps(value)}")
 
     add({k: figures[k] for k in ("commit", "seed", "machine", "bundle")})
     add(_whole_way(bundle.format, build, seed))
     add({"inference_ms": _inference(bundle, references, seed)})
     if "fp32" not in figures["inference_ms"]:
-        say("fp32 and paper_int8 were not measured: they come with the desktop's tools (make bench)")
+        report("fp32 and paper_int8 were not measured: they come with the desktop's tools (make bench)")
     for name in bench_process.NAMES:
         add(_child(name, seed))
     add(_cold_start())
+    add({"bundle_kb": _size_kb(bundle), "date": f"{datetime.now(UTC):%Y-%m-%d}"})
+    add({"load_average": {"before": _rounded(load_before), "after": _rounded(os.getloadavg())}})
     return figures
+
+
+def _rounded(load: tuple[float, float, float]) -> list[float]:
+    """Mean number of runnable processes in the last 1, 5 and 15 minutes."""
+    return [round(value, 2) for value in load]
+
+
+def _size_kb(bundle: Bundle) -> dict[str, float]:
+    """Size on the disk in 1000 bytes: of the model, and of all files of the bundle."""
+    files = bundle.manifest.files.values()
+    whole = len(bundle.manifest.json()) + sum(entry["bytes"] for entry in files)
+    return {"model": round(len(bundle.model) / 1000, 1), "all": round(whole / 1000, 1)}
 
 
 def _percentiles(values: list[float]) -> dict[str, float]:
@@ -63,7 +83,7 @@ def _percentiles(values: list[float]) -> dict[str, float]:
 
 
 class _Watch:
-    """A sink behind the serial port: when it gets a verdict, the port has the sentence."""
+    """A sink after the serial port: when it gets a verdict, the sentence has been written to the port."""
 
     def __init__(self, clock: Clock) -> None:
         self.verdicts: list[Verdict] = []
@@ -81,21 +101,22 @@ class _Watch:
 
 
 def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
-    """SWEEPS sweeps on skin positions of their own, USB bytes to sentence; work takes its time, waiting is skipped.
+    """SWEEPS simulated sweeps from USB bytes to sentence, at skin positions that no training set has. Computing takes its
+    real time, waiting is skipped.
 
-    edge_to_sentence_ms: from stop edge and last frame of the window in hand to the sentence at the port.
-    edge_seen_ms: from the kernel's stamp of the stop edge to its being in hand (glitch filter, rest of a packet).
+    edge_to_sentence_ms: from the moment when stop edge and last frame of the window have been read to the sentence at
+    the port. edge_seen_ms: from the kernel's time stamp of the stop edge to that moment (glitch filter, rest of a packet).
     """
     clock = rig.SkippingClock()
     watch = _Watch(clock)
-    world = devices.build(fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim")
+    simulated = devices.build(fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim")
     with ExitStack() as stack:
-        box, far_end = build(world, stack, [watch], [watch.keep])
-        while not world.finished(box.answered):
+        box, far_end = build(simulated, stack, [watch], [watch.keep])
+        while not simulated.finished(box.answered):
             box.step()
             drain(far_end)
         lost = box.counters.lost_frames
-    pairs = zip(watch.verdicts, world.robot.played, strict=True)
+    pairs = zip(watch.verdicts, simulated.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
     return {
         "accuracy": {"right": right, "total": SWEEPS, "interval": [round(v, 4) for v in wilson(right, SWEEPS)]},
@@ -106,7 +127,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
 
 
 def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
-    """The bundle beside the same network in float and the paper's in int8, taken in turns in one run."""
+    """Times of the bundle, of the same network in float and of the paper's network in int8, measured in turns."""
     rng = np.random.default_rng(seed)
     window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.digits)
     calls: dict[str, Callable[[], object]] = {}
@@ -119,7 +140,7 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
     took_ms: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
         for name, call in calls.items():
-            call()  # the one before has emptied the caches
+            call()  # fills the caches that the model before has emptied
             for _ in range(CALLS):
                 start = time.perf_counter_ns()
                 call()
@@ -128,7 +149,7 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
 
 
 def _make_references(folder: Path) -> None:
-    """Have the desktop's tools build the networks to compare with, where they are installed beside this program."""
+    """Let the desktop's tools write the reference models, where they are installed beside this program."""
     tool = Path(sys.executable).with_name("palpate-train")
     if folder.is_dir() or not tool.exists():
         return
@@ -138,7 +159,7 @@ def _make_references(folder: Path) -> None:
 
 
 def _child(name: str, seed: int) -> dict[str, Any]:
-    """A part in a fresh process."""
+    """One part of the figures, measured in a new process."""
     with tempfile.TemporaryDirectory() as folder:
         acts = Path(folder) / "acts.npz"
         bench_process.write_acts(acts, script.tubes(seed, 6))
@@ -149,7 +170,7 @@ def _child(name: str, seed: int) -> dict[str, Any]:
 
 
 def _cold_start() -> dict[str, Any]:
-    """Seconds from the start of the process to READY with a streaming skin: the first state sentence says so."""
+    """Seconds from the start of the process to READY with a streaming skin, as the first state sentence reports it."""
     took = []
     command = [sys.executable, "-m", "appliance", "run", "--sim", "skin"]
     for _ in range(STARTS):
@@ -165,4 +186,14 @@ def _cold_start() -> dict[str, Any]:
 
 def _machine() -> dict[str, Any]:
     versions = {"python": platform.python_version(), "numpy": np.__version__, "onnxruntime": ort.__version__}
-    return {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()} | versions
+    machine = {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()}
+    return machine | versions | {"processor": _processor()}
+
+
+def _processor() -> str:
+    """What Linux calls the processor, or the board; "" where it has no name."""
+    board, names = Path("/proc/device-tree/model"), Path("/proc/cpuinfo")
+    if board.is_file():
+        return board.read_text().strip("\0\n ")
+    lines = names.read_text().splitlines() if names.is_file() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")

@@ -1,6 +1,6 @@
-"""The figures of the bench that are taken in a process of their own: memory and processor share.
+"""The figures of the bench that are measured in a process of their own: memory and processor share.
 
-In: recorded acts and a way to build a box. Out: figures. The simulated skin is not loaded here: it is not the box's.
+In: recorded sweeps and a way to build a box. Out: figures. The simulated skin is not loaded here: it is no part of the box.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ NAMES = ("memory", "stream")
 
 
 class Build(Protocol):
-    """Builds a box on a world; `stack` takes it apart. The box, and the far end of its serial line to be read."""
+    """Builds a box on simulated devices, which `stack` closes. Out: the box, and the robot's end of its serial line."""
 
     def __call__(
         self,
-        world: devices.SimDevices,
+        simulated: devices.SimDevices,
         stack: ExitStack,
+        /,
         also: Iterable[ResultSink] = (),
         keepers: Iterable[SweepObserver] = (),
     ) -> tuple[Box, int]:
@@ -40,35 +41,35 @@ class Build(Protocol):
 
 
 def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
-    """Record acts for `measure`."""
+    """Write acts to a file for `measure`."""
     frames: dict[str, Any] = {f"{i} {a.start} {a.stop}": a.frames for i, a in enumerate(acts)}
     np.savez(path, **frames)
 
 
 def measure(name: str, fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
-    """One of NAMES, measured in this process while the acts in `path` are played over and over."""
+    """The part `name` of NAMES, measured in this process while the acts in `path` are played again and again."""
     with np.load(path, allow_pickle=False) as z:
         acts = [rig.Act(z[key], int(key.split()[1]), int(key.split()[2]), "") for key in z]
     return {"memory": _memory, "stream": _stream}[name](fmt, build, acts)
 
 
 def drain(far_end: int) -> None:
-    """Read what the box has said, so that its line does not fill up."""
+    """Read and drop what the box has written, so that the line does not fill up."""
     with suppress(BlockingIOError):
         os.read(far_end, 65536)
 
 
 def _memory(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str, Any]:
-    """Resident memory (in 2**20 bytes, as ps and systemd count) after MEMORY_SWEEPS sweeps.
+    """Resident memory (2**20 bytes, as ps and systemd count) after MEMORY_SWEEPS sweeps.
 
-    growth_last_900: since a tenth of them; holds what the allocator takes while it warms up. growth_next_900: after it.
+    growth_last_900: since a tenth of them, with what the allocator takes at first. growth_next_900: from then on.
     """
     n = MEMORY_SWEEPS
-    # what the simulator remembers is not the box's
-    world = devices.build(fmt, cycle(acts), rig.VirtualClock(), "sim", remember=False)
+    # the acts that a simulator remembers are no part of the box
+    simulated = devices.build(fmt, cycle(acts), rig.VirtualClock(), "sim", remember=False)
     rss_mb = {}
     with ExitStack() as stack:
-        box, far_end = build(world, stack)
+        box, far_end = build(simulated, stack)
         while box.answered < n * 19 // 10:
             if box.step() and box.answered in (n // 10, n, n * 19 // 10):
                 rss_mb[box.answered] = _rss_mb()
@@ -84,10 +85,10 @@ def _rss_mb() -> float:
 
 
 def _stream(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str, Any]:
-    """Share of one core while streaming in real time, without the simulated board's own share, and with it."""
-    world = devices.build(fmt, cycle(acts), SystemClock(), "sim")
+    """Share of one core while the skin streams in real time, without and with the simulated readout board."""
+    simulated = devices.build(fmt, cycle(acts), SystemClock(), "sim")
     board_ns = 0
-    real_read = world.backend.bulk_read
+    real_read = simulated.backend.bulk_read
 
     def timed_read(*args: Any) -> int:
         nonlocal board_ns
@@ -97,9 +98,9 @@ def _stream(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str
         finally:
             board_ns += time.thread_time_ns() - start
 
-    world.backend.bulk_read = timed_read  # type: ignore[assignment]
+    simulated.backend.bulk_read = timed_read  # type: ignore[assignment]
     with ExitStack() as stack:
-        box, far_end = build(world, stack)
+        box, far_end = build(simulated, stack)
         box.step()
         board_ns, wall_ns, cpu_ns = 0, -time.monotonic_ns(), -time.process_time_ns()
         while time.monotonic_ns() + wall_ns < STREAM_S * 1e9:

@@ -1,6 +1,6 @@
-"""What a person sees: the skin live in the terminal while a sweep runs, the verdict and its sentence, then a table.
+"""`palpate demo`: the skin live in the terminal during a sweep, then the verdict with its sentence, at the end a table.
 
-In: a box on the rig and the far end of its serial line. Out: pictures where there is a terminal, else plain lines.
+In: a box on simulated devices and the robot's end of its serial line. Out: pictures on a terminal, else plain lines.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from appliance.tools.score import Answer, Score
 
 FRAME_NS = 66_000_000
 """Time between two pictures of the skin."""
-HEARD_S = 1.0
+ARRIVAL_S = 1.0
 """The longest that a sentence may take from one end of the line to the other."""
 BAR = 30
+"""Characters of a full bar."""
 BRIGHT = 160
-"""Digits that are shown white; the skin seldom gives more."""
+"""Raw counts that are shown white; the skin seldom gives more."""
 
 
 def bar(probability: float) -> str:
@@ -33,21 +34,21 @@ def bar(probability: float) -> str:
 
 
 def picture(frame: NDArray[Any]) -> list[str]:
-    """A frame [R, C] as shaded cells with their digits, two lines a row."""
+    """A frame [R, C] of raw counts as shaded cells with their numbers, two lines a row."""
     lines = []
     for row in frame.astype(int):
-        level = [min(23, max(0, d) * 24 // BRIGHT) for d in row]
+        level = [min(23, max(0, count) * 24 // BRIGHT) for count in row]
         shade = [f"\033[48;5;{232 + v}m\033[38;5;{16 if v > 11 else 250}m" for v in level]
-        lines.append("  " + "".join(f"{s}{'':6}\033[0m" for s in shade))
-        lines.append("  " + "".join(f"{s}{d:^6}\033[0m" for s, d in zip(shade, row, strict=True)))
+        lines.append("  " + "".join(f"{colour}{'':6}\033[0m" for colour in shade))
+        lines.append("  " + "".join(f"{colour}{count:^6}\033[0m" for colour, count in zip(shade, row, strict=True)))
     return lines
 
 
 class Demo:
-    """Steps a box until enough answers were read at the far end of its serial line, and shows what happens.
+    """Steps a box until enough answers have come to the robot's end of its serial line, and shows what happens.
 
-    played: the acts of the rig's robot, for the truth. far_end: descriptor of the line's other end, non-blocking.
-    raw: print the sentences alone.
+    played: the acts of the simulated robot, which hold the true materials. far_end: non-blocking file descriptor of the
+    robot's end. raw: print the sentences alone.
     """
 
     def __init__(self, played: Sequence[Act], far_end: int, clock: Clock, out: IO[str], *, raw: bool) -> None:
@@ -60,11 +61,11 @@ class Demo:
         self._next_ns = 0
 
     def run(self, box: Box, sweeps: int, stopped: Callable[[], bool]) -> None:
-        """Step `box` until `sweeps` answers were heard or `stopped()`."""
-        said = 0
+        """Step `box` until `sweeps` answers were read or `stopped()`."""
+        sent = 0
         while self.score.total.total() < sweeps and not stopped():
-            said += len(box.step())
-            self._listen(said, sweeps)
+            sent += len(box.step())
+            self._read(sent, sweeps)
             if self._live and self._clock.now_ns() >= self._next_ns and (frame := box.newest_frame()) is not None:
                 self._next_ns = self._clock.now_ns() + FRAME_NS
                 self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""])
@@ -73,16 +74,16 @@ class Demo:
             touch = [f"  touch time      {self.score.touch(box.format.rate_hz)}"] if self.score.early else []
             self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}", *touch)
 
-    def _listen(self, said: int, wanted: int) -> None:
-        """Read what has come to the robot's end; wait for answers that were said and are not here; stop at `wanted`."""
-        while select.select([self._far_end], [], [], HEARD_S if self.score.total.total() < said else 0)[0]:
+    def _read(self, sent: int, wanted: int) -> None:
+        """Read what has come to the robot's end; wait for answers that were sent and have not come; stop at `wanted`."""
+        while select.select([self._far_end], [], [], ARRIVAL_S if self.score.total.total() < sent else 0)[0]:
             *lines, self._rest = (self._rest + os.read(self._far_end, 65536)).split(b"\r\n")
             for line in lines:
-                self._hear(line.decode("ascii"))
+                self._show(line.decode("ascii"))
                 if self.score.total.total() == wanted:
                     return
 
-    def _hear(self, line: str) -> None:
+    def _show(self, line: str) -> None:
         if self._raw:
             self._print(line)
         answer = Answer.read(line)
@@ -91,19 +92,19 @@ class Demo:
         act = self._played[answer.sweep - 1]
         mark = "right" if self.score.add(act, answer) else "wrong"
         if not self._raw:
-            said = answer.label or answer.status
+            named = answer.label or answer.status
             used = f"  after {answer.share:.0%} of the window" if answer.share < 1 else ""
-            shown = f"{answer.sweep:>3}  {act.label:<15} -> {said:<15} {mark}  {bar(answer.probability)}{used}"
-            self._print(shown, f"     {line}")
+            text = f"{answer.sweep:>3}  {act.label:<15} -> {named:<15} {mark}  {bar(answer.probability)}{used}"
+            self._print(text, f"     {line}")
 
     def _draw(self, lines: list[str]) -> None:
-        """Paint over the picture before, in one write, so that nothing flickers."""
+        """Draw over the picture before, in one write so that nothing flickers."""
         self._out.write(self._back() + "".join(f"{line}\033[K\n" for line in lines))
         self._out.flush()
         self._drawn = len(lines)
 
     def _back(self) -> str:
-        """Where the picture begins."""
+        """The control sequence that returns to the picture's first line."""
         drawn, self._drawn = self._drawn, 0
         return f"\033[{drawn}A" if drawn else ""
 

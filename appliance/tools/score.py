@@ -1,4 +1,4 @@
-"""Right or wrong: answers as the robot read them against what it did. In: sentences, acts. Out: counts, intervals."""
+"""Compares the answers that the robot read with what it did. In: sentences, acts. Out: counts and intervals."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ class Answer:
 
 @dataclass(slots=True)
 class Score:
-    """What has been answered so far. objects: the last answer for each object, where NEW OBJECT was signalled.
+    """Counts of the answers so far.
 
-    early: answers that did not need the whole window. slid: frames of all slides, as far as they went.
+    right, total: by material. objects: whether the last answer for each object was right, where NEW OBJECT was
+    signalled. early: answers that did not need the whole window. slide_frames: frames from START to STOP, of all sweeps.
     """
 
     right: Counter[str] = field(default_factory=Counter)
@@ -48,16 +49,16 @@ class Score:
     objects: list[bool] = field(default_factory=list)
     latency_ms: list[float] = field(default_factory=list)
     early: int = 0
-    slid: int = 0
+    slide_frames: int = 0
 
     def add(self, act: Act, answer: Answer) -> bool:
-        """Count an answer; True where it names the truth."""
+        """Count an answer; True where it names the material of `act`."""
         right = answer.label == act.label and answer.status == Status.OK
         self.total[act.label] += 1
         self.right[act.label] += right
         self.latency_ms.append(answer.latency_ms)
         self.early += answer.share < 1
-        self.slid += act.stop - act.start
+        self.slide_frames += act.stop - act.start
         if act.new_object:
             self.objects.append(right)
         elif self.objects:
@@ -65,7 +66,7 @@ class Score:
         return right
 
     def table(self) -> list[str]:
-        """Right of how many, by material, in all, and by object."""
+        """Lines with right answers and their number: by material, of all sweeps, of all objects."""
         rows = [(name, self.right[name], self.total[name]) for name in sorted(self.total)]
         sums = [("all sweeps", self.right.total(), self.total.total())]
         if self.objects:
@@ -73,13 +74,14 @@ class Score:
         lines = [f"  {name:<16}{right:>5} / {n}" for name, right, n in rows]
         for name, right, n in sums:
             low, high = wilson(right, n)
-            lines.append(f"  {name:<16}{right:>5} / {n:<5} {right / n:.3f} [{low:.3f}, {high:.3f}]")
+            percent = f"{100 * right / n:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+            lines.append(f"  {name:<16}{right:>5} / {n:<5} {percent}")
         return ["  material        right / all", *lines]
 
     def touch(self, rate_hz: float) -> str:
         """Mean touch time, from the start edge to the stop edge, and how many answers came before it."""
         n = self.total.total()
-        return f"{self.slid / n / rate_hz:.2f} s mean, {self.early} of {n} answered early"
+        return f"{self.slide_frames / n / rate_hz:.2f} s mean, {self.early} of {n} answered early"
 
     def latency(self) -> str:
         """Median and worst latency."""

@@ -22,59 +22,11 @@ from appliance.core import statistics
 from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError
 from appliance.core.types import Frames, Status, Sweep, save
 from appliance.inference.classifier import softmax
-from appliance.sim import script, skin
-from appliance.tools import bench, bench_process, demo, pseudo_terminal
+from appliance.sim import skin
+from appliance.tools import pseudo_terminal
 from tests.factories import toy_bundle
-from tests.factories.simulated_box import numbered
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
-
-
-def test_demo_prints_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]):
-    """Each sweep with truth, verdict, bar and raw sentence; then the table."""
-    assert main(["demo", *VIRTUAL]) == 0
-    out = capsys.readouterr().out
-    assert out.count("$PPLP,RES,") == 3
-    assert out.count(" -> ") == 3
-    assert "frames lost     0 of" in out
-    assert "\033" not in out
-
-
-def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
-    """Nothing but sentences, the same in every run with the same seed."""
-    assert main(["demo", "--raw", *VIRTUAL]) == 0
-    first = capsys.readouterr().out
-    assert all(line.startswith("$PPLP,") for line in first.splitlines())
-    assert first.count(",RES,") == 3
-    main(["demo", "--raw", *VIRTUAL])
-    assert capsys.readouterr().out == first
-
-
-def test_demo_paints_on_a_terminal():
-    """On a terminal the skin is drawn in 16 shaded cells and painted over."""
-    far, near = os.openpty()
-    with subprocess.Popen(
-        [sys.executable, "-m", "appliance", "demo", "--virtual", "--sweeps", "1"], stdout=near, stderr=subprocess.PIPE
-    ) as run:
-        os.close(near)
-        shown = b""
-        try:
-            while data := os.read(far, 65536):
-                shown += data
-        except OSError:  # the terminal's end where the last writer has gone
-            pass
-        assert run.wait() == 0
-    os.close(far)
-    first = shown.split(b"\033[12A")[0]
-    assert first.count(b"\033[48;5;") == 32
-    assert b"$PPLP,RES,1," in shown
-
-
-def test_picture_shows_each_digit():
-    """The picture's numbers are the newest frame's digits."""
-    frame = numbered(1)
-    text = "\n".join(demo.picture(frame[0]))
-    assert all(f"{d:^6}" in text for d in frame.ravel())
 
 
 def test_run_prints_sentences_and_ends_with_its_script(capsysbinary: pytest.CaptureFixture[bytes]):
@@ -327,44 +279,12 @@ def test_output_that_nobody_reads():
     assert "Traceback" not in done.stderr
 
 
-def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """A small bench: every key that scripts rely on, in JSON, with commit, seed and machine."""
-    for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
-        monkeypatch.setattr(bench, name, value)
-    monkeypatch.setattr(bench, "_child", lambda name, seed: {name: {"seed": seed}})
-    monkeypatch.setattr(bench, "_make_references", lambda folder: None)
-    assert main(["bench", "--json", str(tmp_path / "b.json"), "--references", str(tmp_path)]) == 0
-    figures = json.loads((tmp_path / "b.json").read_text())
-    assert figures["accuracy"]["total"] == 6
-    assert figures["frames_lost"] == 0
-    assert figures["edge_to_sentence_ms"].keys() >= {"p50", "p99"}
-    assert figures["inference_ms"]["int8"]["p50"] > 0
-    assert figures["cold_start_s"] > 0
-    assert figures["memory"] == {"seed": 2000}
-    assert {"commit", "seed", "machine"} <= figures.keys()
-    out = capsys.readouterr().out
-    assert "edge_to_sentence_ms" in out
-    assert "fp32 and paper_int8 were not measured" in out
-
-
-def test_bench_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Memory and processor share, in short."""
-    monkeypatch.setattr(bench_process, "MEMORY_SWEEPS", 20)
-    monkeypatch.setattr(bench_process, "STREAM_S", 0.5)
-    bench_process.write_acts(tmp_path / "acts.npz", script.tubes(1, 2))
-    assert main(["bench", "--part", "memory", "--acts", str(tmp_path / "acts.npz")]) == 0
-    assert json.loads(capsys.readouterr().out)["rss_mb"]["after_1000"] > 10
-    assert main(["bench", "--part", "stream", "--acts", str(tmp_path / "acts.npz")]) == 0
-    shares = json.loads(capsys.readouterr().out)
-    assert 0 < shares["cpu_share_streaming"] < shares["cpu_share_with_simulated_board"]
+def test_skin_format_is_the_default_bundles(default_bundle: bundle.Bundle):
+    """The simulated skin is the one that the default bundle was trained for."""
+    assert default_bundle.format == skin.FORMAT
+    assert set(default_bundle.manifest.labels) == set(skin.MATERIALS)
 
 
 def test_wilson():
     """The paper's 55 of 60 has the interval that is known for it."""
     assert statistics.wilson(55, 60) == pytest.approx([0.819, 0.964], abs=5e-4)
-
-
-def test_skin_format_is_the_default_bundles(default_bundle: bundle.Bundle):
-    """The simulated skin is the one that the default bundle was trained for."""
-    assert default_bundle.format == skin.FORMAT
-    assert set(default_bundle.manifest.labels) == set(skin.MATERIALS)
