@@ -21,7 +21,7 @@ from appliance.inference.classifier import softmax
 from tests.factories import emulated_machines
 from tests.factories.sweep_sets import easy
 from train.data import sets
-from train.export import export
+from train.export import quantized_bundle
 from train.models.compact import fit
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import TENSOR
@@ -41,7 +41,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.save(folder / "default" / "sweeps.npy", sets.load("sim:T-REAL:1001:1").samples[::3])
     for dtype in TENSOR:
         fitted = fit.fit(easy(dtype=dtype), 1, fit.FitRecipe(steps=40))
-        export.export(fitted, folder / dtype, dtype, "1", "")
+        quantized_bundle.export(fitted, folder / dtype, dtype, "1", "")
         np.save(folder / dtype / "sweeps.npy", fitted.held.samples)
     for name in INSIDE:
         _show(folder, name)

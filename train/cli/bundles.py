@@ -12,7 +12,7 @@ from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
 from train.cli import options
 from train.cli.options import Add
-from train.export import export, pack, sign
+from train.export import measure, pack, quantized_bundle, sign
 from train.models import methods
 from train.models.compact import fit
 from train.models.compact.architectures import ARCHITECTURES, DEFAULT
@@ -24,7 +24,7 @@ def register(add: Add) -> None:
     _add_bundles(add)
     one = add(
         "parity",
-        lambda args: print(export.compared(args.model, options.load(args), args.json)),
+        lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
         "tell what int8 does to a model's answers, and to each tensor",
     )
     one.add_argument("model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form")
@@ -106,14 +106,14 @@ def run_fit(args: argparse.Namespace) -> None:
 
 def run_export(args: argparse.Namespace) -> None:
     """Pack the bundle and say how it does."""
-    _told(export.export(fit.Fit.load(args.fit), *_packing(args)), args.out)
+    _told(quantized_bundle.export(fit.Fit.load(args.fit), *_packing(args)), args.out)
 
 
 def run_pack(args: argparse.Namespace) -> None:
     """Train, pack the bundle and say how it does."""
     (method,) = methods.find([args.method], options.effort(args))
     content = pack.trained(method, options.load(args, args.seed), args.seed)
-    _told(pack.pack(export.checked(content, content.reference), *_packing(args)), args.out)
+    _told(pack.pack(quantized_bundle.checked(content, content.reference), *_packing(args)), args.out)
 
 
 def run_sign(args: argparse.Namespace) -> None:
@@ -132,13 +132,13 @@ def _told(manifest: Manifest, out: Path) -> None:
     for protocol, figure in manifest.figures.items():
         if "accuracy" in figure:
             print(f"{protocol}: {_spoken(figure)}")
-    size = sum(f.stat().st_size for f in out.iterdir())
+    size = measure.sizes(out)[1]
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
 
 
 def run_references(args: argparse.Namespace) -> None:
     """Write the references and name them."""
-    for path in export.references(args.out):
+    for path in quantized_bundle.references(args.out):
         print(path)
 
 

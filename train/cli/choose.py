@@ -10,18 +10,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from appliance.bundle.bundle import Manifest
+from appliance.bundle.manifest import Manifest
 from appliance.core.provenance import commit
 from appliance.core.storage import put
 from train.cli import options
 from train.data.sets import Dataset, digest
 from train.data.transforms import WHOLE, Change
-from train.export import pack
+from train.export import measure, pack
 from train.metrics import score
 from train.models import methods
 from train.reports import selection_report
-from train.selection import prices, reduction_curves, scene, select
-from train.selection.prices import Price
+from train.selection import reduction_curves, scene, select
+from train.selection.select import BundleCost
 
 Json = dict[str, Any]
 
@@ -68,18 +68,19 @@ def _packed(args: argparse.Namespace, asked: scene.Scene, sweeps: Dataset, told:
 
 def _pack(args: argparse.Namespace, asked: scene.Scene, method: methods.Method, sweeps: Dataset, told: Json) -> Json:
     content = pack.trained(method, sweeps, 1)
-    honest = told["honest"]
-    figure = {"accuracy": honest["mean"], "n": len(sweeps), "low": honest["low"], "high": honest["high"]}
+    nested = told["honest"]
+    figure = {"accuracy": nested["mean"], "n": len(sweeps), "low": nested["low"], "high": nested["high"]}
     content = replace(content, about=content.about | {"scene": asked.path.name},
                       figures={"the choice, made without each part and tested on it": figure})  # fmt: skip
     manifest = pack.pack(content, args.out, asked.name, asked.version, commit(), asked.full_scale or None)
-    return _costs(manifest, prices.measured(args.out, content.held), asked)
+    (measurement,) = measure.measure_all([args.out], sweeps.samples)
+    return _described(manifest, BundleCost.of(measurement), asked)
 
 
-def _costs(manifest: Manifest, price: Price, asked: scene.Scene) -> Json:
-    used = {k: round(v, 3) for k, v in price.used(asked.budget).items()}
-    return {"name": manifest.name, "version": manifest.version, "format": asdict(manifest.format), "ms": price.ms,
-            "kb": price.kb, "mb": price.mb, "used": used, "figures": manifest.figures}  # fmt: skip
+def _described(manifest: Manifest, cost: BundleCost, asked: scene.Scene) -> Json:
+    used = {k: round(v, 3) for k, v in cost.used(asked.budget).items()}
+    return {"name": manifest.name, "version": manifest.version, "format": asdict(manifest.format), "ms": cost.ms,
+            "kb": cost.kb, "mb": cost.mb, "used": used, "figures": manifest.figures}  # fmt: skip
 
 
 def _origin(args: argparse.Namespace, asked: scene.Scene, sweeps: Dataset) -> Json:

@@ -16,8 +16,8 @@ from appliance.inference.classifier import Classifier
 from train.cli import options
 from train.cli.options import Add
 from train.data import sets
-from train.evaluation import evaluate, robustness, sim_calibration, uncertainty_cases
-from train.evaluation.robustness_data import EvaluationSweeps
+from train.evaluation import evaluate, robustness, sim_calibration, uncertainty
+from train.evaluation.corruptions import EvaluationSweeps
 from train.export import contact_positions
 from train.metrics import score
 from train.models import methods
@@ -154,7 +154,7 @@ def run_stress(args: argparse.Namespace) -> None:
 def run_certainty(args: argparse.Namespace) -> None:
     """All of it; the page is named at the end."""
     test = sets.load(args.test).select(args.only) if args.test else None
-    told = uncertainty_cases.run(
+    told = uncertainty.run(
         options.load(args), test, args.protocol, args.method, options.where(args), options.Log(), options.effort(args),
         args.seed,
     )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 
@@ -12,14 +13,19 @@ from train.metrics import score
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; its exit code. Troubles that have a name are one line on the error stream."""
+    """Run one command; its exit code. An error of this project is one line on the error stream."""
     args = parser().parse_args(argv)
     try:
-        score.provenance()  # the code that runs is that of now
+        score.provenance()  # read once, now: the code that runs is of this commit
         args.run(args)
+        sys.stdout.flush()
     except ApplianceError as e:
         print(f"palpate-train: {e}", file=sys.stderr)
         return e.exit_code
+    except BrokenPipeError:
+        # the reader of the output has closed it; nothing can be printed any more, not even when the process ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except OSError as e:
         print(f"palpate-train: {e.filename}: {e.strerror}", file=sys.stderr)
         return ApplianceError.exit_code

@@ -27,10 +27,9 @@ from appliance.recording.sweep_window import SweepCutter
 from appliance.sim.rig import VirtualClock
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
-from train.evaluation.corruptions import Corruption, usual
+from train.evaluation.corruptions import Corruption, EvaluationSweeps, usual
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
-from train.evaluation.robustness_data import EvaluationSweeps
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
 

@@ -6,9 +6,10 @@ fitted on. Intervals are 95 %, bootstrapped over the places where the skin sat, 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +21,13 @@ from appliance.inference.enrolment import joined
 from train.calibration.early_exit import LEVELS, decide
 from train.calibration.novelty import Embedding, auroc, embed
 from train.calibration.posthoc import Posthoc
-from train.metrics.score import interval
-
-if TYPE_CHECKING:
-    from train.evaluation.uncertainty_cases import Case
+from train.data.sets import Dataset, digest, join
+from train.data.splitters import Protocol
+from train.evaluation.evaluate import Where
+from train.evaluation.uncertainty_cases import Case, Log, cases, tasks
+from train.metrics.score import interval, provenance
+from train.models import methods
+from train.models.methods import Effort
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -37,9 +41,37 @@ DRAWS, ORDERS = 500, 20
 """Of the bootstrap; of the order in which sweeps of one object, or for one enrolment, come."""
 
 
-def figures(cases: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
+def run(
+    sweeps: Dataset, test: Dataset | None, protocol: str, method: str, where: Where, log: Log,
+    effort: Effort = methods.FULL_EFFORT, seed: int = 1,
+) -> dict[str, Any]:  # fmt: skip
+    """All figures, as results.json holds them. test: tested on this set; else `protocol` says what is left out.
+
+    Raises FormatError where the sets do not fit, or the method cannot do it.
+    """
+    start = time.monotonic()
+    if test is not None:
+        both = join([sweeps.require_materials(), test])
+        protocol, whole_set = "split:set=0->1", both
+    else:
+        whole_set = sweeps
+    folds = Protocol(protocol).folds(whole_set, seed)
+    held = cases(tasks(whole_set, folds, method, effort, seed), whole_set, where, log)
+    log("figures")
+    told = figures(held, whole_set.materials, seed)
+    about = {
+        "set": sweeps.source, "test": test.source if test else "", "protocol": "train and test" if test else protocol,
+        "method": method, "effort": effort.share, "seed": seed, "folds": len(folds), "trainings": len(held),
+        "sweeps": len(whole_set), "tested": int(sum(len(test) for _, test in folds)), "digest": digest(whole_set),
+        "materials": list(whole_set.materials), "format": str(whole_set.format),
+        "took_s": round(time.monotonic() - start, 1),
+    }  # fmt: skip
+    return about | provenance() | told
+
+
+def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
     """All of it; what needs a material left out is missing where there are but two."""
-    done = [(case, case.posthoc()) for case in cases]
+    done = [(case, case.posthoc()) for case in trained]
     full = [one for one in done if one[0].left_out < 0]
     told = {"calibration": calibration(full), "sequence": sequence(full, seed), "early": early(full)}
     partial = [one for one in done if one[0].left_out >= 0]

@@ -7,7 +7,6 @@ figures come from Cases without training again. What a rule, a limit or a temper
 from __future__ import annotations
 
 import io
-import time
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,12 +19,10 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.calibration.posthoc import AugmentedCopies, Posthoc, fit_posthoc, posthoc_inputs
-from train.data.sets import Dataset, digest, join
-from train.data.splitters import Protocol
-from train.evaluation import parallel, uncertainty
+from train.data.sets import Dataset, digest
+from train.evaluation import parallel
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
-from train.metrics.score import provenance
 from train.models import methods
 from train.models.compact.fit import Fit
 from train.models.methods import Effort
@@ -139,34 +136,6 @@ def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -
         out = "" if task.left_out == NOBODY else f" without {sweeps.materials[task.left_out]}"
         progress(f"{task.method}, fold {task.fold + 1}{out}")
     return [held[i] for i in range(len(wanted))]
-
-
-def run(
-    sweeps: Dataset, test: Dataset | None, protocol: str, method: str, where: Where, log: Log,
-    effort: Effort = methods.FULL_EFFORT, seed: int = 1,
-) -> dict[str, Any]:  # fmt: skip
-    """All figures, as results.json holds them. test: tested on this set; else `protocol` says what is left out.
-
-    Raises FormatError where the sets do not fit, or the method cannot do it.
-    """
-    start = time.monotonic()
-    if test is not None:
-        both = join([sweeps.require_materials(), test])
-        protocol, whole_set = "split:set=0->1", both
-    else:
-        whole_set = sweeps
-    folds = Protocol(protocol).folds(whole_set, seed)
-    held = cases(tasks(whole_set, folds, method, effort, seed), whole_set, where, log)
-    log("figures")
-    told = uncertainty.figures(held, whole_set.materials, seed)
-    about = {
-        "set": sweeps.source, "test": test.source if test else "", "protocol": "train and test" if test else protocol,
-        "method": method, "effort": effort.share, "seed": seed, "folds": len(folds), "trainings": len(held),
-        "sweeps": len(whole_set), "tested": int(sum(len(test) for _, test in folds)), "digest": digest(whole_set),
-        "materials": list(whole_set.materials), "format": str(whole_set.format),
-        "took_s": round(time.monotonic() - start, 1),
-    }  # fmt: skip
-    return about | provenance() | told
 
 
 def _learn(numbered: tuple[int, CaseTask], sweeps: Dataset) -> Case:

@@ -22,7 +22,7 @@ from appliance.signal.contact import MOST_POSITIONS, ContactPositions, centre
 from appliance.sim import skin
 from train.calibration import novelty
 from train.data.sets import Dataset
-from train.evaluation.robustness_data import EvaluationSweeps
+from train.evaluation.corruptions import EvaluationSweeps
 from train.metrics.score import interval, provenance
 
 Array = NDArray[Any]

@@ -1,143 +1,103 @@
-"""The room of dots: one model as the box would carry it. In: a trained method. Out: its bundles, their time and memory.
+"""What a packed model costs on this machine. In: folders of models, sweeps. Out: a Measurement of each: time, size, memory.
 
-A dot is a model in one precision. All dots are timed in one process and one thread, in turns, so that what slows the
-machine down slows all alike; each one's memory is taken in a process of its own, which imports the box's code alone.
+Run by its path, this file is also the process of its own in which a model's memory is read. It therefore imports at its
+top only what the box has.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
-from appliance.core import storage
+import appliance
 from appliance.core.errors import BundleError
-from appliance.core.provenance import commit
-from train.data.sets import Dataset
-from train.export import measure_process, pack
-from train.models import minirocket
-from train.models.linear_head import hold_out
-from train.models.methods import Method, model_inputs
-from train.models.training import one_thread
-from train.onnx_tools import cost
 
 Array = NDArray[Any]
 Call = Callable[[Array], Any]
 ROUNDS, BLOCK = 60, 6
-"""Turns; sweeps of a dot in one turn, after one that is not counted: the dot before has emptied the caches."""
-TOLD = "dots.json"
+"""Rounds; sweeps of a model in one round, after one that is not counted: the model before it has emptied the caches."""
+TIMED_SWEEPS = 60
+"""About so many different sweeps are used, spread evenly over those given."""
+SWEEPS_BEFORE_MEMORY = 20
+"""How many sweeps a process answers before its memory is read."""
+MODEL, TORCH, AEON = "model.onnx", "model.pt", "model.npz"
+"""The model's file in a bundle, as TorchScript, and as aeon's parameters."""
+DESKTOP = ("torch", "sklearn", "scipy", "aeon", "numba", "onnx", "train")
+"""Packages that the box never has."""
 
 
 @dataclass(frozen=True)
-class Packed:
-    """A model in `folder`, which alone.load reads. runtime: "onnx" is a bundle, else a peer in its own library.
+class Measurement:
+    """What one packed model costs on this machine.
 
-    form: "" is the method itself, else the name of a form of it. precision, weights, macs: as cost.py tells them.
-    window_s: length of a sweep.
+    ms_p50, ms_p99: processor time in ms of one sweep through the box's classifier, with its checks and features, in one
+    thread; of a model in its own library, of its logits. model_bytes: the model's file. bundle_bytes: all files, golden
+    sweeps too. rss_mib: resident memory (VmRSS) in MiB of a process of its own that has loaded the model and answered
+    SWEEPS_BEFORE_MEMORY sweeps. foreign: packages in that process that the box does not have.
     """
 
-    method: str
-    form: str
-    precision: str
-    runtime: str
-    folder: Path
-    weights: int
-    macs: int
-    window_s: float
+    ms_p50: float
+    ms_p99: float
+    model_bytes: int
+    bundle_bytes: int
+    rss_mib: float
+    foreign: tuple[str, ...] = ()
 
     @property
-    def name(self) -> str:
-        """No two dots share one."""
-        return f"{self.method} {self.precision}" + ("" if self.runtime == "onnx" else f" in {self.runtime}")
+    def model_kb(self) -> float:
+        """Size of the model's file in units of 1000 bytes."""
+        return round(self.model_bytes / 1000, 2)
 
-    def sizes(self) -> tuple[int, int]:
-        """Bytes of the model's file and of all files."""
-        held = {f.name: f.stat().st_size for f in self.folder.iterdir()}
-        return next(held[n] for n in (bundle.MODEL, measure_process.TORCH, measure_process.AEON) if n in held), sum(
-            held.values()
-        )
+    @property
+    def bundle_kb(self) -> float:
+        """Size of all files in units of 1000 bytes."""
+        return round(self.bundle_bytes / 1000, 2)
 
 
-def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Packed]:
-    """Train `method` on four fifths of `sweeps` and pack all its forms; what lies in `folder` is not made again.
+def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) -> list[Measurement]:
+    """The Measurement of the model in each of `folders`, in their order; all are timed in turns.
 
-    Raises FormatError where the method cannot work with the set, ExportRefused where it would be no model on the box.
+    sweeps: raw counts [n, T, R, C], of the format of all the models. Raises BundleError where a model does not run.
     """
-    if not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with storage.folder(folder) as work:
-            (work / TOLD).write_text(json.dumps(list(_made(method, sweeps, seed, work))))
-    told = json.loads((folder / TOLD).read_text())
-    return [Packed(**one | {"method": method.name, "folder": folder / one["folder"]}) for one in told]
+    some = sweeps[:: max(len(sweeps) // TIMED_SWEEPS, 1)]
+    took = timed({str(folder): load(folder) for folder in folders}, some, rounds)
+    return [_measurement(folder, took[str(folder)], memory(folder, some)) for folder in folders]
 
 
-def _made(method: Method, sweeps: Dataset, seed: int, work: Path) -> Iterator[dict[str, Any]]:
-    """Each form packed in a folder of its own; then the method as its own library runs it, where it has one."""
-    train, held, by = hold_out(sweeps, seed)
-    model = method.train(train, model_inputs(method.input, train), seed)
-    ran = getattr(model, "ran", "")
-    counted = {}
-    for form, one in {"": model, **getattr(model, "forms", {})}.items():
-        about = {"method": method.name, "form": form, "seed": seed, "ran": ran}
-        content = pack.Content(one.graph(), method.input, train, held, by, about)
-        precision = cost.precision(content.model)
-        if any(precision == told["precision"] for told in counted.values()):
-            continue  # nothing of it is in int8: it is its own float form
-        folder = work / precision
-        pack.pack(content, folder, f"{method.name}-{precision}", "1", commit())
-        counted[form] = {
-            "form": form, "precision": precision, "weights": cost.weights(content.model),
-            "macs": cost.macs(content.model) + cost.feature_macs(method.input, train.format),
-            "window_s": train.format.window / train.format.rate_hz,
-        }  # fmt: skip
-        yield counted[form] | {"runtime": "onnx", "folder": folder.name}
-    if method.name in GUESTS:
-        runtime, save = GUESTS[method.name]
-        (work / runtime).mkdir()
-        save(model, train, seed, work / runtime)
-        yield counted[""] | {"runtime": runtime, "folder": runtime}
+def _measurement(folder: Path, took_ms: Array, process: Mapping[str, Any]) -> Measurement:
+    model, whole = sizes(folder)
+    p50, p99 = (round(float(np.percentile(took_ms, q)), 4) for q in (50, 99))
+    return Measurement(p50, p99, model, whole, process["rss_mib"], tuple(process["foreign"]))
 
 
-def _torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
-    """The network as TorchScript, which needs none of our code to be read."""
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.jit.trace(model.network.eval(), torch.from_numpy(train.samples[:1])).save(folder / measure_process.TORCH)
-
-
-def _aeon(model: Any, train: Dataset, seed: int, folder: Path) -> None:
-    """aeon's parameters, fitted to the same sweeps once more, and the head that was trained on its features."""
-    named = {f"p{i}": p for i, p in enumerate(minirocket.fitted(train.samples, seed))}
-    silence = np.zeros((1, train.format.rows * train.format.cols, train.format.window), np.float32)
-    np.savez_compressed(folder / measure_process.AEON, silence=silence, weight=model.weight, bias=model.bias, **named)
-
-
-GUESTS: Mapping[str, tuple[str, Callable[[Any, Dataset, int, Path], None]]] = {
-    "paper-cnn-centred": ("torch", _torch),
-    "minirocket": ("aeon", _aeon),
-}
-"""Peers that are measured in their own library as well, which the box has not."""
+def sizes(folder: Path) -> tuple[int, int]:
+    """Bytes of the model's file, and of all files in its folder."""
+    files = {file.name: file.stat().st_size for file in folder.iterdir()}
+    return next(files[name] for name in (MODEL, TORCH, AEON) if name in files), sum(files.values())
 
 
 def timed(calls: Mapping[str, Call], sweeps: Array, rounds: int = ROUNDS, block: int = BLOCK) -> dict[str, Array]:
     """Times in ms [rounds * block] of each call with `sweeps` [n, T, R, C] one by one, by name.
 
-    All take turns, a block each; every round begins with another one. One thread, and the time that the processor gave
-    to it: by the clock, slow models would be interrupted by others and quick ones would not.
+    All take turns, a block each, and every round begins with another one: what slows the machine down slows all alike.
+    It is the time that the processor gave to one thread: by the clock, slow models would be interrupted by other
+    programs and quick ones would not.
     """
+    from train.models.training import one_thread  # imports torch, which the process of `memory` must not hold
+
     names, took = list(calls), {name: np.empty(rounds * block) for name in calls}
     with one_thread():
         for turn in range(rounds):
@@ -145,42 +105,107 @@ def timed(calls: Mapping[str, Call], sweeps: Array, rounds: int = ROUNDS, block:
                 call = calls[name]
                 call(sweeps[turn % len(sweeps)])
                 for i in range(turn * block, (turn + 1) * block):
-                    digits = sweeps[i % len(sweeps)]
+                    counts = sweeps[i % len(sweeps)]
                     start = time.process_time_ns()
-                    call(digits)
+                    call(counts)
                     took[name][i] = (time.process_time_ns() - start) / 1e6
     return took
 
 
-def memory(one: Packed, sweeps: Array) -> dict[str, Any]:
-    """`rss_mb` of a fresh process that has loaded `one` and answered some of `sweeps`, and the `foreign` packages there.
+def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
+    """`rss_mib` of a fresh process that has loaded the model in `folder` and answered some of `sweeps`, and the `foreign`
+    packages there.
 
-    Raises BundleError where it cannot.
+    Raises BundleError where it does not run in a process of its own.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "sweeps.npy"
-        np.save(path, sweeps[: measure_process.SWEEPS])
-        command = [sys.executable, "-P", measure_process.__file__, str(one.folder), str(path)]
+    with tempfile.TemporaryDirectory() as aside:
+        path = Path(aside) / "sweeps.npy"
+        np.save(path, sweeps[:SWEEPS_BEFORE_MEMORY])
+        # -P: the modules beside this file do not hide packages of their names
+        command = [sys.executable, "-P", __file__, str(folder), str(path)]
         env = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+        env |= {"PYTHONPATH": str(Path(appliance.__file__).parents[1])}
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     if done.returncode:
-        raise BundleError(f"{one.name} does not run by itself: {done.stderr.strip()[-300:]}")
-    told: dict[str, Any] = json.loads(done.stdout)
-    return told
+        raise BundleError(
+            f"the model in {folder} does not run in a process of its own: {done.stderr.strip()[-300:]}; pack it again"
+        )
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
 
 
-def measured(all_of_them: list[Packed], sweeps: Array, rounds: int = ROUNDS) -> list[dict[str, Any]]:
-    """What each costs, in the order given: see `docs/evaluation.md`. sweeps: digits [n, T, R, C]."""
-    took = timed({one.name: measure_process.load(one.folder) for one in all_of_them}, sweeps, rounds)
-    return [_costs(one, took[one.name], memory(one, sweeps)) for one in all_of_them]
+def load(folder: Path) -> Call:
+    """What answers raw counts [T, R, C]: the box's classifier for a bundle, else the model in its own library.
+
+    Raises BundleError for a bundle that is not whole, and ImportError where a model's own library is missing.
+    """
+    if (folder / TORCH).is_file():
+        return _torch(folder / TORCH)
+    if (folder / AEON).is_file():
+        return _aeon(folder / AEON)
+    return _classifier(folder)
 
 
-def _costs(one: Packed, took_ms: Array, kept: dict[str, Any]) -> dict[str, Any]:
-    model, whole = one.sizes()
-    return {
-        "method": one.method, "precision": one.precision, "runtime": one.runtime, "weights": one.weights,
-        "macs": one.macs, "file_kb": round(model / 1000, 1), "bundle_kb": round(whole / 1000, 1),
-        "rss_mb": kept["rss_mb"], "ms_p50": round(float(np.percentile(took_ms, 50)), 4),
-        "ms_p99": round(float(np.percentile(took_ms, 99)), 4), "touch_s": one.window_s,
-        "runs_on_box": one.runtime == "onnx" and not kept["foreign"],
-    }  # fmt: skip
+def _classifier(folder: Path) -> Call:
+    """The box's classifier, given one sound sweep after another, each of an object of its own."""
+    from appliance.bundle import bundle  # here, not at the top: a model in its own library runs without the box's code
+    from appliance.core.clock import SystemClock
+    from appliance.core.types import Frames, Status, Sweep
+    from appliance.inference.classifier import Classifier
+
+    classifier = Classifier(bundle.load(folder), SystemClock())
+    form = classifier.bundle.format
+    seq = np.arange(form.window)
+    t_ns = (seq * form.period_ns).astype(np.int64)
+
+    def answer(counts: Array) -> Any:
+        return classifier(Sweep(0, 0, int(t_ns[-1]), Status.OK, Frames(t_ns, seq, counts)))
+
+    return answer
+
+
+def _torch(path: Path) -> Call:
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript, which needs none of our code to be read
+        network = torch.jit.load(path)  # type: ignore[no-untyped-call]
+
+    def answer(counts: Array) -> Any:
+        with torch.inference_mode():
+            return network(torch.from_numpy(counts[None])).numpy()[0]
+
+    return answer
+
+
+def _aeon(path: Path) -> Call:
+    from aeon.transformations.collection.convolution_based import MiniRocket
+
+    with np.load(path, allow_pickle=False) as z:
+        parameters, silence, weight, bias = tuple(z[f"p{i}"] for i in range(5)), z["silence"], z["weight"], z["bias"]
+    features, before = MiniRocket(n_jobs=1), np.random.get_state()
+    features.fit(silence)  # it must have seen the form of a sweep; what it found there is not used
+    np.random.set_state(before)
+    features.parameters = parameters
+
+    def answer(counts: Array) -> Any:
+        series = np.ascontiguousarray(counts.reshape(1, len(counts), -1).transpose(0, 2, 1), np.float32)
+        return weight @ features.transform(series)[0] + bias
+
+    return answer
+
+
+def main(folder: str, sweeps: str) -> None:
+    """Answer some sweeps, and print the resident memory in MiB and what of the desktop was loaded, as JSON."""
+    answer = load(Path(folder))
+    counts = np.load(sweeps)
+    for i in range(SWEEPS_BEFORE_MEMORY):
+        answer(counts[i % len(counts)])
+    resident = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{os.getpid()}/status").read_text())
+    assert resident
+    foreign = sorted({name.split(".")[0] for name in sys.modules} & set(DESKTOP))
+    print(json.dumps({"rss_mib": round(int(resident[1]) / 1024, 1), "foreign": foreign}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle
-from appliance.core import storage
+from appliance.core import provenance, storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Frames, Status, Sweep
@@ -32,7 +32,7 @@ from train.export.contact_positions import place_of
 from train.metrics.score import figure
 from train.models.compact.fit import Fit
 from train.models.linear_head import hold_out
-from train.models.methods import Method, model_inputs
+from train.models.methods import Method, Model, model_inputs
 from train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
@@ -114,18 +114,28 @@ def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
 
     Raises FormatError for a method whose features the box does not compute.
     """
+    return train_content(method, sweeps, seed)[1]
+
+
+def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Content]:
+    """The model that `trained` trains, and its content."""
     if not method.runs_on_the_box:
         raise FormatError(
             f"method {method.name!r} looks at the features {method.input!r} of prior work, which the box does not compute; "
             "compare it with evaluate, and pack another"
         )
-    train, held, by = hold_out(sweeps, seed)
+    train, held_out, held_by = hold_out(sweeps, seed)
     model = method.train(train, model_inputs(method.input, train), seed)
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
     forms = getattr(model, "forms", {})
     reference = forms["float"].graph() if "float" in forms else None
     made = getattr(model, "made", None)
-    return Content(model.graph(), method.input, train, held, by, about, reference=reference, made=made)
+    return model, Content(model.graph(), method.input, train, held_out, held_by, about, reference=reference, made=made)
+
+
+def pack_to_measure(content: Content, target: Path, full_scale: float | None = None) -> bundle.Manifest:
+    """Pack `content` under its method's name, so that every command that measures a method measures the same bundle."""
+    return pack(content, target, content.about["method"], "1", provenance.commit(), full_scale)
 
 
 def completed(content: Content) -> Content:

@@ -19,11 +19,11 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.storage import put
 from train.data import sets
 from train.evaluation import evaluate, parallel, robustness
+from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Plan, Where
 from train.evaluation.fold import fingerprint
-from train.evaluation.robustness_data import EvaluationSweeps
-from train.export import measure
-from train.export.measure import Packed
+from train.export import measure, model_forms
+from train.export.model_forms import Packed
 from train.metrics import score
 from train.models import methods
 from train.models.compact.architectures import ARCHITECTURES
@@ -134,8 +134,7 @@ class Charting:
             made = list(self.packed({method for method, _ in held}, self.where.cache or Path(aside)))
             self.log(f"{len(made)} models take turns")
             train = sets.load(self.chart.train).select(self.chart.only)
-            some = train.samples[:: max(len(train) // 60, 1)]
-            costs = measure.measured(made, some, self.chart.rounds)
+            costs = model_forms.measured(made, train.samples, self.chart.rounds)
         known = {"seeds": list(self.seeds), "set": train.source} | score.provenance()
         return [self._dot(one, told, held.get((one.method, one.form), {})) | known
                 for one, told in zip(made, costs, strict=True)]  # fmt: skip
@@ -196,13 +195,13 @@ class Charting:
             folder = (
                 cache
                 / "dots"
-                / fingerprint(about, methods.module_of(method.name), "train.export.measure", "train.export.pack")
+                / fingerprint(about, methods.module_of(method.name), "train.export.model_forms", "train.export.pack")
             )
             if self.where.kept and not folder.exists():
                 self.left_out[method.name] = "not packed yet"
                 continue
             try:
-                yield from measure.packed(method, train, self.seeds[0], folder)
+                yield from model_forms.packed(method, train, self.seeds[0], folder)
             except (FormatError, BundleError) as e:
                 self.left_out[method.name] = str(e)
             progress(f"{method.name} packed")

@@ -22,9 +22,9 @@ from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol
 from train.data.transforms import WHOLE, Change
 from train.evaluation import corruptions, parallel
+from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Where, folds
 from train.evaluation.fold import Fold, FoldTask
-from train.evaluation.robustness_data import EvaluationSweeps
 from train.metrics.score import interval
 from train.models import methods
 from train.selection.scene import Scene

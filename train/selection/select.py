@@ -1,57 +1,161 @@
-"""The room of the choice: the smallest model that a scene needs. In: a Scene. Out: what was taken and why, and its bundle.
+"""The smallest model that a scene needs. In: a scene and its sweeps. Out: a Selection: what was chosen, and why.
 
-The rungs are tried from the cheapest up. Taken is the cheapest within one standard error of the best (Breiman et al.
-1984, sec. 3.4.3), the error being that of the paired difference. What such a choice is worth is told by nested
-validation (Stone 1974): the same choice is made without each part in turn, which then judges what was chosen.
+The candidates are tried from the cheapest up. Chosen is the cheapest one within one standard error of the best (Breiman
+et al. 1984, sec. 3.4.3), the error being that of the paired difference. Nested validation (Stone 1974) says what such a
+choice is worth: the same choice is made without each part in turn, which then judges what was chosen.
 """
 
 from __future__ import annotations
 
+import json
+import math
+import platform
+import tempfile
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from appliance.core.errors import ApplianceError, FormatError
-from train.data.sets import Dataset
+from appliance.core.errors import ApplianceError, BundleError, FormatError
+from appliance.core.storage import put
+from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import Where
+from train.evaluation.fold import fingerprint
+from train.export import measure, pack
+from train.export.measure import Measurement
 from train.models import methods
-from train.selection import prices as rungs
+from train.models.methods import Effort, Method
 from train.selection.nested_cv import Difference, Refused, Trials, Unseen
-from train.selection.prices import Price
-from train.selection.scene import Scene
+from train.selection.scene import Budget, Scene
 
 Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
-IN_VAIN = 2
-"""So many larger rungs of one family in a row that change nothing end the climb in it."""
+LARGER_WITHOUT_GAIN = 2
+"""So many larger candidates of one family in a row that change nothing end the search in it."""
 
 
 class NothingFits(ApplianceError):
-    """No rung is within the board's budget, or none can work with the scene's sweeps."""
+    """No candidate is within the board's budget, or none can work with the scene's sweeps."""
+
+
+@dataclass(frozen=True)
+class BundleCost:
+    """What a method's bundle costs on this machine: its Measurement, in the units of the scene's budget.
+
+    ms: processor time of a sweep, median. kb: size of the whole bundle in units of 1000 bytes. mb: resident memory in
+    MiB. refused: why there is no bundle; the rest is not a number then.
+    """
+
+    ms: float = math.nan
+    kb: float = math.nan
+    mb: float = math.nan
+    refused: str = ""
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> BundleCost:
+        """All three figures from one measurement."""
+        return cls(measurement.ms_p50, measurement.bundle_kb, measurement.rss_mib)
+
+    def order(self, budget: Budget) -> tuple[float, float]:
+        """What candidates are sorted by: the share of the board's time or of its storage that is used, whichever is
+        larger; where neither has a limit the size alone. Memory does not count: it is nearly the same for all. Equal
+        ones are sorted by time."""
+        shares = [share for key, share in self.used(budget).items() if key != "mb"]
+        return max(shares, default=self.kb), self.ms
+
+    def used(self, budget: Budget) -> dict[str, float]:
+        """Share of each part of the budget that has a limit."""
+        needs = {"ms": self.ms * budget.slower, "kb": self.kb, "mb": self.mb}
+        return {k: v / limit for k, v in needs.items() if math.isfinite(limit := getattr(budget, k))}
+
+
+def candidates(scene: Scene) -> list[str]:
+    """The scene's methods, or the usual ones: the paper's classical ones that are cheap, and the family of compact."""
+    if scene.methods:
+        return list(scene.methods)
+    known = methods.every()
+    family = [name for name in known if name.startswith("compact-")] or ["compact"]
+    return [name for name in ("L-gauss", "L-svm", "H-svm", *family) if name in known]
+
+
+def bundle_costs(
+    names: Sequence[str], sweeps: Dataset, scene: Scene, effort: Effort, where: Where, log: Log
+) -> dict[str, BundleCost]:
+    """The cost of each method's bundle, the cheapest first and refused ones last.
+
+    Bundles are packed one after another and kept; then all are measured at once, and the figures are kept together.
+    """
+    with tempfile.TemporaryDirectory() as aside:
+        kept = (where.cache or Path(aside)) / "bundles"
+        found: dict[str, BundleCost] = {}
+        folders: dict[str, Path] = {}
+        for i, method in enumerate(methods.find(names, effort)):
+            log(f"{i}/{len(names)} bundles packed ({method.name} is next)")
+            folder, refused = _packed(method, sweeps, scene, kept)
+            if refused:
+                found[method.name] = BundleCost(refused=refused)
+            else:
+                folders[method.name] = folder
+        log(f"{len(folders)} bundles are timed in turns")
+        found |= _measured(folders, sweeps, kept)
+    return dict(sorted(found.items(), key=lambda item: (bool(item[1].refused), item[1].order(scene.budget))))
+
+
+def _packed(method: Method, sweeps: Dataset, scene: Scene, kept: Path) -> tuple[Path, str]:
+    """The folder of the method's bundle, and why there is none; what lies in `kept` is not made again."""
+    about = ["bundle", platform.node(), digest(sweeps), method.name, method.effort, scene.full_scale]
+    folder = kept / fingerprint(about, methods.module_of(method.name), "train.export.pack")
+    reason = folder.with_suffix(".refused")
+    if folder.exists():
+        return folder, ""
+    if reason.exists():
+        return folder, reason.read_text()
+    try:
+        with threadpool_limits(1):
+            pack.pack_to_measure(pack.trained(method, sweeps, 1), folder, scene.full_scale or None)
+    except (FormatError, BundleError) as e:
+        put(reason, str(e).encode(), parents=True)
+        return folder, str(e)
+    return folder, ""
+
+
+def _measured(folders: dict[str, Path], sweeps: Dataset, kept: Path) -> dict[str, BundleCost]:
+    """The costs of bundles that were measured together: kept ones where the very same bundles were measured before."""
+    if not folders:
+        return {}
+    about = [platform.node(), *(folder.name for folder in folders.values())]
+    record = kept / f"{fingerprint(about, 'train.export.measure')}.json"
+    if not record.exists():
+        found = measure.measure_all(list(folders.values()), sweeps.samples)
+        put(record, json.dumps([asdict(measurement) for measurement in found]).encode(), parents=True)
+    measurements = [Measurement(**entry) for entry in json.loads(record.read_text())]
+    return {name: BundleCost.of(one) for name, one in zip(folders, measurements, strict=True)}
 
 
 @dataclass
 class SizeSearch:
-    """One choice as it is made, rung by rung in the order of cost. aside: the part that it must not see, or None.
+    """One choice while it is made, candidate by candidate in the order of cost. aside: the part it must not see, or None.
 
-    scores: of the rungs so far, as Trials.scores. vain: by family, its newest rung and how many in a row changed nothing.
+    scores: of the candidates so far, as Trials.scores. unchanged: by family, its newest candidate and how many in a row
+    changed nothing.
     """
 
     trials: Trials
     aside: int | None
     scores: dict[str, Array] = field(default_factory=dict)
-    vain: dict[str, tuple[str, int]] = field(default_factory=dict)
+    unchanged: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def enough(self, name: str) -> str:
-        """Why the next rung `name` need not be tried, "" where it could still change the choice.
+        """Why the next candidate `name` need not be tried, "" where it could still change the choice.
 
-        Enough is where even a faultless model would be within one standard error of what is chosen, and where two rungs
-        of its family in a row changed nothing and the second was no better than the first.
+        It need not where even a faultless model would be within one standard error of what is chosen, and where
+        LARGER_WITHOUT_GAIN candidates of its family in a row changed nothing and the last was no better than the one before.
         """
         if not self.scores:
             return ""
@@ -59,102 +163,110 @@ class SizeSearch:
         faultless = np.where(np.isfinite(chosen), 1.0, np.nan)
         if self.trials.difference(faultless, chosen).within:
             return "not tried: even a faultless one would be no more than a standard error better"
-        if self.vain.get(_kin(name), ("", 0))[1] >= IN_VAIN:
-            return f"not tried: {IN_VAIN} larger ones of its family changed nothing"
+        if self.unchanged.get(_family(name), ("", 0))[1] >= LARGER_WITHOUT_GAIN:
+            return f"not tried: {LARGER_WITHOUT_GAIN} larger ones of its family changed nothing"
         return ""
 
     def needs(self) -> list[Unseen]:
-        """Trainings that a rung takes."""
+        """The trainings that a candidate takes."""
         return list(self.trials.seen_from(self.aside).values())
 
     def add(self, name: str) -> None:
-        """A rung has been tried."""
+        """The candidate `name` has been tried."""
         before = self.chosen if self.scores else ""
         self.scores[name] = self.trials.scores(name, self.aside)
-        last, times = self.vain.get(_kin(name), ("", 0))
-        rises = last and not self.trials.difference(self.scores[name], self.scores[last]).within
-        self.vain[_kin(name)] = name, (times + 1 if self.chosen == before and not rises else 0)
+        last, times = self.unchanged.get(_family(name), ("", 0))
+        better = last and not self.trials.difference(self.scores[name], self.scores[last]).within
+        self.unchanged[_family(name)] = name, (times + 1 if self.chosen == before and not better else 0)
 
     @property
     def best(self) -> str:
-        """The rung with the highest mean; of equals the cheapest."""
+        """The candidate with the highest mean; of equal ones the cheapest."""
         return max(self.scores, key=lambda name: self.trials.mean(self.scores[name]))
 
     @property
     def chosen(self) -> str:
-        """The cheapest rung within one standard error of the best."""
+        """The cheapest candidate within one standard error of the best."""
         return next(name for name in self.scores if self.behind(name).within)
 
     def behind(self, name: str, ahead: str = "") -> Difference:
-        """How far `name` is behind another rung, usually the best."""
+        """How far `name` is behind another candidate, usually the best."""
         return self.trials.difference(self.scores[ahead or self.best], self.scores[name])
 
 
-def _kin(name: str) -> str:
+def _family(name: str) -> str:
     return name.partition("-")[0]
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What was chosen. why_not: reasons by rung that was not tried. final: the choice with all data; inner: without each
-    part in turn. prices: of all rungs, cheapest first."""
+    """What was chosen. costs: of all candidates, the cheapest first. why_not: reasons by candidate that was not tried.
+    final: the choice with all data; inner: without each part in turn."""
 
     trials: Trials
-    prices: dict[str, Price]
+    costs: dict[str, BundleCost]
     why_not: dict[str, str]
     final: SizeSearch
     inner: list[SizeSearch]
 
     @property
-    def honest(self) -> Array:
+    def nested(self) -> Array:
         """Scores [groups, N] of what was chosen without each part, on that part: what the choice is worth."""
         scores = np.full_like(self.final.scores[self.final.chosen], np.nan)
-        for p, climb in enumerate(self.inner):
+        for p, search in enumerate(self.inner):
             part = self.trials.parts[p]
-            right = self.trials.right(climb.chosen, (p,))
+            right = self.trials.right(search.chosen, (p,))
             scores[self.trials.groups.index(part.group), part.out] = right[part.out]
         return scores
 
     def json(self, scene: Scene) -> Json:
         """What scripts read of it."""
         trials, final = self.trials, self.final
-        order = list(self.prices)
-        tried = list(final.scores)
-        at = tried.index(final.chosen)
-        rung = [self._rung(name, scene) for name in order]
-        beside = {"smaller": tried[at - 1] if at else "", "larger": tried[at + 1] if at + 1 < len(tried) else ""}
+        order = list(self.costs)
         return {
-            "chosen": final.chosen, "best": final.best, "rungs": rung, "accuracy": trials.accuracy(final.scores[final.chosen]),
-            "honest": trials.accuracy(self.honest) | {
-                "groups": {name: trials.accuracy(np.where(np.arange(len(trials.groups))[:, None] == g, self.honest, np.nan))
-                           for g, name in enumerate(trials.groups)},
-                "chose": dict(Counter(climb.chosen for climb in self.inner).most_common())},
-            **{key: {"method": name} | final.behind(*pair).json() if name else None
-               for key, name in beside.items()
-               for pair in [(name, final.chosen) if key == "smaller" else (final.chosen, name)]},
-            "next": next((name for name in order[order.index(final.chosen) + 1 :]), ""),
+            "chosen": final.chosen, "best": final.best, "rungs": [self._candidate(name, scene) for name in order],
+            "accuracy": trials.accuracy(final.scores[final.chosen]), "honest": self._nested_json(),
+            **dict(self._neighbours()), "next": next(iter(order[order.index(final.chosen) + 1 :]), ""),
             "wanted": scene.accuracy,
             "parts": [{"group": p.group, "values": list(p.values)} for p in trials.parts],
             "conditions": [{"name": name, "accuracy": value} for name, value in self._conditions()],
             "confused": self._confused(),
         }  # fmt: skip
 
-    def _rung(self, name: str, scene: Scene) -> Json:
-        price = self.prices[name]
-        told: Json = {
+    def _nested_json(self) -> Json:
+        """Accuracy of the nested choice, for each group too, and how often each candidate was chosen."""
+        trials, scores = self.trials, self.nested
+        number = np.arange(len(trials.groups))[:, None]
+        groups = {name: trials.accuracy(np.where(number == g, scores, np.nan)) for g, name in enumerate(trials.groups)}
+        chose = Counter(search.chosen for search in self.inner)
+        return trials.accuracy(scores) | {"groups": groups, "chose": dict(chose.most_common())}
+
+    def _neighbours(self) -> Iterator[tuple[str, Json | None]]:
+        """The candidates tried just before and after the chosen one, with their difference from it."""
+        tried = list(self.final.scores)
+        chosen = self.final.chosen
+        at = tried.index(chosen)
+        smaller, larger = (tried[at - 1] if at else "", tried[at + 1] if at + 1 < len(tried) else "")
+        yield "smaller", {"method": smaller} | self.final.behind(smaller, chosen).json() if smaller else None
+        yield "larger", {"method": larger} | self.final.behind(chosen, larger).json() if larger else None
+
+    def _candidate(self, name: str, scene: Scene) -> Json:
+        cost = self.costs[name]
+        entry: Json = {
             "method": name,
-            "ms": price.ms,
-            "kb": price.kb,
-            "mb": price.mb,
+            "ms": cost.ms,
+            "kb": cost.kb,
+            "mb": cost.mb,
             "why_not": self.why_not.get(name, ""),
         }
-        if price.refused:
-            return told | {"ms": None, "kb": None, "mb": None, "used": {}, "accuracy": None, "behind": None}
-        told["used"] = {k: round(v, 3) for k, v in price.used(scene.budget).items()}
+        if cost.refused:
+            return entry | {"ms": None, "kb": None, "mb": None, "used": {}, "accuracy": None, "behind": None}
         scores = self.final.scores.get(name)
-        told["accuracy"] = None if scores is None else self.trials.accuracy(scores)
-        told["behind"] = None if scores is None else self.final.behind(name).json()
-        return told
+        return entry | {
+            "used": {k: round(v, 3) for k, v in cost.used(scene.budget).items()},
+            "accuracy": None if scores is None else self.trials.accuracy(scores),
+            "behind": None if scores is None else self.final.behind(name).json(),
+        }
 
     def _conditions(self) -> list[tuple[str, float]]:
         _, condition, sweep, probability = self.trials.tested(self.final.chosen)
@@ -174,48 +286,50 @@ class Selection:
         ]
 
 
-def choose(sweeps: Dataset, scene: Scene, effort: methods.Effort, where: Where, log: Log) -> Selection:
-    """Climb the ladder. Raises NothingFits where no rung can be taken, and FormatError where the scene cannot be judged."""
+def choose(sweeps: Dataset, scene: Scene, effort: Effort, where: Where, log: Log) -> Selection:
+    """Search the candidates from the cheapest up.
+
+    Raises NothingFits where no candidate can be taken, and FormatError where the scene cannot be judged.
+    """
     trials = Trials(sweeps, scene, effort, where, log)
-    alone = [p for p in range(len(trials.parts)) if not trials.seen_from(p)]
-    for p in alone:
+    for p in (p for p in range(len(trials.parts)) if not trials.seen_from(p)):
         raise FormatError(f"{scene.path.name}: without {trials.parts[p].group} {trials.parts[p].values[0]} nothing is left "
                           "to choose by; a group that varies needs three values: one to train on, one to choose by, one "
                           "to judge the choice by")  # fmt: skip
-    prices = rungs.prices(rungs.ladder(scene), sweeps, scene, effort, where, log)
-    why_not = {name: price.refused or _over(price, scene) for name, price in prices.items()}
+    costs = bundle_costs(candidates(scene), sweeps, scene, effort, where, log)
+    why_not = {name: cost.refused or _over(cost, scene) for name, cost in costs.items()}
     final, inner = SizeSearch(trials, None), [SizeSearch(trials, p) for p in range(len(trials.parts))]
-    for name in prices:
+    for name in costs:
         if why_not[name]:
             continue
         why_not[name] = final.enough(name)
-        climbing = [climb for climb in (final, *inner) if not climb.enough(name)]
+        searching = [search for search in (final, *inner) if not search.enough(name)]
         try:
-            trials.run(name, sorted({unseen for climb in climbing for unseen in climb.needs()}))
+            trials.run(name, sorted({unseen for search in searching for unseen in search.needs()}))
         except Refused as e:
             why_not[name] = str(e)
             continue
-        for climb in climbing:
-            climb.add(name)
+        for search in searching:
+            search.add(name)
     if not final.scores:
-        raise NothingFits(_nearest(prices, why_not, scene))
-    for p, climb in enumerate(inner):
-        trials.run(climb.chosen, [(p,)])
-    return Selection(trials, prices, {k: v for k, v in why_not.items() if v}, final, inner)
+        raise NothingFits(_nearest(costs, why_not, scene))
+    for p, search in enumerate(inner):
+        trials.run(search.chosen, [(p,)])
+    return Selection(trials, costs, {k: v for k, v in why_not.items() if v}, final, inner)
 
 
-def _over(price: Price, scene: Scene) -> str:
-    """Why a rung does not fit the board, or nothing."""
+def _over(cost: BundleCost, scene: Scene) -> str:
+    """Why a candidate does not fit the board, or nothing."""
     limits = {k: getattr(scene.budget, k) for k in ("ms", "kb", "mb")}
-    needs = {"ms": price.ms * scene.budget.slower, "kb": price.kb, "mb": price.mb}
-    over = [f"{needs[k]:.3g} {k} of {limits[k]:g}" for k, share in price.used(scene.budget).items() if share > 1]
+    needs = {"ms": cost.ms * scene.budget.slower, "kb": cost.kb, "mb": cost.mb}
+    over = [f"{needs[k]:.3g} {k} of {limits[k]:g}" for k, share in cost.used(scene.budget).items() if share > 1]
     return f"over the budget: {', '.join(over)}" if over else ""
 
 
-def _nearest(prices: dict[str, Price], why_not: dict[str, str], scene: Scene) -> str:
-    """Why nothing could be taken, with the rung that is least over the budget."""
+def _nearest(costs: dict[str, BundleCost], why_not: dict[str, str], scene: Scene) -> str:
+    """Why nothing could be taken, with the candidate that is least over the budget."""
     over = {
-        name: max(prices[name].used(scene.budget).values()) for name, why in why_not.items() if why.startswith("over")
+        name: max(costs[name].used(scene.budget).values()) for name, why in why_not.items() if why.startswith("over")
     }
     if not over:
         return "; ".join(f"{name} cannot be used here: {why}" for name, why in why_not.items())

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -237,3 +239,14 @@ def test_fabrics_are_told_apart(tmp_path: Path):
     with torch.no_grad():
         given = made.network()(torch.from_numpy(unseen.samples.astype(np.float32))).argmax(1).numpy()
     assert np.mean(given == unseen.labels) > 0.9
+
+
+def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
+    """`palpate-train methods | head -1`: exit code 1, and nothing on the error stream."""
+    command = [sys.executable, "-m", "train", "methods"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        assert process.stderr
+        process.stdout.close()
+        error = process.stderr.read()
+    assert (process.returncode, error) == (1, "")

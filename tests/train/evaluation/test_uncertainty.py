@@ -177,9 +177,7 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
     """The whole way with a few iterations: results, pictures and page are there; a second run trains nothing."""
     hums, lines = sweeps(), []
     where = Where(jobs=1, cache=tmp_path / "cache")
-    first = uncertainty_cases.run(
-        hums, None, "split:position=0,1,2->3", "compact-1k", where, lines.append, Effort(0.02)
-    )
+    first = uncertainty.run(hums, None, "split:position=0,1,2->3", "compact-1k", where, lines.append, Effort(0.02))
     assert first["trainings"] == 4
     assert "4/4 done" in lines[-2]
     page = uncertainty_report.write(first, tmp_path / "out")
@@ -190,12 +188,12 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
             "results.json",
         ]
     )
-    again = uncertainty_cases.run(
+    again = uncertainty.run(
         hums, None, "split:position=0,1,2->3", "compact-1k", replace(where, kept=True), lines.append, Effort(0.02)
     )
     assert {k: v for k, v in again.items() if k != "took_s"} == {k: v for k, v in first.items() if k != "took_s"}
     with pytest.raises(FormatError, match="4 of 4 trainings are not kept"):
-        uncertainty_cases.run(
+        uncertainty.run(
             hums, None, "split:position=0,1->2", "compact-1k", replace(where, kept=True), lines.append, Effort(0.02)
         )
 
@@ -203,7 +201,7 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
 def test_methods_without_tenths_are_refused(tmp_path):
     """L-gauss has no trunk: said by name."""
     with pytest.raises(FormatError, match="L-gauss"):
-        uncertainty_cases.run(
+        uncertainty.run(
             sweeps(), None, "split:position=0,1,2->3", "L-gauss", Where(jobs=1, cache=None), print, Effort(0.02)
         )
 

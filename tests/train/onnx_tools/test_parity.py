@@ -14,7 +14,7 @@ from onnx import numpy_helper
 from appliance.core.errors import FormatError
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
-from train.export import export
+from train.export import quantized_bundle
 from train.models.compact import fit
 from train.models.compact.fit import Fit, FitRecipe
 from train.onnx_tools import parity
@@ -30,7 +30,7 @@ def fitted() -> Fit:
 
 def measured(fitted: Fit) -> parity.Parity:
     """What its two forms do on its held-out sweeps."""
-    reference, int8 = export.graphs(fitted)
+    reference, int8 = quantized_bundle.graphs(fitted)
     return parity.measure(int8, fitted.held.samples, fitted.held.labels, reference)
 
 
@@ -122,7 +122,7 @@ def test_a_layer_that_saturates_is_the_one_that_is_named(fitted: Fit):
 
 def test_a_tap_that_was_moved_is_found(fitted: Fit):
     """Taps that sum to zero, then one integer more: an offset can move the first convolution by it."""
-    _, int8 = export.graphs(fitted)
+    _, int8 = quantized_bundle.graphs(fitted)
     conv = next(n for n in int8.graph.node if n.op_type == "Conv")
     maker = next(n for n in int8.graph.node if conv.input[1] in n.output)
     held = next(c for c in int8.graph.initializer if c.name == maker.input[0])
@@ -137,7 +137,7 @@ def test_a_tap_that_was_moved_is_found(fitted: Fit):
 
 def test_any_quantized_graph_can_be_looked_at(fitted: Fit):
     """What onnxruntime quantizes has its twins in the float graph, too, behind the ReLU."""
-    reference, _ = export.graphs(fitted)
+    reference, _ = quantized_bundle.graphs(fitted)
     int8 = quantize(reference, fitted.train.samples)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels, reference)
     assert len(activations(found)) == len(fitted.shape.channels)
@@ -147,7 +147,7 @@ def test_any_quantized_graph_can_be_looked_at(fitted: Fit):
 
 def test_a_bundle_is_told_without_float(fitted: Fit):
     """Each tensor against itself, before it is rounded; a graph without int8 is named."""
-    reference, int8 = export.graphs(fitted)
+    reference, int8 = quantized_bundle.graphs(fitted)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels)
     assert (found.apart, found.lost, {layer.against for layer in found.layers}) == (None, None, {"itself"})
     assert len(found.layers) >= len(fitted.shape.channels)
@@ -159,13 +159,13 @@ def test_a_bundle_is_told_without_float(fitted: Fit):
 def test_the_command_tells_fits_and_bundles(fitted: Fit, tmp_path: Path):
     """Table and JSON of both; a set of another kind is named."""
     fitted.save(tmp_path / "fit.npz")
-    export.export(fitted, tmp_path / "bundle", "close", "1", "")
-    table = export.compared(tmp_path / "fit.npz", fitted.held, tmp_path / "told.json")
+    quantized_bundle.export(fitted, tmp_path / "bundle", "close", "1", "")
+    table = quantized_bundle.compared(tmp_path / "fit.npz", fitted.held, tmp_path / "told.json")
     told = json.loads((tmp_path / "told.json").read_bytes())
     assert told["lost"]["total"] == len(fitted.held)
     assert len(told["layers"]) == len(measured(fitted).layers)
     assert told["set"] == "close"
     assert [line.split()[0] for line in table.splitlines()[:3]] == ["labels", "float", "first"]
-    assert "holds no float form" in export.compared(tmp_path / "bundle", fitted.held)
+    assert "holds no float form" in quantized_bundle.compared(tmp_path / "bundle", fitted.held)
     with pytest.raises(FormatError, match=r"fit.npz is of 2x2 uint8 .* name a set of the same kind"):
-        export.compared(tmp_path / "fit.npz", easy(dtype="int16"))
+        quantized_bundle.compared(tmp_path / "fit.npz", easy(dtype="int16"))

@@ -4,85 +4,29 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import TensorProto, helper
 
-from appliance.bundle import bundle
-from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
-from appliance.core.types import SweepFormat
-from appliance.inference.classifier import Classifier
 from appliance.sim import skin
 from tests.factories.chart_data import DOTS, FRONT, dot
-from train.data.sets import Dataset
+from tests.factories.loud_model import loudness, sweeps
 from train.evaluation.evaluate import Where
-from train.export import measure, measure_process
-from train.models import methods, minirocket
+from train.models import methods
 from train.models.compact import graph
 from train.models.compact.architectures import ARCHITECTURES
-from train.models.methods import Method
 from train.onnx_tools import cost
-from train.onnx_tools.graph_builder import GraphBuilder, GraphModel, run
 from train.onnx_tools.quantize import quantize
 from train.reports import chart_page, chart_report, pareto, scatter
 
-FORM = SweepFormat(2, 2, 100.0, 40, "uint8")
 KEYS = ("method", "precision", "weights", "macs", "file_kb", "rss_mb", "ms_p50", "ms_p99", "touch_s", "runs_on_box")
 """What the issue asks of each dot, beside `accuracy`."""
-
-
-def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
-    """Sweeps of two materials at six positions, the second louder."""
-    labels = np.arange(n) % 2
-    noise = np.random.default_rng(5).standard_normal((n, 40, 2, 2)) * (2 + 18 * labels)[:, None, None, None]
-    groups = {"position": np.arange(n) // 4, "recording": np.arange(n)}
-    return Dataset((100 + noise).clip(0, 255).astype(kind), labels, ("soft", "loud"), 100.0, groups, "small")
-
-
-def loudness(form: SweepFormat = FORM) -> onnx.ModelProto:
-    """A graph that tells the two apart: a convolution that takes differences, its mean size, a threshold."""
-    g, taxels = GraphBuilder(), form.rows * form.cols
-    x = g("Cast", g("Reshape", "sweep", g.constant([1, form.window, taxels], "int64")), to=TensorProto.FLOAT)
-    x = g("Transpose", x, perm=[0, 2, 1])
-    taps = np.zeros((3, taxels, 2))
-    taps[:, :, 0], taps[:, :, 1] = 1, -1
-    x = g("Relu", g("Conv", x, g.constant(taps), g.constant(np.zeros(3)), strides=[1]))
-    x = g("ReduceMean", x, axes=[2], keepdims=0)
-    g("Gemm", x, g.constant([[-1, 1]] * 3), g.constant([45, -45]), output="logits")
-    return g.model(form, "logits", 2)
-
-
-@dataclass
-class Loud:
-    """A model in two precisions."""
-
-    model: onnx.ModelProto
-    forms: dict[str, GraphModel] = field(default_factory=dict)
-
-    def logits(self, given: np.ndarray) -> np.ndarray:
-        """As the graph says."""
-        return run(self.model, given)
-
-    def graph(self) -> onnx.ModelProto:
-        """The graph."""
-        return self.model
-
-
-def loud(calls: list[int]) -> Method:
-    """A method that needs no training; `calls` counts how often it was asked to."""
-
-    def train(known: Dataset, given: np.ndarray, seed: int) -> Loud:
-        calls.append(seed)
-        return Loud(loudness(), {"int8": GraphModel(quantize(loudness(), given))})
-
-    return Method("L-gauss", "for tests", "raw", train)
 
 
 # the front
@@ -168,81 +112,6 @@ def test_the_transforms_of_features_are_counted():
     assert cost.feature_macs("L", skin.FORMAT) == pytest.approx(16 * 1500 * np.log2(1500), abs=1)
     assert cost.feature_macs("H", skin.FORMAT) == pytest.approx(16 * 40 * 75 * np.log2(75), abs=1)
     assert cost.feature_macs("raw", skin.FORMAT) == 0
-
-
-# packing and measuring
-
-
-def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
-    """Both precisions load in the box's classifier and answer as the model; the second time nothing is trained."""
-    calls: list[int] = []
-    for _ in range(2):
-        made = measure.packed(loud(calls), sweeps(), 3, tmp_path / "kept")
-    assert calls == [3]
-    assert [(one.form, one.precision, one.runtime) for one in made] == [("", "float", "onnx"), ("int8", "int8", "onnx")]
-    for one in made:
-        box = Classifier(bundle.load(one.folder), SystemClock())
-        known = sweeps()
-        assert [box.logits(digits).argmax() for digits in known.samples] == known.labels.tolist()
-        assert one.window_s == 0.4
-        assert one.sizes()[0] == (one.folder / "model.onnx").stat().st_size < one.sizes()[1]
-
-
-def test_all_take_turns():
-    """Every round begins with another dot; each one's first sweep of a turn is not counted."""
-    order: list[str] = []
-    calls = {name: (lambda digits, name=name: order.append(name)) for name in "abc"}
-    took = measure.timed(calls, np.zeros((5, 1)), rounds=3, block=2)
-    assert "".join(order) == "aaabbbccc" + "bbbcccaaa" + "cccaaabbb"
-    assert {name: (len(ms), bool((ms > 0).all())) for name, ms in took.items()} == dict.fromkeys("abc", (6, True))
-
-
-def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
-    """Costs of a real bundle: the keys that the issue names, resident memory of Python with numpy and onnxruntime."""
-    made = measure.packed(loud([]), sweeps(), 1, tmp_path / "kept")
-    (told, _) = measure.measured(made, sweeps().samples, 2)
-    assert set(KEYS) <= told.keys()
-    assert told["runs_on_box"]
-    assert 15 < told["rss_mb"] < 150
-    assert 0 < told["ms_p50"] <= told["ms_p99"]
-    assert told["file_kb"] < told["bundle_kb"]
-    assert not measure._costs(made[0], np.ones(3), {"rss_mb": 400.0, "foreign": ["torch"]})["runs_on_box"]
-
-
-def test_what_does_not_run_by_itself_is_named(tmp_path: Path):
-    """A bundle that was altered on disk is refused with its name and reason."""
-    one, _ = measure.packed(loud([]), sweeps(), 1, tmp_path / "kept")
-    (one.folder / "model.onnx").write_bytes(b"no model")
-    with pytest.raises(measure.BundleError, match=r"L-gauss float does not run by itself.*was altered"):
-        measure.memory(one, sweeps().samples)
-
-
-def test_torch_runs_what_was_trained(tmp_path: Path):
-    """The network as TorchScript gives its own logits."""
-
-    class Network(torch.nn.Module):
-        def forward(self, digits: torch.Tensor) -> torch.Tensor:
-            return digits.flatten(1).float()[:, :2]
-
-    @dataclass
-    class Model:
-        network: torch.nn.Module
-
-    measure._torch(Model(Network()), sweeps(), 1, tmp_path)
-    digits = sweeps().samples[3]
-    assert measure_process.load(tmp_path)(digits).tolist() == digits.ravel()[:2].tolist()
-
-
-def test_aeon_runs_what_was_trained(tmp_path: Path):
-    """aeon's transform with the head that was trained on our graph of it gives the graph's logits."""
-    pytest.importorskip("aeon")
-    known = sweeps()
-    state = np.random.get_state()[1].copy()
-    model = minirocket.train(known, known.samples, 1)
-    measure._aeon(model, known, 1, tmp_path)
-    answer = measure_process.load(tmp_path)
-    assert answer(known.samples[1]) == pytest.approx(model.logits(known.samples[1:2])[0], abs=0.05)
-    assert (np.random.get_state()[1] == state).all()
 
 
 # joining

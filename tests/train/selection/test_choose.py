@@ -18,12 +18,12 @@ from train.cli.main import main
 from train.data.sets import Dataset
 from train.evaluation import evaluate
 from train.evaluation.evaluate import Where
+from train.export import measure
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Method
 from train.onnx_tools.graph_builder import GraphBuilder, run
 from train.selection import nested_cv, reduction_curves, scene, select
-from train.selection import prices as rungs
-from train.selection.prices import Price
+from train.selection.select import BundleCost
 
 HERE = Where(jobs=1, cache=None)
 
@@ -83,18 +83,18 @@ def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise
 
 
 FAKES = {f"see-{n}": Method(f"see-{n}", f"{n} taxels", "raw", partial(learn, first=n)) for n in (1, 2, 4, 6)}
-COSTS = {name: Price(0.1 * (i + 1), 10.0 * (i + 1), 50.0) for i, name in enumerate(FAKES)}
+COSTS = {name: BundleCost(0.1 * (i + 1), 10.0 * (i + 1), 50.0) for i, name in enumerate(FAKES)}
 
 
 @pytest.fixture
 def fakes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Puts fake methods, at fixed prices, in the place of the real ones."""
+    """Puts fake methods, of fixed costs, in the place of the real ones."""
 
-    def put(known: dict[str, Method] = FAKES, prices: dict[str, Price] = COSTS) -> None:
+    def put(known: dict[str, Method] = FAKES, costs: dict[str, BundleCost] = COSTS) -> None:
         monkeypatch.setattr(methods, "every", lambda effort=FULL_EFFORT: known)
         monkeypatch.setattr(methods, "module_of", lambda name: "train.models.methods")
-        monkeypatch.setattr(rungs, "ladder", lambda asked: list(known))
-        monkeypatch.setattr(rungs, "prices", lambda *args: prices)
+        monkeypatch.setattr(select, "candidates", lambda asked: list(known))
+        monkeypatch.setattr(select, "bundle_costs", lambda *args: costs)
 
     put()
     return put
@@ -152,7 +152,7 @@ def test_a_gain_within_the_error_is_no_reason(fakes):
     assert select.SizeSearch(parts_of(two()), None, {"cheap": everywhere, "dear": better}).chosen == "dear"
 
 
-def test_a_family_is_climbed_until_it_is_in_vain(fakes):
+def test_the_search_in_a_family_ends_where_larger_ones_change_nothing(fakes):
     """Two larger ones that change nothing end it, unless the second is better than the first; other families go on."""
     half, more = np.zeros((2, 1, len(two())))
     half[0, ::2], more[0] = 1, 1
@@ -175,8 +175,8 @@ def test_a_family_is_climbed_until_it_is_in_vain(fakes):
 
 
 def test_the_order_is_that_of_cost(fakes):
-    """The same methods at other prices: the one that is then cheapest is taken, though it looks at more."""
-    fakes(prices={name: replace(COSTS[name], kb=100 - COSTS[name].kb) for name in reversed(FAKES)})
+    """The same methods with other costs: the one that is then cheapest is taken, though it looks at more."""
+    fakes(costs={name: replace(COSTS[name], kb=100 - COSTS[name].kb) for name in reversed(FAKES)})
     assert chosen(two()).final.chosen == "see-6"
 
 
@@ -199,10 +199,11 @@ def test_nothing_fits(fakes):
 
 
 def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
-    """It has no price, or its training refuses: the reason is told and the others are tried."""
+    """It has no cost, or its training refuses: the reason is told and the others are tried."""
     never = Method("see-0", "refuses", "raw", lambda sweeps, given, seed: learn(sweeps, given[:, :1], seed))
     fakes(
-        {"see-0": never, **FAKES, "bad": never}, {"see-0": Price(0.01, 1, 1), **COSTS, "bad": Price(refused="no graph")}
+        {"see-0": never, **FAKES, "bad": never},
+        {"see-0": BundleCost(0.01, 1, 1), **COSTS, "bad": BundleCost(refused="no graph")},
     )
     choice = chosen(two())
     assert choice.final.chosen == "see-2"
@@ -216,13 +217,13 @@ def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
 def test_the_honest_figure_does_not_flatter(fakes):
     """Of sixteen that only guess the best one looks good; the choice, judged on what it has not seen, is a guess."""
     known = {f"g{i}-": Method(f"g{i}-", "guesses", "raw", partial(guess, number=i)) for i in range(16)}
-    fakes(known, {name: Price(0.1, 10 + i, 50) for i, name in enumerate(known)})
+    fakes(known, {name: BundleCost(0.1, 10 + i, 50) for i, name in enumerate(known)})
     sweeps = skin(places=6, each=2)
     sweeps = sweeps.take(sweeps.labels < 2).select(())
     shuffled = replace(sweeps, labels=np.random.default_rng(8).permutation(sweeps.labels))
     choice = chosen(shuffled, folds=3)
     best = choice.trials.mean(choice.final.scores[choice.final.best])
-    honest = choice.trials.mean(choice.honest)
+    honest = choice.trials.mean(choice.nested)
     assert best > 0.6
     assert honest < best - 0.08
     assert honest == pytest.approx(0.5, abs=0.1)
@@ -393,9 +394,8 @@ def test_what_was_interrupted_goes_on(fakes, tmp_path: Path, monkeypatch: pytest
     assert len(calls) == 8 + 2 * 6 - 7
 
 
-def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
     """Real methods on a real bundle: L-features suffice, so they are deployed; the page needs nothing from outside."""
-    monkeypatch.setattr(rungs, "TRIED_S", 0)
     skin().save(tmp_path / "skin.npz")
     (tmp_path / "scene.toml").write_text(
         'name = "drawer"\nsets = ["skin.npz"]\nmaterials = ["a", "d"]\nvaries = ["place"]\nfolds = 3\naccuracy = 0.8\n'
@@ -433,8 +433,7 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, monkeypatc
 
 def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     """The best is told and packed all the same."""
-    monkeypatch.setattr(rungs, "TRIED_S", 0)
-    monkeypatch.setattr(rungs, "_resident", lambda folder: 50.0)
+    monkeypatch.setattr(measure, "memory", lambda folder, sweeps: {"rss_mib": 50.0, "foreign": []})
     hard = skin(noise=0.9)
     hard.save(tmp_path / "skin.npz")
     (tmp_path / "scene.toml").write_text('sets = ["skin.npz"]\nvaries = ["place"]\naccuracy = 0.99\nreduce = []\n')
@@ -447,9 +446,9 @@ def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, mon
 
 def test_cheap_is_what_takes_little_of_the_scarcer():
     """Of time and room, whichever the board has less of; without a budget the smaller; of equals the faster."""
-    small, fast = Price(0.4, 20, 60), Price(0.1, 40, 50)
+    small, fast = BundleCost(0.4, 20, 60), BundleCost(0.1, 40, 50)
     tight = {"time": scene.Budget(ms=1, kb=1000, slower=2), "room": scene.Budget(ms=100, kb=50), "none": scene.Budget()}
-    cheaper = {name: min((small, fast), key=lambda price: price.cost(b)) for name, b in tight.items()}
+    cheaper = {name: min((small, fast), key=lambda cost: cost.order(b)) for name, b in tight.items()}
     assert cheaper == {"time": fast, "room": small, "none": small}
-    assert Price(0.1, 20, 50).cost(scene.Budget()) < small.cost(scene.Budget())
+    assert BundleCost(0.1, 20, 50).order(scene.Budget()) < small.order(scene.Budget())
     assert small.used(tight["time"]) == {"ms": 0.8, "kb": 0.02}

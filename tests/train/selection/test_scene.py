@@ -13,7 +13,7 @@ import pytest
 from appliance.core.errors import FormatError
 from tests.factories.paths import ROOT
 from train.data.sets import Dataset
-from train.selection import prices, scene
+from train.selection import scene, select
 
 WHOLE = """
 name = "drawer"
@@ -181,5 +181,5 @@ def test_the_examples_are_scenes_and_name_every_key():
     told = tomllib.loads((docs / "tubes.toml").read_text())
     assert told.keys() == {f.name for f in fields(scene.Scene)} - {"path"}
     assert told["budget"].keys() == {f.name for f in fields(scene.Budget)}
-    usual = prices.ladder(replace(found["tubes.toml"], methods=()))
+    usual = select.candidates(replace(found["tubes.toml"], methods=()))
     assert list(found["tubes.toml"].methods) == usual

@@ -26,7 +26,7 @@ from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
 from train.cli.main import main
 from train.data import sets
-from train.export import export, pack
+from train.export import pack, quantized_bundle
 from train.export.pack import ExportRefused
 from train.models import methods, networks
 from train.models.compact import fit
@@ -54,7 +54,7 @@ def tight() -> Fit:
 def packed(fitted: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its bundle."""
     target = tmp_path_factory.mktemp("export") / "bundle"
-    export.export(fitted, target, "easy", "1", "0123abcd")
+    quantized_bundle.export(fitted, target, "easy", "1", "0123abcd")
     return target
 
 
@@ -118,7 +118,7 @@ def test_quantizing_leaves_its_model_alone(fitted: Fit):
     """onnxruntime empties the model that it is given; ours still runs."""
     trunk = fitted.trunk(int8=False)
     before = trunk.SerializeToString()
-    export.quantize(trunk, fitted.train.samples[:4])
+    quantized_bundle.quantize(trunk, fitted.train.samples[:4])
     assert trunk.SerializeToString() == before
 
 
@@ -133,8 +133,8 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     assert held["accuracy"] == pytest.approx(np.mean(pack.score(it, fitted.held) == fitted.held.labels), abs=1e-4)
     assert manifest.figures["held-out recording, by recording"]["n"] == len(fitted.held) / 2
     told = manifest.figures["parity"]
-    assert told["agreement"] >= export.LEAST_AGREEMENT
-    assert told["lost"] <= export.MOST_LOST
+    assert told["agreement"] >= quantized_bundle.LEAST_AGREEMENT
+    assert told["lost"] <= quantized_bundle.MOST_LOST
     assert told["total"] == len(fitted.held)
     weakest = fitted.train.samples.mean(axis=1).max(axis=(1, 2)).min()
     assert manifest.thresholds.contact == pytest.approx(0.1 * weakest)
@@ -149,7 +149,7 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
 
 def test_the_same_fit_gives_the_same_bytes(fitted: Fit, packed: Path, tmp_path: Path):
     """Every file, the zip of golden sweeps included."""
-    export.export(fitted, tmp_path / "again", "easy", "1", "0123abcd")
+    quantized_bundle.export(fitted, tmp_path / "again", "easy", "1", "0123abcd")
     for file in (bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
         assert (tmp_path / "again" / file).read_bytes() == (packed / file).read_bytes(), file
     assert [f.name for f in tmp_path.iterdir()] == ["again"]
@@ -174,7 +174,7 @@ def test_a_head_that_says_otherwise_is_refused(fitted: Fit, tmp_path: Path):
     with pytest.raises(
         ExportRefused, match=r"int8 loses \d+\.\d\d points on held-out sweeps, by float's own .*limit 0\.5"
     ):
-        export.export(negated(fitted), tmp_path / "bundle", "easy", "1", "")
+        quantized_bundle.export(negated(fitted), tmp_path / "bundle", "easy", "1", "")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -182,13 +182,13 @@ def test_weights_that_are_no_numbers_are_refused(fitted: Fit, tmp_path: Path):
     """A difference of nan is beyond every limit."""
     spoilt = fitted.weights | {"head.bias": fitted.weights["head.bias"] * np.nan}
     with pytest.raises(ExportRefused, match="differs from pytorch by nan in a logit"):
-        export.export(replace(fitted, weights=spoilt), tmp_path / "bundle", "easy", "1", "")
+        quantized_bundle.export(replace(fitted, weights=spoilt), tmp_path / "bundle", "easy", "1", "")
 
 
 def judged(fitted: Fit) -> None:
     """What export finds of its two forms."""
-    reference, int8 = export.graphs(fitted)
-    export.check(parity.measure(int8, fitted.held.samples, fitted.held.labels, reference))
+    reference, int8 = quantized_bundle.graphs(fitted)
+    quantized_bundle.check(parity.measure(int8, fitted.held.samples, fitted.held.labels, reference))
 
 
 def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
@@ -258,16 +258,16 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
 )
 def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
     """On this side it passes, beyond it is named with its number, its limit and what to try."""
-    export.check(found(**good))
+    quantized_bundle.check(found(**good))
     with pytest.raises(ExportRefused, match=message) as refused:
-        export.check(found(**bad))
+        quantized_bundle.check(found(**bad))
     assert "take a larger network" in str(refused.value)
 
 
 def test_a_box_that_would_refuse_is_no_box(fitted: Fit, tmp_path: Path):
     """A full scale that the sweeps pass: they count as saturated, which export tells instead of the robot."""
     with pytest.raises(ExportRefused, match=r"the box would refuse \d+ of \d+ held-out sweeps"):
-        export.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
+        quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
 
 
 def test_the_box_must_say_what_export_saw(fitted: Fit, packed: Path):
@@ -289,20 +289,20 @@ def test_a_material_never_recognised_is_refused(fitted: Fit):
 def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):
     """A refused export leaves the old bundle; a good one takes its place, stray files gone; other folders are safe."""
     target = tmp_path / "bundle"
-    export.export(fitted, target, "old", "1", "")
+    quantized_bundle.export(fitted, target, "old", "1", "")
     (target / "stray").write_text("left over")
     before = (target / bundle.MANIFEST).read_bytes()
     with pytest.raises(ExportRefused):
-        export.export(negated(fitted), target, "new", "2", "")
+        quantized_bundle.export(negated(fitted), target, "new", "2", "")
     assert (target / bundle.MANIFEST).read_bytes() == before
-    export.export(fitted, target, "new", "2", "")
+    quantized_bundle.export(fitted, target, "new", "2", "")
     assert bundle.load(target).manifest.name == "new"
     assert sorted(f.name for f in target.iterdir()) == sorted(
         [bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS]
     )
     (tmp_path / "letters").mkdir()
     with pytest.raises(ExportRefused, match="is no bundle and will not be replaced"):
-        export.export(fitted, tmp_path / "letters", "new", "2", "")
+        quantized_bundle.export(fitted, tmp_path / "letters", "new", "2", "")
     assert sorted(f.name for f in tmp_path.iterdir()) == ["bundle", "letters"]
 
 
@@ -310,14 +310,14 @@ def test_a_target_that_cannot_be_written_is_named(fitted: Fit, tmp_path: Path):
     """A file where a folder should be."""
     (tmp_path / "file").write_text("")
     with pytest.raises(ExportRefused, match="the bundle cannot be written to"):
-        export.export(fitted, tmp_path / "file" / "bundle", "easy", "1", "")
+        quantized_bundle.export(fitted, tmp_path / "file" / "bundle", "easy", "1", "")
 
 
 def test_a_label_that_cannot_be_sent_is_refused(fitted: Fit, tmp_path: Path):
     """The manifest's own check speaks before anything is written."""
     named = replace(fitted, **{k: replace(getattr(fitted, k), materials=("a,b", "c", "d")) for k in ("train", "held")})
     with pytest.raises(BundleError, match="label 'a,b' cannot be sent"):
-        export.export(named, tmp_path / "bundle", "easy", "1", "")
+        quantized_bundle.export(named, tmp_path / "bundle", "easy", "1", "")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -367,7 +367,7 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     """Nothing in it is int8: both forms are one, the box's labels are its network's, no tensor is told; what another
     head says is refused here as well."""
     made = fit.fit(easy(), 1, FitRecipe(), shape=ARCHITECTURES["bands"])
-    export.export(made, tmp_path / "b", "easy", "1", "0123abcd")
+    quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
     it = box(tmp_path / "b")
     assert it.self_test() < 1e-6
     assert "QuantizeLinear" not in {n.op_type for n in onnx.load(tmp_path / "b" / bundle.MODEL).graph.node}
@@ -379,9 +379,9 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     assert told["probability_difference"] < 1e-3
     (method,) = methods.find(["compact-bands"], methods.Effort(0.02))
     content = pack.trained(method, easy(), 1)
-    assert export.checked(content, content.reference).figures["parity"]["agreement"] == 1
+    assert quantized_bundle.checked(content, content.reference).figures["parity"]["agreement"] == 1
     with pytest.raises(ExportRefused, match=r"int8 loses \d+\.\d\d points .*record more"):
-        export.export(negated(made), tmp_path / "other", "easy", "1", "")
+        quantized_bundle.export(negated(made), tmp_path / "other", "easy", "1", "")
 
 
 def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch):
@@ -390,11 +390,11 @@ def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch
     train, held, by = hold_out(easy(), 1)
     model = method.train(train, train.samples, 1)
     content, reference = pack.Content(model.graph(), "raw", train, held, by, {}), model.forms["float"].graph()
-    assert export.checked(content, reference).figures["parity"]["total"] == len(content.held)
-    assert export.checked(content, None) is content
-    monkeypatch.setattr(export, "MOST_MEAN_DIFFERENCE", 0.0)
+    assert quantized_bundle.checked(content, reference).figures["parity"]["total"] == len(content.held)
+    assert quantized_bundle.checked(content, None) is content
+    monkeypatch.setattr(quantized_bundle, "MOST_MEAN_DIFFERENCE", 0.0)
     with pytest.raises(ExportRefused, match=r"on average \(limit 0.0\)"):
-        export.checked(content, reference)
+        quantized_bundle.checked(content, reference)
 
 
 @pytest.mark.skipif("PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps")
@@ -432,7 +432,7 @@ def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
     offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
     try:
         made = fit.fit(offset, 1, FitRecipe(steps=20, keep_means=keep), shape=ARCHITECTURES["20k"])
-        manifest = export.export(made, tmp_path / "b", "offset", "1", "0123abcd")
+        manifest = quantized_bundle.export(made, tmp_path / "b", "offset", "1", "0123abcd")
     except ExportRefused:  # what was never learnt may not survive int8 either
         assert not keep
         return

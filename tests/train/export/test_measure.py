@@ -1,0 +1,135 @@
+"""Packing all forms of a method, and the one way to time, size and weigh a model."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from appliance.bundle import bundle
+from appliance.core.clock import SystemClock
+from appliance.inference.classifier import Classifier
+from tests.factories.loud_model import loud, sweeps
+from train.cli.main import main
+from train.export import measure, model_forms
+from train.export.measure import Measurement
+from train.models import minirocket
+from train.reports import chart_report
+
+KEYS = ("method", "precision", "weights", "macs", "file_kb", "rss_mb", "ms_p50", "ms_p99", "touch_s", "runs_on_box")
+"""What chart.json has of each model, beside `accuracy`."""
+
+
+def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
+    """Both precisions load in the box's classifier and answer as the model; the second time nothing is trained."""
+    calls: list[int] = []
+    for _ in range(2):
+        made = model_forms.packed(loud(calls), sweeps(), 3, tmp_path / "kept")
+    assert calls == [3]
+    assert [(one.form, one.precision, one.runtime) for one in made] == [("", "float", "onnx"), ("int8", "int8", "onnx")]
+    for one in made:
+        box = Classifier(bundle.load(one.folder), SystemClock())
+        known = sweeps()
+        assert [box.logits(digits).argmax() for digits in known.samples] == known.labels.tolist()
+        assert one.window_s == 0.4
+        assert measure.sizes(one.folder)[0] == (one.folder / "model.onnx").stat().st_size < measure.sizes(one.folder)[1]
+
+
+def test_all_take_turns():
+    """Every round begins with another model; each one's first sweep of a turn is not counted."""
+    order: list[str] = []
+    calls = {name: (lambda digits, name=name: order.append(name)) for name in "abc"}
+    took = measure.timed(calls, np.zeros((5, 1)), rounds=3, block=2)
+    assert "".join(order) == "aaabbbccc" + "bbbcccaaa" + "cccaaabbb"
+    assert {name: (len(ms), bool((ms > 0).all())) for name, ms in took.items()} == dict.fromkeys("abc", (6, True))
+
+
+def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
+    """Costs of a real bundle: the keys that the issue names, resident memory of Python with numpy and onnxruntime."""
+    made = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
+    (told, _) = model_forms.measured(made, sweeps().samples, 2)
+    assert set(KEYS) <= told.keys()
+    assert told["runs_on_box"]
+    assert 15 < told["rss_mb"] < 150
+    assert 0 < told["ms_p50"] <= told["ms_p99"]
+    assert told["file_kb"] < told["bundle_kb"]
+    assert not model_forms._costs(made[0], Measurement(1.0, 1.0, 10, 20, 400.0, ("torch",)))["runs_on_box"]
+
+
+def test_what_does_not_run_by_itself_is_named(tmp_path: Path):
+    """A bundle that was altered on disk is refused with its name and reason."""
+    one, _ = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
+    (one.folder / "model.onnx").write_bytes(b"no model")
+    with pytest.raises(
+        measure.BundleError, match=r"the model in .*/float does not run in a process of its own.*was altered"
+    ):
+        measure.memory(one.folder, sweeps().samples)
+
+
+def test_torch_runs_what_was_trained(tmp_path: Path):
+    """The network as TorchScript gives its own logits."""
+
+    class Network(torch.nn.Module):
+        def forward(self, digits: torch.Tensor) -> torch.Tensor:
+            return digits.flatten(1).float()[:, :2]
+
+    @dataclass
+    class Model:
+        network: torch.nn.Module
+
+    model_forms._save_torch(Model(Network()), sweeps(), 1, tmp_path)
+    digits = sweeps().samples[3]
+    assert measure.load(tmp_path)(digits).tolist() == digits.ravel()[:2].tolist()
+
+
+def test_aeon_runs_what_was_trained(tmp_path: Path):
+    """aeon's transform with the head that was trained on our graph of it gives the graph's logits."""
+    pytest.importorskip("aeon")
+    known = sweeps()
+    state = np.random.get_state()[1].copy()
+    model = minirocket.train(known, known.samples, 1)
+    model_forms._save_aeon(model, known, 1, tmp_path)
+    answer = measure.load(tmp_path)
+    assert answer(known.samples[1]) == pytest.approx(model.logits(known.samples[1:2])[0], abs=0.05)
+    assert (np.random.get_state()[1] == state).all()
+
+
+def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Both commands pack the same bundle of a method, measure it with the same function, and take size, time and memory
+    from one record."""
+    measured: dict[str, Measurement] = {}
+    digests: dict[str, str] = {}
+    measure_all = measure.measure_all
+    command = ""
+
+    def recorded(folders: list[Path], counts: np.ndarray, rounds: int = 2) -> list[Measurement]:
+        found = measure_all(folders, counts, 2)
+        for folder, measurement in zip(folders, found, strict=True):
+            held = bundle.load(folder)
+            if held.manifest.name == "L-gauss":  # not the one that `choose` packs at the end, under the scene's name
+                measured[command], digests[command] = measurement, held.id
+        return found
+
+    monkeypatch.setattr(measure, "measure_all", recorded)
+    (tmp_path / "scene.toml").write_text(
+        'sets = ["sim:T-REAL:1001:3"]\nonly = ["position<=2"]\nvaries = ["position"]\nmethods = ["L-gauss"]\nreduce = []\n'
+    )
+    where = ["--jobs", "1", "--cache", str(tmp_path / "cache")]
+    command = "choose"
+    assert main(["choose", "--scene", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "b"), *where]) == 0
+    monkeypatch.setattr(chart_report, "QUICK", replace(chart_report.QUICK, named=("L-gauss",)))
+    command = "chart"
+    assert main(["chart", "--quick", "--out", str(tmp_path / "chart"), *where]) == 0
+    (candidate,) = json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"]
+    (dot,) = json.loads((tmp_path / "chart" / "chart.json").read_text())
+    assert digests["choose"] == digests["chart"]
+    assert measured["choose"].bundle_bytes == measured["chart"].bundle_bytes
+    assert candidate["kb"] == dot["bundle_kb"] == measured["chart"].bundle_kb
+    for key, printed, record in (("choose", (candidate["ms"], candidate["mb"]), measured["choose"]),
+                                 ("chart", (dot["ms_p50"], dot["rss_mb"]), measured["chart"])):  # fmt: skip
+        assert printed == (record.ms_p50, record.rss_mib), key
+    assert candidate["mb"] == pytest.approx(dot["rss_mb"], rel=0.1)

@@ -1,0 +1,132 @@
+"""Every form of a method as a packed model. In: a method, sweeps. Out: its bundles, and it as its own library runs it.
+
+The forms are the method itself, its other precisions, and for some a peer: the same model in a library that the box has not.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from appliance.core import storage
+from train.data.sets import Dataset
+from train.export import measure, pack
+from train.export.measure import Measurement
+from train.models import minirocket
+from train.models.methods import Method
+from train.onnx_tools import cost
+
+Array = NDArray[Any]
+INDEX = "dots.json"
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A model in `folder`, which measure.load reads. runtime: "onnx" is a bundle, else a peer in its own library.
+
+    form: "" is the method itself, else the name of a form of it. precision, weights, macs: as onnx_tools.cost counts
+    them. window_s: length of a sweep in s.
+    """
+
+    method: str
+    form: str
+    precision: str
+    runtime: str
+    folder: Path
+    weights: int
+    macs: int
+    window_s: float
+
+    @property
+    def name(self) -> str:
+        """No two models of a chart share one."""
+        return f"{self.method} {self.precision}" + ("" if self.runtime == "onnx" else f" in {self.runtime}")
+
+
+def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Packed]:
+    """Train `method` on four fifths of `sweeps` and pack all its forms; what lies in `folder` is not made again.
+
+    Raises FormatError where the method cannot work with the set, ExportRefused where it would be no model on the box.
+    """
+    if not folder.exists():
+        with storage.folder(folder) as work:
+            entries = list(_packed_forms(method, sweeps, seed, work))
+            (work / INDEX).write_text(json.dumps(entries))
+    entries = json.loads((folder / INDEX).read_text())
+    return [Packed(**entry | {"method": method.name, "folder": folder / entry["folder"]}) for entry in entries]
+
+
+def _packed_forms(method: Method, sweeps: Dataset, seed: int, work: Path) -> Iterator[dict[str, Any]]:
+    """Each form packed in a folder of its own; then the method as its own library runs it, where it has one."""
+    model, content = pack.train_content(method, sweeps, seed)
+    counted: dict[str, dict[str, Any]] = {}
+    for form, graphed in {"": model, **getattr(model, "forms", {})}.items():
+        graph = graphed.graph()
+        precision = cost.precision(graph)
+        if any(precision == entry["precision"] for entry in counted.values()):
+            continue  # nothing of it is in int8: it is its own float form
+        folder = work / precision
+        if form:  # early answers and novelty belong to the method itself
+            about = content.about | {"form": form}
+            pack.pack_to_measure(replace(content, model=graph, about=about, made=None, reference=None), folder)
+        else:
+            pack.pack_to_measure(content, folder)
+        counted[form] = {
+            "form": form, "precision": precision, "weights": cost.weights(graph),
+            "macs": cost.macs(graph) + cost.feature_macs(method.input, content.train.format),
+            "window_s": content.train.format.window / content.train.format.rate_hz,
+        }  # fmt: skip
+        yield counted[form] | {"runtime": "onnx", "folder": folder.name}
+    if method.name in PEERS:
+        runtime, save = PEERS[method.name]
+        (work / runtime).mkdir()
+        save(model, content.train, seed, work / runtime)
+        yield counted[""] | {"runtime": runtime, "folder": runtime}
+
+
+def _save_torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
+    """The network as TorchScript, which needs none of our code to be read."""
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        traced: Any = torch.jit.trace(model.network.eval(), torch.from_numpy(train.samples[:1]))  # type: ignore[no-untyped-call]
+        traced.save(folder / measure.TORCH)
+
+
+def _save_aeon(model: Any, train: Dataset, seed: int, folder: Path) -> None:
+    """aeon's parameters, fitted to the same sweeps once more, and the head that was trained on its features."""
+    arrays: dict[str, Any] = {f"p{i}": p for i, p in enumerate(minirocket.fitted(train.samples, seed))}
+    arrays["silence"] = np.zeros((1, train.format.rows * train.format.cols, train.format.window), np.float32)
+    np.savez_compressed(folder / measure.AEON, weight=model.weight, bias=model.bias, **arrays)
+
+
+PEERS: Mapping[str, tuple[str, Callable[[Any, Dataset, int, Path], None]]] = {
+    "paper-cnn-centred": ("torch", _save_torch),
+    "minirocket": ("aeon", _save_aeon),
+}
+"""Methods that are measured in their own library as well, which the box has not."""
+
+
+def measured(models: Sequence[Packed], sweeps: Array, rounds: int = measure.ROUNDS) -> list[dict[str, Any]]:
+    """What each of the `models` costs, as chart.json names it; see docs/evaluation.md. sweeps: raw counts [n, T, R, C].
+
+    Raises BundleError where a model does not run.
+    """
+    found = measure.measure_all([one.folder for one in models], sweeps, rounds)
+    return [_costs(one, measurement) for one, measurement in zip(models, found, strict=True)]
+
+
+def _costs(one: Packed, measurement: Measurement) -> dict[str, Any]:
+    return {
+        "method": one.method, "precision": one.precision, "runtime": one.runtime, "weights": one.weights,
+        "macs": one.macs, "file_kb": measurement.model_kb, "bundle_kb": measurement.bundle_kb,
+        "rss_mb": measurement.rss_mib, "ms_p50": measurement.ms_p50, "ms_p99": measurement.ms_p99,
+        "touch_s": one.window_s, "runs_on_box": one.runtime == "onnx" and not measurement.foreign,
+    }  # fmt: skip
