@@ -19,7 +19,8 @@ from train.data.splitters import Protocol
 from train.evaluation import parallel
 from train.evaluation.fold import Fold, FoldTask, key, run
 from train.metrics.score import Score, fused, interval, provenance
-from train.models import methods
+from train.models import methods as known_methods
+from train.models.methods import FULL_EFFORT, Effort
 from train.onnx_tools import parity
 
 Array = NDArray[Any]
@@ -93,8 +94,9 @@ class Result:
         logits = np.concatenate([fold.forms[name] for fold in self.folds])
         precise, int8 = (logits, self.logits) if name == "float" else (self.logits, logits)
         labels, clusters = self.sweeps.labels[self.test], Protocol(self.protocol).clusters(self.sweeps)
-        right = [x.argmax(1) == labels for x in (precise, int8)]
-        lost = parity.loss(*right, None if clusters is None else clusters[self.test])
+        lost = parity.loss(
+            precise.argmax(1) == labels, int8.argmax(1) == labels, None if clusters is None else clusters[self.test]
+        )
         told = asdict(parity.compare(precise, int8)) | asdict(lost)
         return self._counts(logits) | {key: round(value, 4) for key, value in told.items()}
 
@@ -123,7 +125,7 @@ class Plan:
     protocols: Sequence[str]
     seeds: Sequence[int] = (1,)
     means_removed: bool = False
-    effort: methods.Effort = methods.FULL_EFFORT
+    effort: Effort = FULL_EFFORT
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def evaluate(
     sweeps: Dataset, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
 ) -> Iterator[Result]:
     """Results as they are complete. Raises FormatError where a method or protocol is unknown or does not fit the set."""
-    known = methods.find(plan.methods, plan.effort)
+    known = known_methods.find(plan.methods, plan.effort)
     sweeps = sweeps.without_means() if plan.means_removed else sweeps
     origin = {"digest": digest(sweeps)} | provenance()
     splits = {(p, s): Protocol(p).folds(sweeps, s) for p in plan.protocols for s in plan.seeds}
@@ -171,7 +173,7 @@ def folds(
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()
     left = [named for named in tasks.items() if named[0] not in kept and not where.kept]
-    shared = (sweeps, methods.model_inputs(kind, sweeps)) if left else ()
+    shared = (sweeps, known_methods.model_inputs(kind, sweeps)) if left else ()
     for (name, _), fold in parallel.results(_run, left, shared, where.jobs, where.scheduler):
         if where.cache:
             fold.save(paths[name])

@@ -57,6 +57,7 @@ def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Pac
     Raises FormatError where the method cannot work with the set, ExportRefused where it would be no model on the box.
     """
     if not folder.exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
         with storage.folder(folder) as work:
             entries = list(_packed_forms(method, sweeps, seed, work))
             (work / INDEX).write_text(json.dumps(entries))
