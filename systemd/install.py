@@ -46,10 +46,10 @@ LINKS = {place: f"{HERE}/share/palpate/{Path(name).name}" for name, place in PLA
 PIP = "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index --root-user-action=ignore"
 SELF_TEST = """
 import sys; from pathlib import Path; from appliance.bundle import bundle
-from appliance.cli.commands import model; from appliance.core import clock, config
+from appliance.cli.commands import load_bundle; from appliance.core import clock, config
 from appliance.inference import classifier
 settings = config.load(None, folder=Path(sys.argv[1]))
-for held in (bundle.load(bundle.DEFAULT), model(settings)):
+for held in (bundle.load(bundle.DEFAULT), load_bundle(settings)):
     classifier.Classifier(held, clock.SystemClock()).self_test()
 """
 """The settings are understood, and the bundle that is packaged and the one in use do what they should."""

@@ -15,8 +15,9 @@ from appliance.io.robot_link import SerialSink
 from appliance.runtime import assembly
 from appliance.sim import devices, rig, script, skin
 from appliance.tools import pseudo_terminal
+from tests.factories import log_lines
 from tests.factories.paths import NO_SITE
-from tests.factories.simulated_box import Rigged
+from tests.factories.simulated_box import OnSweep, Rigged
 
 
 @pytest.fixture(scope="session")
@@ -34,7 +35,7 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             world: devices.SimDevices | None = None,
             sets: tuple[str, ...] = (),
             model=default_bundle,
-            keepers=(),
+            observers=(),
             **more,
         ) -> Rigged:
             world = world or devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
@@ -42,8 +43,15 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             far_end, name = stack.enter_context(pseudo_terminal.pair())
             port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
             kept: list[Sweep] = []
-            all_keepers = [lambda sweep, verdict: kept.append(sweep), *keepers]
-            box = assembly.box(settings, model, world, port, stack, keepers=all_keepers, **more)
+            watching = [OnSweep(lambda sweep, verdict: kept.append(sweep)), *observers]
+            box = assembly.box(settings, model, world, port, stack, observers=watching, **more)
             return Rigged(box, world, far_end, port, kept=kept)
 
         yield make
+
+
+@pytest.fixture
+def logged() -> Iterator[list[str]]:
+    """The lines that the box logs during the test; a warning has `<4>` before it."""
+    with log_lines.collected() as lines:
+        yield lines

@@ -1,6 +1,6 @@
-"""The command `palpate`: which devices a command gets. In: arguments. Out: an exit code.
+"""The command `palpate`: runs a command with the devices that it needs. In: arguments. Out: an exit code.
 
-Simulated parts are chosen by name here and nowhere else, and every sentence they cause says so.
+Simulated devices are chosen by name, here and nowhere else, and every sentence they cause says so.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from appliance.cli import commands, device_commands
-from appliance.cli.device_commands import model, settings, stop_flag
+from appliance.cli import bundle_commands, commands
+from appliance.cli.commands import OpenDevices, load_bundle, load_settings, stop_flag
 from appliance.cli.parser import parser
 from appliance.core.clock import SystemClock
 from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.log import to_stderr
+from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
-from appliance.io.robot_link import ResultSink, SerialSink
+from appliance.io.robot_link import SerialSink
 from appliance.runtime import assembly
-from appliance.runtime.loop import Box, SweepObserver
+from appliance.runtime.loop import Box
 
 if TYPE_CHECKING:
     from appliance.sim.devices import SimDevices
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 def main(argv: list[str] | None = None) -> int:
     """Run a command; its exit code."""
     args = parser(RUNS).parse_args(argv)
+    to_stderr()
     try:
         code: int = args.run(args)
         sys.stdout.flush()
@@ -44,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        # whoever read our output has left; nothing more can be said there, not even at exit
+        # nobody reads standard output any more, so nothing must be written to it, not even at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as e:
@@ -52,14 +55,12 @@ def main(argv: list[str] | None = None) -> int:
         return 1
 
 
-def _with_devices(
-    run: Callable[[argparse.Namespace, device_commands.OpenDevices], int], args: argparse.Namespace
-) -> int:
-    return run(args, partial(_world, args))
+def _with_devices(run: Callable[[argparse.Namespace, OpenDevices], int], args: argparse.Namespace) -> int:
+    return run(args, partial(_open_devices, args))
 
 
-def _world(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> Devices:
-    """The real devices, or the rig where `--sim` names it; `fmt` tells what the simulated skin has to send."""
+def _open_devices(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> Devices:
+    """The real devices, or simulated ones where `--sim` names them; `fmt` gives what the simulated skin has to send."""
     if args.sim:
         return _simulated(args.sim, fmt(), args, remember=False)
     if args.virtual:
@@ -81,49 +82,44 @@ def run_demo(args: argparse.Namespace) -> int:
     """`palpate demo`: a dozen sweeps through a pseudo-terminal, seen from both ends."""
     from appliance.tools import demo, pseudo_terminal
 
-    how = settings(args)
-    held = model(how)
+    settings = load_settings(args)
+    bundle = load_bundle(settings)
     args.sweeps = args.sweeps or 12
-    world = _simulated(args.sim or "skin", held.format, args)
+    devices = _simulated(args.sim or "skin", bundle.format, args)
     stopped = stop_flag()
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
-        port = SerialSink(replace(how.serial, port=name), world.clock, world.source)
-        show = demo.Demo(world.robot.played, far_end, world.clock, sys.stdout, raw=args.raw)
-        box = assembly.box(how, held, world, port, stack)
+        port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
+        show = demo.Demo(devices.robot.played, far_end, devices.clock, sys.stdout, raw=args.raw)
+        box = assembly.box(settings, bundle, devices, port, stack)
         show.run(box, args.sweeps, stopped)
     return 0
 
 
 def run_bench(args: argparse.Namespace) -> int:
-    """`palpate bench`: see appliance/sim/bench.py."""
+    """`palpate bench`: see appliance/tools/bench.py."""
     from appliance.tools import bench_process, pseudo_terminal
 
-    how = settings(args)
-    held = model(how)
+    settings = load_settings(args)
+    bundle = load_bundle(settings)
 
-    def staged(
-        world: SimDevices,
-        stack: ExitStack,
-        also: Iterable[ResultSink] = (),
-        keepers: Iterable[SweepObserver] = (),
-    ) -> tuple[Box, int]:
+    def build(devices: SimDevices, stack: ExitStack, observers: Iterable[Observer] = ()) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
-        port = SerialSink(replace(how.serial, port=name), world.clock, world.source)
-        return assembly.box(how, held, world, port, stack, also=also, keepers=keepers), far_end
+        port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
+        return assembly.box(settings, bundle, devices, port, stack, observers=observers), far_end
 
     if args.part:
-        print(json.dumps(bench_process.measure(args.part, held.format, staged, args.acts)))
+        print(json.dumps(bench_process.measure(args.part, bundle.format, build, args.acts)))
         return 0
     from appliance.tools import bench
 
-    figures = bench.run(held, staged, args.references, args.seed, lambda line: print(line, flush=True))
+    figures = bench.run(bundle, build, args.references, args.seed, lambda line: print(line, flush=True))
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
     return 0
 
 
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
-    "demo": run_demo, "bench": run_bench, **commands.RUNS,
-    **{name: partial(_with_devices, run) for name, run in device_commands.RUNS.items()},
+    "demo": run_demo, "bench": run_bench, **commands.RUNS, **bundle_commands.RUNS,
+    **{name: partial(_with_devices, run) for name, run in commands.WITH_DEVICES.items()},
 }  # fmt: skip

@@ -1,9 +1,8 @@
-"""The state of the box at the end of each turn of its loop (Health), and the interface of those who observe it."""
+"""How the box is at the end of a turn of its loop: what observers get, and what the STA sentence and the status show."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +32,3 @@ class Health:
         """One line for a person."""
         skin = f"skin {self.skin}: {self.trouble}" if self.trouble else f"skin {self.skin}"
         return f"{skin}. Sweeps answered: {self.answered}"
-
-
-class HealthObserver(Protocol):
-    """Observes the loop, for example a watchdog, which notices a turn that does not end because no call comes."""
-
-    def turn(self, health: Health) -> None:
-        """A turn of the loop has ended: frames were read or the skin's absence reported, edges polled, answers sent."""
-        ...
-
-    def stopping(self) -> None:
-        """The loop has ended; open sweeps are answered next."""
-        ...

@@ -128,6 +128,27 @@ class Frames:
         return cls(*(np.concatenate([getattr(run, name) for run in runs]) for name in cls.__slots__))
 
 
+class EdgeKind(StrEnum):
+    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that what the robot signalled is unknown."""
+
+    START = "start"
+    STOP = "stop"
+    NEW_OBJECT = "new-object"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """One debounced edge. t_ns: kernel time stamp, `CLOCK_MONOTONIC`, of the first edge of its burst.
+
+    LOST has the time of the edge at which the loss or the storm was detected. Edges reported before it are certain.
+    No edge follows it until every line has been quiet for `glitch_us`; the levels are then read again, without an edge.
+    """
+
+    kind: EdgeKind
+    t_ns: int
+
+
 @dataclass(frozen=True, slots=True)
 class Sweep:
     """One sweep as SweepCutter cut it. frames: the middle window if `status` is ok, otherwise empty.

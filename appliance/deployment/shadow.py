@@ -19,13 +19,14 @@ from appliance.core import storage
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError, BundleError, FormatError
 from appliance.core.health import Health
+from appliance.core.log import TroubleLog, log
+from appliance.core.observer import Observer
 from appliance.core.schema import typed
 from appliance.core.statistics import wilson
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.recording.recording import SweepFolder
-from appliance.service.journal import WARNING
 
 FILE = "agreement.json"
 KEPT = 100
@@ -115,26 +116,23 @@ def read(folder: Path) -> Agreement | None:
         raise FormatError(f"{folder / FILE} cannot be read: {e}; take it away, and the counts begin anew") from e
 
 
-class Shadow:
-    """Sweep and health observer of a running box: lets the candidate judge each sweep by the same rules, and counts.
+class Shadow(Observer):
+    """Observer of a running box that lets the candidate judge each sweep by the same rules, and counts.
 
     current: the bundle in service. folder: for agreement and kept sweeps; those of another pair of bundles are removed.
-    judge: makes a bundle's classifier by the settings. circumstances: what the box reports of itself, with its tare.
-    log: gets a line when the candidate is given up, and one when the folder cannot be written. Raises ApplianceError
-    where the candidate or the folder cannot be used.
+    judge: makes a bundle's classifier by the settings. Raises ApplianceError where the candidate or the folder cannot be used.
     """
 
     def __init__(
-        self, candidate: Bundle, current: Bundle, folder: Path, clock: Clock, *,
-        judge: Callable[[Bundle], Classifier], circumstances: Callable[[], Mapping[str, Any]], log: Callable[[str], None],
-    ) -> None:  # fmt: skip
+        self, candidate: Bundle, current: Bundle, folder: Path, clock: Clock, judge: Callable[[Bundle], Classifier]
+    ) -> None:
         if candidate.format != current.format:
             raise BundleError(
                 f"candidate {candidate.id} wants {candidate.format}, the bundle in service {current.format}: one skin "
                 "cannot serve both; commit to it without a shadow"
             )
-        self._clock, self._circumstances, self._log = clock, circumstances, log
-        self._failures_in_row, self._logged = 0, False
+        self._clock, self._failures_in_row = clock, 0
+        self._log = TroubleLog(f"shadow: {folder} cannot be written", "make room there; classifying goes on")
         self._waiting: list[tuple[Sweep, Verdict, Mapping[str, Any]]] = []
         self._settled_ns = self._due_ns = clock.now_ns() + PERIOD_NS
         try:
@@ -150,12 +148,11 @@ class Shadow:
             self.stopping()
             raise
 
-    def __call__(self, sweep: Sweep, verdict: Verdict) -> None:
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Let the candidate judge a sweep that has a window; one on which they differ is kept in a later turn."""
         if self._failures_in_row == FAILURES or not len(sweep.frames):
             return
-        about = self._circumstances()
-        self._classifier.tare = np.asarray(about["tare"], np.float64)
+        self._classifier.tare = np.asarray(circumstances["tare"], np.float64)
         begin_ns = self._clock.now_ns()
         self._due_ns = min(self._due_ns, begin_ns + PERIOD_NS)
         try:
@@ -173,23 +170,23 @@ class Shadow:
         elif not self.agreement.add(verdict, other, took_ns / 1e6):
             self._due_ns = begin_ns
             if self.agreement.kept + len(self._waiting) < KEPT:
-                self._waiting.append((sweep, verdict, {**about, "candidate": other.as_dict()}))
+                self._waiting.append((sweep, verdict, {**circumstances, "candidate": other.as_dict()}))
 
     def turn(self, health: Health) -> None:
         """At the end of a turn: write one thing that is due, while no sweep is open."""
         if health.sweeping:
             return
         if self._waiting:
-            self._try(self._keep)
+            self._log.attempt(self._keep)
         elif self._clock.now_ns() >= self._due_ns:
-            self._try(self._write)
+            self._log.attempt(self._write)
 
     def stopping(self) -> None:
         """The loop has ended in order: write what is left, and do not count this start."""
         self.agreement.starts = 0
         while self._waiting:
-            self._try(self._keep)
-        self._try(self._write)
+            self._log.attempt(self._keep)
+        self._log.attempt(self._write)
         self._sweeps.close()
 
     def _begin(self, candidate: str, current: str) -> Agreement:
@@ -197,7 +194,7 @@ class Shadow:
         try:
             found = read(self._sweeps.folder)
         except FormatError as e:
-            self._log(f"{WARNING}shadow: {e}")
+            log.warning(f"shadow: {e}")
             found = None
         if found is None or (found.candidate, found.current) != (candidate, current):
             for number in [*self._sweeps.numbers]:
@@ -223,8 +220,8 @@ class Shadow:
         self.agreement.failed += 1
         self._failures_in_row += 1
         if self._failures_in_row == FAILURES:
-            self._log(
-                f"{WARNING}shadow: candidate {self.agreement.candidate} is not asked any more, it failed {FAILURES} times "
+            log.warning(
+                f"shadow: candidate {self.agreement.candidate} is not asked any more, it failed {FAILURES} times "
                 f"in a row: {why}; classifying goes on"
             )
 
@@ -237,14 +234,3 @@ class Shadow:
         if self._clock.now_ns() >= self._settled_ns:
             self.agreement.starts = 0
         storage.put(self._sweeps.folder / FILE, self.agreement.json())
-
-    def _try(self, act: Callable[[], None]) -> None:
-        try:
-            act()
-        except OSError as e:
-            if not self._logged:
-                self._log(
-                    f"{WARNING}shadow: {self._sweeps.folder} cannot be written: {e.strerror}; make room there; "
-                    "classifying goes on"
-                )
-            self._logged = True

@@ -32,11 +32,11 @@ from appliance.core import storage
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, BundleError, ConfigError
+from appliance.core.log import log
 from appliance.deployment import signature
 from appliance.deployment.sandbox import run_limited
 from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
 from appliance.deployment.trial import Trial
-from appliance.service.journal import WARNING
 
 SHA = re.compile(r"[0-9a-f]{64}")
 INCOMPLETE = "."
@@ -203,7 +203,7 @@ class Store:
         """The current bundle, checked. This counts no start."""
         return self._committed(self.current).bundle
 
-    def choose(self, log: Callable[[str], None]) -> Choice:
+    def choose(self) -> Choice:
         """What this start runs, checked. A bundle on trial that was started MOST_STARTS times, or is refused, gives way
         to the bundle it goes back to."""
         sha = self.current
@@ -213,15 +213,15 @@ class Store:
             why = self._count(sha)
             if not why:
                 try:
-                    return self._on_trial(sha, log)
+                    return self._on_trial(sha)
                 except BundleError as e:
                     why = str(e)
             self._go_back(sha, why)
         except OSError as e:
-            log(f"{WARNING}{self.folder}: {e.strerror}, so no bundle can be on trial; what was committed runs for now")
+            log.warning(f"{self.folder}: {e.strerror}, so no bundle can be on trial; what was committed runs for now")
             return self._committed(self.state.of(sha).previous)
         chosen = self._committed(self.current)
-        log(f"{WARNING}bundle {sha[:8]} has failed its trial, and {chosen.bundle.id} runs again: {why}")
+        log.warning(f"bundle {sha[:8]} has failed its trial, and {chosen.bundle.id} runs again: {why}")
         return chosen
 
     def commit(self, sha: str | None = None, wait_s: float = LOCK_S) -> bool:
@@ -262,7 +262,7 @@ class Store:
         except BundleError as e:
             raise BundleError(f"{e} (this bundle is committed; `palpate rollback` goes back to the one before)") from e
 
-    def _on_trial(self, sha: str, log: Callable[[str], None]) -> Choice:
+    def _on_trial(self, sha: str) -> Choice:
         """A bundle on trial for this start, which was counted."""
         loaded = self.bundles.get(sha).bundle
         try:
@@ -270,8 +270,8 @@ class Store:
         except ConfigError as e:
             raise BundleError(f"it does not fit the settings: {e}") from e
         standing = self.state.of(sha)
-        log(f"bundle {sha[:8]} is on trial, start {standing.starts} of {MOST_STARTS}")
-        return Choice(loaded, self.bundles.at(sha), Trial(self, sha, standing, log))
+        log.info(f"bundle {sha[:8]} is on trial, start {standing.starts} of {MOST_STARTS}")
+        return Choice(loaded, self.bundles.at(sha), Trial(self, sha, standing))
 
     def _count(self, sha: str) -> str:
         """Count a start of `sha`; the reason where it must not be started again, else ""."""

@@ -7,12 +7,12 @@ nor when the program ends in order or for want of a device.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
 from appliance.core.errors import ApplianceError, BundleError
-from appliance.service.journal import WARNING
+from appliance.core.log import TroubleLog, log
+from appliance.core.observer import Observer
 
 if TYPE_CHECKING:
     from appliance.core.config import StoreConfig
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 RETRY_NS = 10_000_000_000
 """After a write that failed, the disk is left alone for so long."""
+ERRORS = (OSError, ApplianceError)
+"""What a write to the store may raise: from the disk, or because another command holds the store."""
 
 
 class TrialStore(Protocol):
@@ -38,19 +40,20 @@ class TrialStore(Protocol):
         """End the trial of `sha`; whether it was on trial."""
 
 
-class Trial:
-    """Observes one bundle's trial: health observer, sink for verdicts, and a context around both.
+class Trial(Observer):
+    """Observes one bundle's trial; also a context around the run.
 
     standing: with this start counted. Never raises for the disk: a failed write is logged once and tried again after
     RETRY_NS, and classifying goes on.
     """
 
-    def __init__(self, store: TrialStore, sha: str, standing: Standing, log: Callable[[str], None]) -> None:
-        self._store, self._sha, self._log = store, sha, log
+    def __init__(self, store: TrialStore, sha: str, standing: Standing) -> None:
+        self._store, self._sha = store, sha
         self._starts, self._counted = standing.starts, True
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
         self._last_ns: int | None = None  # the last turn's time, where frames came in it
-        self._next_ns, self._trouble, self._over = 0, "", False
+        self._next_ns, self._over = 0, False
+        self._log = TroubleLog(f"trial of bundle {sha[:8]}: ledger.json cannot be written", "it is tried again")
 
     @property
     def text(self) -> str:
@@ -63,7 +66,7 @@ class Trial:
             f"{self._streamed_ns / 1e9:.0f} of {settings.trial_s:.0f} s"
         )
 
-    def send(self, verdict: Verdict) -> None:
+    def answered(self, verdict: Verdict) -> None:
         """Count a sweep that the bundle gave a label."""
         self._sweeps += bool(verdict.label)
 
@@ -80,7 +83,7 @@ class Trial:
     def stopping(self) -> None:
         """The program ends in order: this start does not count."""
         if not self._over and self._counted:
-            self._try(lambda: self._note(False))
+            self._log.attempt(lambda: self._note(False), ERRORS)
 
     def __enter__(self) -> Trial:
         return self
@@ -94,8 +97,8 @@ class Trial:
         """Whether the store knows all it should. A commit waits until no sweep is open."""
         settings = self._store.settings
         if self._sweeps >= settings.trial_sweeps or self._streamed_ns >= settings.trial_s * 1e9:
-            return health.sweeping or self._try(self._commit)
-        return health.streams == self._counted or self._try(lambda: self._note(health.streams))
+            return health.sweeping or self._log.attempt(self._commit, ERRORS)
+        return health.streams == self._counted or self._log.attempt(lambda: self._note(health.streams), ERRORS)
 
     def _note(self, counts: bool) -> None:
         starts = self._starts - (not counts)
@@ -106,22 +109,7 @@ class Trial:
         done = self._store.commit(self._sha, 0.0)
         self._over = True
         if done:
-            self._log(f"bundle {self._sha[:8]} has stood its trial and is committed")
-
-    def _try(self, write: Callable[[], None]) -> bool:
-        """Whether it could be written; a reason is logged once, until a write succeeds or the reason changes."""
-        try:
-            write()
-        except (OSError, ApplianceError) as e:
-            trouble = str(getattr(e, "strerror", None) or e)
-            if trouble != self._trouble:
-                self._log(
-                    f"{WARNING}trial of bundle {self._sha[:8]}: ledger.json cannot be written: {trouble}; it is tried again"
-                )
-            self._trouble = trouble
-            return False
-        self._trouble = ""
-        return True
+            log.info(f"bundle {self._sha[:8]} has stood its trial and is committed")
 
 
 def _is_hardware_or_settings(error: BaseException | None) -> bool:

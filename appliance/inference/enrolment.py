@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,8 @@ from appliance.bundle.bundle import Bundle, Classes, Manifest
 from appliance.core import storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError, BundleError, FormatError
+from appliance.core.log import log
+from appliance.core.observer import Observer
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.novelty import Means
@@ -161,11 +163,11 @@ def _doubts(means: Means, label: str, z: NDArray[np.float64]) -> Iterator[str]:
         )
 
 
-class Taken:
-    """Takes the good sweeps of a running box: one of its keepers; `say` tells of each."""
+class Taken(Observer):
+    """Takes the good sweeps of a running box, and logs each."""
 
-    def __init__(self, wanted: int, say: Callable[[str], None]) -> None:
-        self._wanted, self._say = wanted, say
+    def __init__(self, wanted: int) -> None:
+        self._wanted = wanted
         self._windows: list[NDArray[Any]] = []
 
     @property
@@ -173,15 +175,15 @@ class Taken:
         """True once all that are wanted were taken."""
         return len(self._windows) >= self._wanted
 
-    def keep(self, sweep: Sweep, verdict: Verdict) -> None:
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Take the sweep's window where the box found nothing wrong with it."""
         if self.enough:
             return
         if verdict.status.classified or verdict.status is Status.UNKNOWN:
             self._windows.append(sweep.frames.taxels)
-            self._say(f"sweep {sweep.id} taken: {len(self._windows)} of {self._wanted}")
+            log.info(f"sweep {sweep.id} taken: {len(self._windows)} of {self._wanted}")
         else:
-            self._say(f"sweep {sweep.id} not taken: {verdict.status} {verdict.detail}".rstrip())
+            log.info(f"sweep {sweep.id} not taken: {verdict.status} {verdict.detail}".rstrip())
 
     def windows(self) -> NDArray[Any]:
         """The digits [n, T, R, C]. Raises ApplianceError where there are too few."""

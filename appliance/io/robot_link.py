@@ -39,20 +39,16 @@ PSEUDO_TERMINALS = range(136, 144)
 _UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 
 
-class ResultSink(Protocol):
-    """Receives verdicts."""
-
-    def send(self, verdict: Verdict) -> None:
-        """Output a verdict without waiting."""
-        ...
-
-
-class Port(ResultSink, Protocol):
+class Port(Protocol):
     """A line to the robot controller: verdicts and other sentences out, commands in. dropped: sentences that were not
     sent. trouble: why the line does not work, "" where it does."""
 
     dropped: int
     trouble: str
+
+    def send(self, verdict: Verdict) -> None:
+        """Send a verdict's sentence without waiting."""
+        ...
 
     def say(self, line: bytes) -> None:
         """Send a sentence without waiting."""

@@ -8,36 +8,15 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
+from appliance.core.types import Edge, EdgeKind
 from appliance.io.gpio_lines import check_binding, line_error, naming, request_lines
 
 if TYPE_CHECKING:
     from gpiod import EdgeEvent, LineRequest
 
     from appliance.core.config import TriggerConfig
-
-
-class EdgeKind(StrEnum):
-    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that what the robot signalled is unknown."""
-
-    START = "start"
-    STOP = "stop"
-    NEW_OBJECT = "new-object"
-    LOST = "lost"
-
-
-@dataclass(frozen=True, slots=True)
-class Edge:
-    """One debounced edge. t_ns: kernel time stamp, `CLOCK_MONOTONIC`, of the first edge of its burst.
-
-    LOST has the time of the edge at which the loss or the storm was detected. Edges reported before it are certain.
-    No edge follows it until every line has been quiet for `glitch_us`; the levels are then read again, without an edge.
-    """
-
-    kind: EdgeKind
-    t_ns: int
 
 
 class Trigger(Protocol):

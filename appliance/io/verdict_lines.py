@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from appliance.core.errors import ConfigError
+from appliance.core.observer import Observer
 from appliance.core.types import Status, Verdict
 from appliance.io.gpio_lines import Lines
 
 
-class LineSink:
+class LineSink(Observer):
     """Outputs the verdict as a code: 1 + the label's index in the manifest if the status is ok, otherwise 0."""
 
     def __init__(self, lines: Lines, labels: Sequence[str]) -> None:
@@ -20,7 +21,7 @@ class LineSink:
         self._lines = lines
         self._code = {label: i + 1 for i, label in enumerate(labels)}
 
-    def send(self, verdict: Verdict) -> None:
+    def answered(self, verdict: Verdict) -> None:
         """Output the code and raise RESULT VALID."""
         self._lines.result(self._code[verdict.label] if verdict.status is Status.OK else 0)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from enum import IntEnum
@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import IO
 
 from appliance.core.errors import ConfigError, FormatError, SensorError, SensorMismatch
+from appliance.core.log import TroubleLog
+from appliance.core.observer import Observer
 from appliance.core.schema import typed
-from appliance.core.types import Frames, SweepFormat
+from appliance.core.types import Edge, EdgeKind, Frames, SweepFormat
 from appliance.io.packets import Identity
 from appliance.io.robot_link import Command, command
-from appliance.io.trigger import Edge, EdgeKind
 from appliance.io.usb_sensor import SensorCounters, Stream
 
 MAGIC = b"PPLPCAP1"
@@ -40,16 +41,17 @@ class RecordKind(IntEnum):
     COMMAND = 3
 
 
-class CaptureWriter:
+class CaptureWriter(Observer):
     """Writes a capture as it happens; what a power failure cuts off is at most what the system had not written yet.
 
-    log: told once where the file cannot be written any more; the capture then ends, since one with a hole would lie,
-    and classifying goes on. Raises ConfigError where it cannot be opened.
+    Where the file cannot be written any more the capture ends, since one with a hole would lie; classifying goes on.
+    Raises ConfigError where it cannot be opened.
     """
 
-    def __init__(self, path: Path, fmt: SweepFormat, log: Callable[[str], None] = lambda line: None) -> None:
+    def __init__(self, path: Path, fmt: SweepFormat) -> None:
         head = json.dumps(asdict(fmt)).encode()
-        self._path, self._log, self._ended = path, log, False
+        self._ended = False
+        self._log = TroubleLog(f"capture: {path} cannot be written", "it ends here, classifying goes on")
         try:
             self._file: IO[bytes] = path.open("wb")
         except OSError as e:
@@ -64,7 +66,7 @@ class CaptureWriter:
         """Note the sensor's new state."""
         self._write(RecordKind.STATE, t_ns, state.encode())
 
-    def edges(self, t_ns: int, edges: list[Edge]) -> None:
+    def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
         """Note edges that the trigger gave out at `t_ns`."""
         self._write(RecordKind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
 
@@ -81,12 +83,7 @@ class CaptureWriter:
             self._put(lambda: self._file.write(_RECORD.pack(kind, t_ns, len(data)) + data))
 
     def _put(self, write: Callable[[], object]) -> None:
-        try:
-            write()
-        except OSError as e:
-            if not self._ended:
-                self._log(f"capture: {self._path} cannot be written: {e.strerror}; it ends here, classifying goes on")
-            self._ended = True
+        self._ended = not self._log.attempt(write) or self._ended
 
 
 class Playback:

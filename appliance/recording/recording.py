@@ -21,9 +21,10 @@ from appliance.bundle.manifest import LABEL
 from appliance.core import storage
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.log import TroubleLog, log
+from appliance.core.observer import Observer
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict, save
 from appliance.io.robot_link import sentence
-from appliance.service.journal import WARNING
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """What a disk says that has no room."""
@@ -114,26 +115,24 @@ class Labels:
                 )
 
 
-class RecordingSession:
-    """Keeper of a running box: writes each sweep that has a window, with the labels that held at its start edge.
+class RecordingSession(Observer):
+    """Writes each sweep that has a window, with the labels that held at its start edge.
 
-    circumstances: what stands in the sidecars beside sweep and verdict. say: takes REC sentences. log: told where
-    sweeps begin to be lost to the disk, and where they no longer are. Raises ConfigError where the folder cannot be used.
+    say: takes REC sentences. Raises ConfigError where the folder cannot be used.
     """
 
     def __init__(
-        self, folder: Path, fmt: SweepFormat, labels: Labels, clock: Clock, *,
-        circumstances: Callable[[], Mapping[str, Any]], say: Callable[[bytes], None], log: Callable[[str], None],
-    ) -> None:  # fmt: skip
+        self, folder: Path, fmt: SweepFormat, labels: Labels, clock: Clock, say: Callable[[bytes], None]
+    ) -> None:
         try:
             self._folder = SweepFolder(folder, fmt)
         except OSError as e:
             raise ConfigError(f"--out {folder}: {e.strerror}; name a folder that can be written") from e
-        self._clock, self._circumstances, self._say, self._log = clock, circumstances, say, log
+        self._clock, self._say = clock, say
         # (since when, what): a command that comes while a sweep is open is not of that sweep
         self._labels = deque([(0, labels)], MOST_CHANGES)
         self._stored: list[int] = []
-        self._outcome = "stored"
+        self._log = TroubleLog("record")
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
             "MATERIAL": partial(self._change, "material"), "POSITION": partial(self._change, "position"),
             "SESSION": partial(self._change, "session"), "NEXT": self._next, "DISCARD": self._discard,
@@ -144,14 +143,15 @@ class RecordingSession:
         """How many sweeps of this run are on the disk."""
         return len(self._stored)
 
-    def keep(self, sweep: Sweep, verdict: Verdict) -> None:
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and say what became of it."""
         labels = next((labels for since_ns, labels in reversed(self._labels) if since_ns <= sweep.start_ns), Labels())
         sweep = replace(sweep, material=labels.material, position=labels.position, session=labels.session)
-        outcome, detail = self._store(sweep, verdict) if len(sweep.frames) else ("skipped", f"{verdict.status}")
-        if outcome not in ("skipped", self._outcome):
-            self._outcome = outcome
-            self._log(_news(outcome, sweep.id, detail, self._folder.folder))
+        outcome, detail = "skipped", f"{verdict.status}"
+        if len(sweep.frames):
+            outcome, detail = self._store(sweep, verdict, circumstances)
+            trouble = "" if outcome == "stored" else outcome
+            self._log.update(trouble, _news(outcome, sweep.id, detail, self._folder.folder))
         self._say(
             sentence("REC", sweep.id, outcome, self.stored, labels.material, labels.position, labels.session, detail)
         )
@@ -159,9 +159,9 @@ class RecordingSession:
     def close(self) -> None:
         """Give the folder back, and say what is in it."""
         self._folder.close()
-        self._log(f"record: sweeps of this run in {self._folder.folder}: {self.stored}")
+        log.info(f"record: sweeps of this run in {self._folder.folder}: {self.stored}")
 
-    def _store(self, sweep: Sweep, verdict: Verdict) -> tuple[str, str]:
+    def _store(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> tuple[str, str]:
         """What became of the sweep, and what a person should know about that."""
         try:
             room = os.statvfs(self._folder.folder)
@@ -169,7 +169,7 @@ class RecordingSession:
             if room.f_bavail < least:
                 left, wanted = (n * room.f_frsize / 1e6 for n in (room.f_bavail, least))
                 return "full", f"{left:.1f} MB left of {wanted:.1f} for the system"
-            number = self._folder.put(sweep, verdict, self._circumstances())
+            number = self._folder.put(sweep, verdict, circumstances)
         except OSError as e:
             return "full" if e.errno in FULL else "failed", str(e.strerror)
         self._stored.append(number)
@@ -207,4 +207,4 @@ def _news(outcome: str, sweep: int, detail: str, folder: Path) -> str:
     if outcome == "stored":
         return f"record: sweeps are stored again, from sweep {sweep} on"
     advice = f"make room in {folder}" if outcome == "full" else f"see that {folder} may be written"
-    return f"{WARNING}record: sweep {sweep} is not stored: {detail}; {advice}; classifying goes on"
+    return f"record: sweep {sweep} is not stored: {detail}; {advice}; classifying goes on"

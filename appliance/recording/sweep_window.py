@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.config import SweepConfig
-from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat
-from appliance.io.trigger import Edge, EdgeKind
+from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
 
 MAX_GAP = 2
 """Missing frames in a row that are interpolated; more make the status `gap`."""

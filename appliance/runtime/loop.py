@@ -1,12 +1,12 @@
-"""The box itself: one thread, one loop. In: sensor, trigger, recorder, classifier, sinks. Out: answers to all triggers.
+"""The loop of the box: one thread. In: frames, edges, commands. Out: a verdict for every trigger, states, answers.
 
-Which parts these are is decided elsewhere (`__main__`); nothing here knows whether they are real.
+Which devices these come from is decided elsewhere (assembly); nothing here knows whether they are real.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -15,71 +15,72 @@ from numpy.typing import NDArray
 
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError
-from appliance.core.health import Health, HealthObserver
+from appliance.core.health import Health
+from appliance.core.log import TroubleLog
+from appliance.core.observer import Observer
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
-from appliance.io.robot_link import Command, Port, ResultSink, sentence
-from appliance.io.trigger import Edge, Trigger
+from appliance.io.robot_link import Command, Port, sentence
+from appliance.io.trigger import Trigger
 from appliance.io.usb_sensor import Sensor, SensorCounters
 from appliance.recording.sweep_window import SweepCutter
-from appliance.service.journal import WARNING
 
 TARE_S = 0.5
 """How much of the latest signal a tare averages."""
 
+CommandHandler = Callable[[str], list[object]]
+"""Carries out a command: its text -> the fields of its answer. What it raises as ApplianceError is the answer."""
+
 
 class Panel(Protocol):
-    """The lines that tell the robot how the box is."""
+    """The lines that show the robot the state of the box."""
 
     def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
         """Drive READY, BUSY, FAULT and DECIDED."""
         ...
 
 
-class InputObserver(Protocol):
-    """Takes note of what comes in beside frames, for captures."""
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """What a sweep passes on its way to a verdict. early: answers sweeps that still go on, or None."""
 
-    def edges(self, t_ns: int, edges: list[Edge]) -> None:
-        """Edges have settled."""
-        ...
-
-    def command(self, t_ns: int, name: str) -> None:
-        """A command is about to be carried out."""
-        ...
-
-
-SweepObserver = Callable[[Sweep, Verdict], None]
-"""Takes a sweep with its verdict, after all answers of the turn are out. Must not raise: a full disk costs the record,
-never the classifying."""
+    sensor: Sensor
+    trigger: Trigger
+    cutter: SweepCutter
+    classifier: Classifier
+    early: Decider | None = None
 
 
 class Box:
     """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer, listen.
 
-    early: answers sweeps that still go on, or None. panel: READY, BUSY, FAULT, DECIDED, or None.
-    port: where commands come from and state sentences go, or None.
-    tap: takes note of edges and commands, for captures. keepers: given each sweep with its verdict, for recordings.
-    pulses: told at the end of each turn. obey: further commands, from their text to the fields of their answer; what
-    they raise as ApplianceError is the answer.
+    port: where verdicts and state sentences go and commands come from, or None. panel: READY, BUSY, FAULT, DECIDED, or
+    None. observers: called in this order, after the port. commands: further commands by name. source: where the frames
+    come from, as sentences name it. state_s: time between two state sentences.
     """
 
     def __init__(
-        self, sensor: Sensor, trigger: Trigger, recorder: SweepCutter, classifier: Classifier, clock: Clock, *,
-        early: Decider | None = None,
-        sinks: Sequence[ResultSink] = (), port: Port | None = None, panel: Panel | None = None,
-        state_s: float = 1.0, source: str = "usb", log: Callable[[str], None] = lambda line: None,
-        tap: InputObserver | None = None, keepers: Sequence[SweepObserver] = (), pulses: Sequence[HealthObserver] = (),
-        obey: Mapping[str, Callable[[str], list[object]]] = MappingProxyType({}),
+        self, pipeline: Pipeline, clock: Clock, *, port: Port | None = None, panel: Panel | None = None,
+        observers: Sequence[Observer] = (), commands: Mapping[str, CommandHandler] = MappingProxyType({}),
+        source: str = "usb", state_s: float = 1.0,
     ) -> None:  # fmt: skip
         self.answered = 0
-        self._sensor, self._trigger, self._recorder, self._classifier = sensor, trigger, recorder, classifier
-        self._early, self._clock, self._sinks, self._port, self._panel = early, clock, sinks, port, panel
+        self._sensor, self._trigger, self._cutter = pipeline.sensor, pipeline.trigger, pipeline.cutter
+        self._classifier, self._early = pipeline.classifier, pipeline.early
+        self._clock, self._port, self._panel, self._commands = clock, port, panel, commands
+        self._source, self._state_ns = source, round(state_s * 1e9)
+        # only what an observer overrides is called, so nothing is computed that nobody wants
+        self._on_edges = [o.edges for o in observers if type(o).edges is not Observer.edges]
+        self._on_command = [o.command for o in observers if type(o).command is not Observer.command]
+        self._on_answered = [o.answered for o in observers if type(o).answered is not Observer.answered]
+        self._on_sweep = [o.sweep for o in observers if type(o).sweep is not Observer.sweep]
+        self._on_turn = [o.turn for o in observers if type(o).turn is not Observer.turn]
+        self._on_stopping = [o.stopping for o in observers if type(o).stopping is not Observer.stopping]
         self._decided = False
-        self._state_ns, self._source, self._log = round(state_s * 1e9), source, log
-        self._tap, self._keepers, self._pulses, self._more = tap, keepers, pulses, obey
         self._next_state_ns = clock.now_ns()
-        self._troubles: dict[str, str] = {}
+        self._skin_log = TroubleLog("skin", end="skin: streaming", known=False)
+        self._port_log = TroubleLog("serial", end="serial: open", known=False)
 
     @property
     def counters(self) -> SensorCounters:
@@ -88,43 +89,44 @@ class Box:
 
     @property
     def format(self) -> SweepFormat:
-        """The form of the sweeps that it takes."""
+        """The format of the sweeps that it takes."""
         return self._classifier.bundle.format
 
     def newest_frame(self) -> NDArray[Any] | None:
-        """The newest frame [R, C] of digits, None before the first."""
-        frames = self._recorder.latest(1)
+        """The newest frame [R, C] of raw counts, None before the first."""
+        frames = self._cutter.latest(1)
         return None if frames is None else frames[0]
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Take turns until `stopped()`; what is open then is answered `aborted`."""
         while not stopped():
             self.step()
-        for pulse in self._pulses:
-            pulse.stopping()
-        self._recorder.interrupt(Status.ABORTED, self._clock.now_ns())
-        self._answer(self._recorder.finished(self._clock.now_ns()))
+        for stopping in self._on_stopping:
+            stopping()
+        self._cutter.interrupt(Status.ABORTED, self._clock.now_ns())
+        self._answer(self._cutter.finished(self._clock.now_ns()))
 
     def step(self) -> list[Verdict]:
         """One turn; takes at most the sensor's timeout. The verdicts that were sent."""
         frames = self._sensor.read()
         now = self._clock.now_ns()
-        self._recorder.put(frames, now)
+        self._cutter.put(frames, now)
         # before the edges of this turn: a capture gives frames and edges in turns of their own
         verdicts = self._decide(now)
         edges = self._trigger.edges(now)
-        if self._tap and edges:
-            self._tap.edges(now, edges)
-        self._recorder.trigger(edges, self._able, now)
+        if edges:
+            for note in self._on_edges:
+                note(now, edges)
+        self._cutter.trigger(edges, self._able, now)
         if self._sensor.state != "streaming":
-            self._recorder.interrupt(Status.SENSOR_LOST, now)
+            self._cutter.interrupt(Status.SENSOR_LOST, now)
         self._show()
-        verdicts += self._answer(self._recorder.finished(now))
+        verdicts += self._answer(self._cutter.finished(now))
         self._report(now)
-        if self._pulses:
+        if self._on_turn:
             health = self.health
-            for pulse in self._pulses:
-                pulse.turn(health)
+            for turn in self._on_turn:
+                turn(health)
         return verdicts
 
     @property
@@ -133,7 +135,7 @@ class Box:
         return self._sensor.state == "streaming" and not self._trigger.blind
 
     def _show(self) -> None:
-        sweeping, able = self._recorder.sweeping, self._able
+        sweeping, able = self._cutter.sweeping, self._able
         self._decided = self._decided and not sweeping
         if self._panel:
             self._panel.show(ready=able and not sweeping, busy=sweeping, fault=not able, decided=self._decided)
@@ -142,13 +144,13 @@ class Box:
         """Answer the open sweep early, where that is wanted and possible."""
         if not self._early:
             return []
-        for sweep in self._recorder.so_far(self._early.steps, now_ns):
+        for sweep in self._cutter.so_far(self._early.steps, now_ns):
             if verdict := self._early(sweep):
-                self._recorder.settle()
+                self._cutter.settle()
                 self._send(verdict)
                 self._decided = True
                 self._show()
-                self._keep(sweep, verdict)
+                self._pass_on([sweep], [verdict])
                 return [verdict]
         return []
 
@@ -156,55 +158,57 @@ class Box:
         verdicts = [self._classifier(sweep) for sweep in sweeps]
         for verdict in verdicts:
             self._send(verdict)
-        for sweep, verdict in zip(sweeps, verdicts, strict=True):  # a disk takes its time, so after all answers
-            self._keep(sweep, verdict)
+        self._pass_on(sweeps, verdicts)
         return verdicts
 
-    def _keep(self, sweep: Sweep, verdict: Verdict) -> None:
-        for keep in self._keepers:
-            keep(sweep, verdict)
+    def _pass_on(self, sweeps: Sequence[Sweep], verdicts: Sequence[Verdict]) -> None:
+        """Give answered sweeps to whoever keeps them: a disk takes its time, so after all answers."""
+        if not (sweeps and self._on_sweep):
+            return
+        circumstances = self.circumstances()
+        for sweep, verdict in zip(sweeps, verdicts, strict=True):
+            for keep in self._on_sweep:
+                keep(sweep, verdict, circumstances)
 
     def _send(self, verdict: Verdict) -> None:
-        for sink in self._sinks:
-            sink.send(verdict)
+        if self._port:
+            self._port.send(verdict)
+        for answered in self._on_answered:
+            answered(verdict)
         self.answered += 1
 
     def _report(self, now_ns: int) -> None:
-        """Log what has changed, answer commands, say the state once in a while."""
-        self._note("skin", str(self._sensor.trouble or ""), "streaming")
+        """Log what has changed, answer commands, send the state once in a while."""
+        self._skin_log.update(str(self._sensor.trouble or ""))
         if not self._port:
             return
         for command in self._port.commands():
-            if self._tap and not command.error:
-                self._tap.command(now_ns, command.line)
-            self._port.say(self._obey(command))
-        self._note("serial", self._port.trouble, "open")
+            if not command.error:
+                for note in self._on_command:
+                    note(now_ns, command.line)
+            self._port.say(self._answer_to(command))
+        self._port_log.update(self._port.trouble)
         if now_ns >= self._next_state_ns:
             self._next_state_ns = now_ns + self._state_ns
             self._port.say(sentence("STA", *self._state()))
 
-    def _note(self, what: str, trouble: str, fine: str) -> None:
-        if self._troubles.get(what) != trouble:
-            self._troubles[what] = trouble
-            self._log(f"{WARNING if trouble else ''}{what}: {trouble or fine}")
-
     @property
     def health(self) -> Health:
-        """How it is now."""
+        """The state now."""
         sensor, counters = self._sensor, self._sensor.counters
         return Health(
             time_ns=self._clock.now_ns(), skin=sensor.state, trouble=str(sensor.trouble or ""),
-            streams=sensor.state == "streaming" and counters.frames > 0, sweeping=self._recorder.sweeping,
+            streams=sensor.state == "streaming" and counters.frames > 0, sweeping=self._cutter.sweeping,
             answered=self.answered, frames=counters.frames, lost_frames=counters.lost_frames,
             garbage_bytes=counters.garbage_bytes, enumerations=counters.enumerations,
             dropped=self._port.dropped if self._port else 0, bundle=self._classifier.bundle.id, source=self._source,
         )  # fmt: skip
 
     def circumstances(self) -> dict[str, Any]:
-        """What a recorded sweep should tell beside its frames, as it is now: for JSON.
+        """What belongs into the sidecar of a recorded sweep beside its frames, as it is now: for JSON.
 
         device: the board's name, serial number and firmware, None before it was asked. clock: see DeviceClock.quality.
-        tare: [R, C] digits.
+        tare: [R, C] raw counts.
         """
         who = self._sensor.identity
         return {
@@ -224,7 +228,7 @@ class Box:
             h.enumerations, h.dropped, h.bundle, h.source,
         ]  # fmt: skip
 
-    def _obey(self, command: Command) -> bytes:
+    def _answer_to(self, command: Command) -> bytes:
         """Carry out a command; its ANS sentence."""
         if command.error:
             return sentence("ANS", command.name, "error", command.error)
@@ -234,11 +238,11 @@ class Box:
             return sentence("ANS", command.name, "error", e)
 
     def _carried_out(self, command: Command) -> list[object]:
-        if command.name in self._more:
-            return self._more[command.name](command.text)
-        if command.name not in _OBEY:
+        if command.name in self._commands:
+            return self._commands[command.name](command.text)
+        if command.name not in _COMMANDS:
             raise ApplianceError("nothing is recorded now; use palpate record")
-        return _OBEY[command.name](self)
+        return _COMMANDS[command.name](self)
 
     def _identity(self) -> list[object]:
         m, who = self._classifier.bundle.manifest, self._sensor.identity
@@ -250,23 +254,23 @@ class Box:
 
     def _tare(self) -> list[object]:
         """Take the mean of the latest signal as the unloaded skin."""
-        frames = self._recorder.latest(max(1, round(TARE_S * self._classifier.bundle.format.rate_hz)))
-        if frames is None or self._recorder.sweeping or self._sensor.state != "streaming":
+        frames = self._cutter.latest(max(1, round(TARE_S * self._classifier.bundle.format.rate_hz)))
+        if frames is None or self._cutter.sweeping or self._sensor.state != "streaming":
             raise ApplianceError(f"tare needs {TARE_S} s of signal without loss and outside a sweep; try again")
         self._classifier.tare = frames.mean(axis=0, dtype=np.float64)
         return [f"largest {self._classifier.tare.max():.1f} digits"]
 
     def _new_object(self) -> list[object]:
-        self._recorder.new_object()
+        self._cutter.new_object()
         return []
 
     def _abort(self) -> list[object]:
-        if not self._recorder.interrupt(Status.ABORTED, self._clock.now_ns()):
+        if not self._cutter.interrupt(Status.ABORTED, self._clock.now_ns()):
             raise ApplianceError("no sweep is open, so there is nothing to abort")
         return []
 
 
-_OBEY: dict[str, Callable[[Box], list[object]]] = {
+_COMMANDS: dict[str, Callable[[Box], list[object]]] = {
     "ID": Box._identity,
     "STATE": Box._state,
     "TEST": Box._self_test,

@@ -26,7 +26,7 @@ from appliance.io.robot_link import StdoutPort, result
 from appliance.recording.capture import Playback
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime import assembly
-from appliance.runtime.loop import Box
+from appliance.runtime.loop import Box, Pipeline
 
 SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
 """Bit for bit; so are the scores of this sweep, but not all earlier ones of its object are there; it is not."""
@@ -239,6 +239,6 @@ def _capture(path: Path, settings: Config, model: Bundle) -> None:
     _check(str(path), play.format, model)
     classifier = assembly.classifier(settings, model, play)
     port = StdoutPort("replay", play.commands)
-    recorder, early = SweepCutter(model.format, settings.sweep), assembly.early(settings, classifier)
-    box = Box(play, play, recorder, classifier, play, early=early, sinks=[port], port=port, source="replay")
-    box.run(lambda: play.finished)
+    cutter = SweepCutter(model.format, settings.sweep)
+    pipeline = Pipeline(play, play, cutter, classifier, assembly.early_exit(settings, classifier))
+    Box(pipeline, play, port=port, source="replay").run(lambda: play.finished)

@@ -1,6 +1,6 @@
 """The self-test behind `palpate check`: bundle, golden sweeps, lines, skin, port, each by itself.
 
-In: the configuration and a way to the devices. Out: one line for each part, with its trouble where it has one.
+In: the settings and the devices. Out: one result for each component, with its trouble where it has one.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from appliance.io.trigger import GpioTrigger
 from appliance.io.usb_sensor import UsbSensor
 
 LISTEN_S = 1.0
-"""How long the skin is listened to."""
+"""How long frames of the skin are counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """What became of one part: ok with a detail, or not ok with what to do."""
+    """The result for one component: ok with a detail, or not ok with what to do."""
 
-    part: str
+    component: str
     ok: bool
     detail: str
 
 
-def check(settings: Config, load: Callable[[], Bundle], world: Devices) -> Iterator[CheckResult]:
-    """Look at one part after another; a part that fails does not keep the others from being looked at."""
+def check(settings: Config, load: Callable[[], Bundle], devices: Devices) -> Iterator[CheckResult]:
+    """Check one component after another; the check goes on after one that fails."""
     loaded: list[Bundle] = []
 
     def bundle() -> str:
@@ -43,7 +43,7 @@ def check(settings: Config, load: Callable[[], Bundle], world: Devices) -> Itera
         return f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}"
 
     def golden() -> str:
-        classifier = Classifier(loaded[0], world.clock)
+        classifier = Classifier(loaded[0], devices.clock)
         worst = classifier.self_test()
         if settings.classifier.early:
             Decider(classifier)
@@ -52,27 +52,27 @@ def check(settings: Config, load: Callable[[], Bundle], world: Devices) -> Itera
     yield _try("bundle", bundle)
     if loaded:
         yield _try("golden sweeps", golden)
-        yield _try("skin", lambda: _skin(settings, loaded[0], world))
+        yield _try("skin", lambda: _skin(settings, loaded[0], devices))
     if settings.trigger.start:
-        yield _try("gpio lines", lambda: _lines(settings, world))
+        yield _try("gpio lines", lambda: _lines(settings, devices))
     else:
         yield CheckResult("gpio lines", False, "trigger.start names no line; choose a board with --board")
     if settings.serial.port:
-        yield _try("serial port", lambda: _port(settings, world))
+        yield _try("serial port", lambda: _port(settings, devices))
 
 
-def _try(part: str, look: Callable[[], str]) -> CheckResult:
+def _try(component: str, look: Callable[[], str]) -> CheckResult:
     try:
-        return CheckResult(part, True, look())
+        return CheckResult(component, True, look())
     except ApplianceError as e:
-        return CheckResult(part, False, str(e))
+        return CheckResult(component, False, str(e))
 
 
-def _skin(settings: Config, bundle: Bundle, world: Devices) -> str:
-    sensor = UsbSensor(settings.sensor, bundle.format, world.clock, world.backend)
-    until_ns = world.clock.now_ns() + round(LISTEN_S * 1e9)
+def _skin(settings: Config, bundle: Bundle, devices: Devices) -> str:
+    sensor = UsbSensor(settings.sensor, bundle.format, devices.clock, devices.backend)
+    until_ns = devices.clock.now_ns() + round(LISTEN_S * 1e9)
     try:
-        while world.clock.now_ns() < until_ns:
+        while devices.clock.now_ns() < until_ns:
             sensor.read()
         if sensor.trouble or not sensor.counters.frames:
             raise sensor.trouble or SensorError(f"the skin sent no frame within {LISTEN_S} s; replug it")
@@ -84,15 +84,15 @@ def _skin(settings: Config, bundle: Bundle, world: Devices) -> str:
         sensor.close()
 
 
-def _lines(settings: Config, world: Devices) -> str:
-    with GpioTrigger(settings.trigger, world.gpio), Lines(settings.output, world.gpio, world.clock) as lines:
+def _lines(settings: Config, devices: Devices) -> str:
+    with GpioTrigger(settings.trigger, devices.gpio), Lines(settings.output, devices.gpio, devices.clock) as lines:
         codes = lines.capacity
     inputs = [n for n in (settings.trigger.start, settings.trigger.stop, settings.trigger.new_object) if n]
     return f"inputs {' '.join(inputs)}, outputs for {codes} codes"
 
 
-def _port(settings: Config, world: Devices) -> str:
-    port = SerialSink(settings.serial, world.clock, world.source)
+def _port(settings: Config, devices: Devices) -> str:
+    port = SerialSink(settings.serial, devices.clock, devices.source)
     port.commands()
     trouble = port.trouble
     port.close()

@@ -1,7 +1,6 @@
-"""The room of `palpate status`. In: how the box is each turn, and its verdicts. Out: these as one small JSON file, and the
-file in words.
+"""What `palpate status` shows. In: health each turn, verdicts. Out: both as one small JSON file, and this file in words.
 
-The file lies in memory (/run): it is written aside and renamed, so a reader has it whole, and never synced.
+The file lies in memory (/run): it is written aside and renamed, so that a reader gets it whole, and never synced.
 """
 
 from __future__ import annotations
@@ -19,98 +18,88 @@ from appliance.core import storage
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.health import Health
+from appliance.core.log import TroubleLog
+from appliance.core.observer import Observer
 from appliance.core.types import Status, Verdict
-from appliance.service.journal import REASONS, WARNING
+from appliance.service.systemd import REASONS
 
 SCHEMA = 1
 VERDICTS = 20
-"""How many of the latest verdicts are told."""
+"""How many of the latest verdicts the file holds."""
 PERIOD_NS = 1_000_000_000
 SOON_NS = 100_000_000
-"""A verdict, or another state of the skin, is told so soon after what was told before it."""
+"""A verdict, or another state of the skin, is written so soon after what was written before it."""
 STALE_NS = 10_000_000_000
-"""A file that has not changed for so long is of a program that hangs: it is the unit's watchdog time."""
+"""A file that has not changed for so long belongs to a program that hangs: it is the unit's watchdog time."""
 MOST_BYTES = 1 << 20
-_START = "systemctl start palpate, then journalctl -u palpate tells more"
+_START = "systemctl start palpate, then see journalctl -u palpate"
 WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
 
 
-class StatusFile:
-    """Tells how the box is and what it has answered; gone when the program has ended in order.
+class StatusFile(Observer):
+    """Writes the state of the box and its latest answers; removed when the program has ended in order.
 
     clock: the host's real one, which a reader in another process shares. more: further facts for JSON; a text among them
-    is a line of its own in words, unless it is empty. log: told once where the file cannot be written; it is tried again.
+    is a line of its own in words, unless it is empty.
     """
 
-    def __init__(
-        self, path: Path, clock: Clock, *, more: Callable[[], Mapping[str, Any]] = dict,
-        log: Callable[[str], None] = lambda line: None,
-    ) -> None:  # fmt: skip
-        self._path, self._clock, self._more, self._log = path, clock, more, log
+    def __init__(self, path: Path, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
+        self._path, self._clock, self._more = path, clock, more
         self._since_ns = self._next_ns = clock.now_ns()
         self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
-        self._fresh, self._skin, self._failed = False, "", False
+        self._fresh, self._skin = False, ""
+        self._log = TroubleLog(f"status: {path} cannot be written", "classifying goes on")
 
-    def send(self, verdict: Verdict) -> None:
-        """Have a verdict told with the end of the turn."""
+    def answered(self, verdict: Verdict) -> None:
+        """Have a verdict written at the end of the turn."""
         self._verdicts.append(verdict.as_dict(arrays=False))
         self._fresh = True
 
     def turn(self, health: Health) -> None:
-        """A turn is over: write what is due, once a second, and what is new soon."""
+        """Write once a second, and soon after a verdict or another state of the skin."""
         now_ns = self._clock.now_ns()
         if health.skin != self._skin:
             self._skin, self._fresh = health.skin, True
         if now_ns < self._next_ns - (PERIOD_NS - SOON_NS if self._fresh else 0):
             return
         self._next_ns, self._fresh = now_ns + PERIOD_NS, False
-        told = {
+        report = {
             **self._more(), **asdict(health), "time_ns": now_ns, "since_ns": self._since_ns, "pid": os.getpid(),
             "version": __version__, "schema": SCHEMA, "verdicts": list(self._verdicts),
         }  # fmt: skip
         # every user of the box may ask; the file lies in memory (/run), and on a card one sync a second would wear it
-        self._try(lambda: storage.put(self._path, json.dumps(told).encode(), durable=False, mode=0o644))
+        self._log.attempt(lambda: storage.put(self._path, json.dumps(report).encode(), durable=False, mode=0o644))
 
     def stopping(self) -> None:
-        """The loop has ended: what the file tells is no longer so."""
-        self._try(lambda: self._path.unlink(missing_ok=True))
-
-    def _try(self, act: Callable[[], object]) -> None:
-        try:
-            act()
-        except OSError as e:
-            if not self._failed:
-                self._log(f"{WARNING}status: {self._path} cannot be written: {e.strerror}; classifying goes on")
-            self._failed = True
-        else:
-            self._failed = False
+        """Remove the file: what it says no longer holds."""
+        self._log.attempt(lambda: self._path.unlink(missing_ok=True))
 
 
 def read(path: Path, now_ns: int) -> dict[str, Any]:
-    """What the file tells, with `running`, and `why` where it does not run. now_ns: of the clock that writes it.
+    """The content of the file, with `running`, and `why` where the service does not run. now_ns: of the clock that writes it.
 
-    Raises FormatError where the file is none of this version's, ApplianceError where it may not be read.
+    Raises FormatError where the file is not one of this version, ApplianceError where it may not be read.
     """
     try:
         with path.open("rb") as f:
-            told = json.loads(f.read(MOST_BYTES))
-        if not isinstance(told, dict) or told.get("schema") != SCHEMA:
+            report = json.loads(f.read(MOST_BYTES))
+        if not isinstance(report, dict) or report.get("schema") != SCHEMA:
             raise TypeError(f"no object of schema {SCHEMA}")
-        pid, age_ns = int(told["pid"]), now_ns - int(told["time_ns"])
-        told["verdicts"] = [v | {"status": Status(v["status"])} for v in told["verdicts"]]
-        Health(**{name: told[name] for name in Health.__slots__})
+        pid, age_ns = int(report["pid"]), now_ns - int(report["time_ns"])
+        report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
+        Health(**{name: report[name] for name in Health.__slots__})
     except FileNotFoundError:
-        return {"running": False, "why": f"it does not run, or has begun just now (no {path}); {_START}"}
+        return {"running": False, "why": f"the service does not run, or has just started (no {path}); {_START}"}
     except OSError as e:
         raise ApplianceError(f"{path} cannot be read: {e.strerror}; see store.status, or ask as root") from e
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
         raise FormatError(f"{path}: not a status of this version ({e}); restart the service") from e
     why = ""
     if not _alive(pid) or age_ns < 0:  # a file of before the last boot can be ahead of this boot's clock
-        why = f"process {pid} has ended without a word; {_START}"
+        why = f"process {pid} has ended without closing down; {_START}"
     elif age_ns > STALE_NS:
-        why = f"process {pid} has told nothing for {_span(age_ns)}, it hangs; the service's watchdog starts it again"
-    return told | {"running": not why, "why": why}
+        why = f"process {pid} has written nothing for {_span(age_ns)}, so it hangs; the service's watchdog restarts it"
+    return report | {"running": not why, "why": why}
 
 
 def _alive(pid: int) -> bool:
@@ -123,36 +112,36 @@ def _alive(pid: int) -> bool:
     return pid > 0
 
 
-def exit_code(told: Mapping[str, Any]) -> int:
+def exit_code(report: Mapping[str, Any]) -> int:
     """0 where all is well; 69 where the skin is away, 1 where it does not run."""
-    if not told["running"]:
+    if not report["running"]:
         return NOT_RUNNING
-    return WELL if told["streams"] else SKIN_AWAY
+    return WELL if report["streams"] else SKIN_AWAY
 
 
-def lines(told: Mapping[str, Any], now_ns: int) -> list[str]:
-    """What `read` gave, in words: first how it is and what to do, then the last verdicts, the newest first."""
-    if not told["running"]:
-        return [f"not running: {told['why']}"]
-    head = f"process {told['pid']}, palpate {told['version']}, source {told['source']}"
-    said = [f"running for {_span(now_ns - told['since_ns'])} ({head})"]
-    facts = {"skin": _skin(told), "bundle": told["bundle"], "sweeps": f"{told['answered']} answered"}
-    if told["dropped"]:
-        facts["serial"] = f"{told['dropped']} sentences dropped, since nobody read them; look at the robot's end"
-    own = {"version", "why", *Health.__slots__}
-    facts |= {name: text for name, text in told.items() if name not in own and isinstance(text, str) and text}
-    said += [f"{name:<8} {text}" for name, text in facts.items()]
-    said += [_line(v, now_ns) for v in reversed(told["verdicts"])]
-    return ["".join(c if c.isprintable() else "?" for c in line) for line in said]
+def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
+    """What `read` gave, in words: first the state and what to do, then the last verdicts, the newest first."""
+    if not report["running"]:
+        return [f"not running: {report['why']}"]
+    head = f"process {report['pid']}, palpate {report['version']}, source {report['source']}"
+    rows = [f"running for {_span(now_ns - report['since_ns'])} ({head})"]
+    facts = {"skin": _skin(report), "bundle": report["bundle"], "sweeps": f"{report['answered']} answered"}
+    if report["dropped"]:
+        facts["serial"] = f"{report['dropped']} sentences dropped, since nobody read them; check the robot's end"
+    shown = {"version", "why", *Health.__slots__}
+    facts |= {name: text for name, text in report.items() if name not in shown and isinstance(text, str) and text}
+    rows += [f"{name:<8} {text}" for name, text in facts.items()]
+    rows += [_line(v, now_ns) for v in reversed(report["verdicts"])]
+    return ["".join(c if c.isprintable() else "?" for c in line) for line in rows]
 
 
-def _skin(told: Mapping[str, Any]) -> str:
-    counted = f"{told['frames']:,} frames, {told['lost_frames']:,} lost"
-    if told["garbage_bytes"]:
-        counted += f", {told['garbage_bytes']:,} bytes in no packet"
-    if told["enumerations"] > 1:
-        counted += f", plugged in {told['enumerations']} times"
-    return f"{told['skin']}{': ' if told['trouble'] else ''}{told['trouble']} ({counted})"
+def _skin(report: Mapping[str, Any]) -> str:
+    counted = f"{report['frames']:,} frames, {report['lost_frames']:,} lost"
+    if report["garbage_bytes"]:
+        counted += f", {report['garbage_bytes']:,} bytes in no packet"
+    if report["enumerations"] > 1:
+        counted += f", plugged in {report['enumerations']} times"
+    return f"{report['skin']}{': ' if report['trouble'] else ''}{report['trouble']} ({counted})"
 
 
 def _line(v: Mapping[str, Any], now_ns: int) -> str:

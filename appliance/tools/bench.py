@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
@@ -27,6 +27,7 @@ import onnxruntime as ort
 from appliance.bundle.bundle import Bundle
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.errors import BundleError
+from appliance.core.observer import Observer
 from appliance.core.provenance import commit
 from appliance.core.statistics import wilson
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
@@ -82,8 +83,8 @@ def _percentiles(values: list[float]) -> dict[str, float]:
     return {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)} | {"n": len(values)}
 
 
-class _Watch:
-    """A sink after the serial port: when it gets a verdict, the sentence has been written to the port."""
+class _Watch(Observer):
+    """Measures how late answers are: when it gets a verdict, the sentence has been written to the serial port."""
 
     def __init__(self, clock: Clock) -> None:
         self.verdicts: list[Verdict] = []
@@ -91,12 +92,12 @@ class _Watch:
         self.seen_ms: list[float] = []
         self._clock = clock
 
-    def send(self, verdict: Verdict) -> None:
+    def answered(self, verdict: Verdict) -> None:
         in_hand_ns = verdict.time_ns - verdict.latency_ns
         self.verdicts.append(verdict)
         self.answered_ms.append((self._clock.now_ns() - in_hand_ns) / 1e6)
 
-    def keep(self, sweep: Sweep, verdict: Verdict) -> None:
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         self.seen_ms.append((sweep.complete_ns - sweep.stop_ns) / 1e6)
 
 
@@ -111,7 +112,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     watch = _Watch(clock)
     simulated = devices.build(fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim")
     with ExitStack() as stack:
-        box, far_end = build(simulated, stack, [watch], [watch.keep])
+        box, far_end = build(simulated, stack, [watch])
         while not simulated.finished(box.answered):
             box.step()
             drain(far_end)

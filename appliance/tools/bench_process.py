@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from appliance.core.clock import SystemClock
+from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
-from appliance.io.robot_link import ResultSink
-from appliance.runtime.loop import Box, SweepObserver
+from appliance.runtime.loop import Box
 from appliance.sim import devices, rig
 
 MEMORY_SWEEPS, STREAM_S = 1000, 15.0
@@ -33,8 +33,7 @@ class Build(Protocol):
         simulated: devices.SimDevices,
         stack: ExitStack,
         /,
-        also: Iterable[ResultSink] = (),
-        keepers: Iterable[SweepObserver] = (),
+        observers: Iterable[Observer] = (),
     ) -> tuple[Box, int]:
         """Build it."""
         ...

@@ -13,6 +13,7 @@ from pathlib import Path
 from appliance.recording.black_box import BlackBox
 from tests.cuts import recording
 from tests.cuts.scene import CutScene, Found, SceneStep
+from tests.factories import log_lines
 
 MOST = 2
 """Sweeps that are kept: so few that each run takes old ones away."""
@@ -21,11 +22,14 @@ KEPT = re.compile(r"^kept (\S+)$", re.MULTILINE)
 
 def keep(folder: Path) -> None:
     """Keep three sweeps."""
-    box = BlackBox(folder, recording.FORMAT, MOST, circumstances=dict, log=sys.exit)
-    for number in (1, 2, 3):
-        box.keep(*recording.taken(number))
-        print(f"kept {max(folder.glob('*.npy')).stem}", flush=True)
-    box.close()
+    with log_lines.collected() as logged:
+        box = BlackBox(folder, recording.FORMAT, MOST)
+        for number in (1, 2, 3):
+            box.sweep(*recording.taken(number), {})
+            if logged:
+                sys.exit(logged[0])
+            print(f"kept {max(folder.glob('*.npy')).stem}", flush=True)
+        box.close()
 
 
 def judge(found: Found) -> list[str]:
@@ -39,11 +43,11 @@ def judge(found: Found) -> list[str]:
 
 def _goes_on(folder: Path, last: str) -> list[str]:
     """What the next run does wrong in the folder. last: the newest sweep there."""
-    wrong: list[str] = []
-    box = BlackBox(folder, recording.FORMAT, MOST, circumstances=dict, log=wrong.append)
-    for number in (1, 2):
-        box.keep(*recording.taken(number))
-    box.close()
+    with log_lines.collected() as wrong:
+        box = BlackBox(folder, recording.FORMAT, MOST)
+        for number in (1, 2):
+            box.sweep(*recording.taken(number), {})
+        box.close()
     broken, there = recording.read(folder)
     left = {path.stem for path in folder.iterdir()}
     if len(there) != MOST or left != there.keys() or min(there) <= last:

@@ -36,20 +36,20 @@ def record(way: str, folder: Path, session: str) -> None:
     """Record two sweeps, discard the second, record a third; way: how the files get onto the disk."""
     storage.put_all = WAYS[way]
     running = recording(folder, session, lambda line: print(line.decode().strip(), flush=True))
-    running.keep(*taken(1))
-    running.keep(*taken(2))
+    running.sweep(*taken(1), {})
+    running.sweep(*taken(2), {})
     print(f"discarding {max(folder.glob('*.npy')).stem}", flush=True)
     print(f"discarded {running.commands['DISCARD']('')[-1]}", flush=True)
-    running.keep(*taken(3))
+    running.sweep(*taken(3), {})
     if running.stored != 2:
         sys.exit(f"{running.stored} sweeps are stored instead of 2")
     running.close()
 
 
 def recording(folder: Path, session: str, say: Callable[[bytes], None]) -> RecordingSession:
-    """The box's keeper of sweeps."""
+    """The observer of the box that records sweeps."""
     labels = Labels("plastic rough", "1", session)
-    return RecordingSession(folder, FORMAT, labels, SystemClock(), circumstances=dict, say=say, log=lambda line: None)
+    return RecordingSession(folder, FORMAT, labels, SystemClock(), say)
 
 
 def taken(number: int) -> tuple[Sweep, Verdict]:
@@ -139,7 +139,7 @@ def _goes_on(folder: Path) -> list[str]:
     before = {path: path.read_bytes() for path in folder.glob("*.npy")}
     running = recording(folder, "later", lambda line: None)
     for number in (1, 2):
-        running.keep(*taken(number))
+        running.sweep(*taken(number), {})
     running.close()
     wrong, there = read(folder)
     if not {"later 1", "later 2"} <= set(there.values()):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import select
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from appliance.core.observer import Observer
 from appliance.core.types import Sweep, SweepFormat, Verdict
 from appliance.io.robot_link import SerialSink
 from appliance.runtime.loop import Box
@@ -31,6 +33,17 @@ def idle_world(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -
     world = devices.build(fmt, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
     world.backend.board = rig.Board(fmt, world.robot, world.clock, **{"packet_frames": 4} | board)
     return world
+
+
+class OnSweep(Observer):
+    """Calls a function with each sweep and its verdict."""
+
+    def __init__(self, act: Callable[[Sweep, Verdict], object]) -> None:
+        self._act = act
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Call it."""
+        self._act(sweep, verdict)
 
 
 @dataclass

@@ -15,9 +15,8 @@ import numpy as np
 
 from appliance.bundle import bundle
 from appliance.core import config
-from appliance.core.types import DATA_TYPES, Frames, Status, Sweep, SweepFormat, save
+from appliance.core.types import DATA_TYPES, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat, save
 from appliance.io import packets, robot_link
-from appliance.io.trigger import Edge, EdgeKind
 from appliance.recording.capture import MAGIC, CaptureWriter
 from appliance.sim import script, skin
 from tests.factories.paths import ROOT

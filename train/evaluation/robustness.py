@@ -20,9 +20,8 @@ from appliance.core.config import SweepConfig
 from appliance.core.errors import FormatError
 from appliance.core.statistics import wilson
 from appliance.core.storage import put
-from appliance.core.types import Frames, SweepFormat, Verdict
+from appliance.core.types import Edge, EdgeKind, Frames, SweepFormat, Verdict
 from appliance.inference.classifier import Classifier
-from appliance.io.trigger import Edge, EdgeKind
 from appliance.recording.sweep_window import SweepCutter
 from appliance.sim.rig import VirtualClock
 from train.data.sets import Dataset, digest

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from appliance import __version__
-from appliance.cli import bundle_list, parser
+from appliance.cli import bundle_commands, parser
 from appliance.cli.main import RUNS
 from appliance.core import config, errors
 from appliance.core.schema import Key
 from appliance.core.types import Status, Verdict
 from appliance.deployment import state
 from appliance.io import robot_link
-from appliance.service import journal, status
+from appliance.service import status, systemd
 from tests.factories.paths import ROOT
 
 DOCS = ROOT / "docs"
@@ -241,7 +241,7 @@ def verdict(sweep: int, what: Status, label: str = "", probability: float = 0.0,
 
 def test_samples_are_what_the_box_prints():
     """Lines of the journal, of `palpate status` and of `palpate bundles`, from the code that prints them."""
-    told = [journal.words(verdict(1, Status.OK, "wood", 0.991)), journal.words(verdict(8, Status.SENSOR_LOST))]
+    told = [systemd.words(verdict(1, Status.OK, "wood", 0.991)), systemd.words(verdict(8, Status.SENSOR_LOST))]
     health = {
         "time_ns": 0, "skin": "streaming", "trouble": "", "streams": True, "sweeping": False, "answered": 1,
         "frames": 54006, "lost_frames": 0, "garbage_bytes": 0, "enumerations": 1, "dropped": 0, "bundle": "d5b2b6ef",
@@ -255,10 +255,10 @@ def test_samples_are_what_the_box_prints():
     }  # fmt: skip
     told += status.lines(file, now_ns)
     detail = "start 1 of 3, 7 of 20 sweeps, 41 of 600 s, as of its last start or end"
-    told += bundle_list.lines([
-        bundle_list.ListedBundle("9" * 64, "9f3c2a1b", "mine", "2", 2, "anna", "on trial", detail),
-        bundle_list.ListedBundle("5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""),
-        bundle_list.ListedBundle("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
+    told += bundle_commands.lines([
+        bundle_commands.ListedBundle("9" * 64, "9f3c2a1b", "mine", "2", 2, "anna", "on trial", detail),
+        bundle_commands.ListedBundle("5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""),
+        bundle_commands.ListedBundle("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
     ])  # fmt: skip
     assert [line for line in told if line not in BLOCKS] == []
 

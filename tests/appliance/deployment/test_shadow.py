@@ -25,7 +25,7 @@ from appliance.deployment.shadow import Shadow
 from appliance.inference.classifier import Classifier
 from appliance.sim import rig, skin
 from tests.factories import toy_bundle
-from tests.factories.simulated_box import SECOND, Rigged
+from tests.factories.simulated_box import SECOND
 
 IDLE = Health(0, "streaming", "", True, False, 0, 0, 0, 0, 1, 0, "", "sim")
 SWEEPING = replace(IDLE, sweeping=True)
@@ -35,18 +35,17 @@ class Side:
     """A current bundle and a candidate beside it, without a box."""
 
     def __init__(self, current: Bundle, candidate: Bundle, folder: Path, **how: Any) -> None:
-        self.clock, self.folder, self.log = rig.VirtualClock(), folder, []
+        self.clock, self.folder = rig.VirtualClock(), folder
         self.tare = np.zeros((current.format.rows, current.format.cols))
         self.current = Classifier(current, self.clock, **how)
         self.shadow = Shadow(
-            candidate, current, folder, self.clock, judge=lambda b: Classifier(b, self.clock, **how),
-            circumstances=lambda: {"tare": self.tare.tolist()}, log=self.log.append,
+            candidate, current, folder, self.clock, lambda b: Classifier(b, self.clock, **how)
         )  # fmt: skip
 
     def judge(self, *sweeps: Sweep) -> None:
         """Have both judge, each sweep with the end of its turn."""
         for one in sweeps:
-            self.shadow(one, self.current(one))
+            self.shadow.sweep(one, self.current(one), {"tare": self.tare.tolist()})
             self.turn()
 
     def turn(self, health: Health = IDLE, n: int = 2) -> None:
@@ -131,7 +130,7 @@ def test_nothing_is_written_while_a_sweep_is_open(side):
     """Only counted then; with the sweep over, one thing a turn."""
     pair = side(renamed)
     for one in (A, B):
-        pair.shadow(one, pair.current(one))
+        pair.shadow.sweep(one, pair.current(one), {"tare": pair.tare.tolist()})
     pair.turn(SWEEPING, 10)
     assert (pair.kept(), pair.written().compared) == ([], 0)
     for kept, compared in ((1, 0), (2, 0), (2, 2)):
@@ -188,7 +187,7 @@ def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Pat
         pair = Side(eager, candidate, tmp_path / f"shadow-{candidate.id}")
         verdict = shadow.Decider(pair.current)(half)
         assert verdict
-        pair.shadow(half, verdict)
+        pair.shadow.sweep(half, verdict, {"tare": pair.tare.tolist()})
         found = pair.shadow.agreement
         assert (found.compared, found.agreed, found.later) == counts
 
@@ -211,29 +210,29 @@ def strange() -> None:
     raise type("Fail", (Exception,), {})("[ONNXRuntimeError] : 1 : FAIL : no")
 
 
-def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side):
+def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: list[str]):
     """Three failures in a row: told once, not asked any more; a success between begins the row anew."""
     pair = side()
     pair.shadow._classifier = Broken(pair.shadow._classifier, lambda s: s.id != 3, strange)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 10)))
     found = pair.shadow.agreement
     assert (found.compared, found.failed) == (1, 5)
-    assert len(pair.log) == 1
-    assert "failed 3 times in a row: [ONNXRuntimeError]" in pair.log[0]
+    assert len(logged) == 1
+    assert "failed 3 times in a row: [ONNXRuntimeError]" in logged[0]
     pair.turn()
     pair.clock.sleep_until(pair.clock.now_ns() + 61 * SECOND)
     pair.turn()
     assert pair.written().failed == 5
 
 
-def test_a_candidate_that_is_too_slow_has_failed(side):
+def test_a_candidate_that_is_too_slow_has_failed(side, logged: list[str]):
     """A tenth of a second is the most that frames may wait."""
     pair = side()
     slow = lambda: pair.clock.sleep_until(pair.clock.now_ns() + SECOND // 5)  # noqa: E731
     pair.shadow._classifier = Broken(pair.shadow._classifier, lambda s: True, slow)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
     assert (pair.shadow.agreement.compared, pair.shadow.agreement.failed) == (0, 3)
-    assert "it computed 200 ms for a sweep, 100 are allowed" in pair.log[0]
+    assert "it computed 200 ms for a sweep, 100 are allowed" in logged[0]
 
 
 def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path: Path):
@@ -276,7 +275,7 @@ def test_a_candidate_that_kills_the_program_stays_away(side):
             start(1)
 
 
-def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
     """Told once; verdicts go on being compared."""
     pair = side(renamed)
 
@@ -287,9 +286,7 @@ def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatc
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
     pair.shadow.stopping()
     assert pair.shadow.agreement.compared == 4
-    assert [line.split(": ")[2] for line in pair.log] == [
-        "No space left on device; make room there; classifying goes on"
-    ]
+    assert [line.split(": ")[2] for line in logged] == ["No space left on device; make room there; classifying goes on"]
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
@@ -306,12 +303,12 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_b
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"candidate": "x"}', '{"candidate": "x", "current": "y", "schema": 2}'])
-def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str):
+def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str, logged: list[str]):
     """It is named in the log, and the counts begin with this start."""
     (tmp_path / "shadow").mkdir()
     (tmp_path / "shadow" / shadow.FILE).write_text(text)
     pair = side()
-    assert "cannot be read" in pair.log[0]
+    assert "cannot be read" in logged[0]
     assert pair.written().starts == 1
 
 
@@ -328,15 +325,13 @@ def test_the_robot_notices_nothing(rigged, default_bundle: Bundle, tmp_path: Pat
     heard = []
     for beside in (False, True):
         clock = rig.VirtualClock()
-        made: list[Rigged] = []
         ghost = Shadow(
             renamed(default_bundle), default_bundle, tmp_path / "shadow", clock,
-            judge=lambda b, clock=clock: Classifier(b, clock),
-            circumstances=lambda made=made: made[0].box.circumstances(), log=print,
+            lambda b, clock=clock: Classifier(b, clock),
         )  # fmt: skip
-        made.append(rigged(keepers=[ghost] if beside else [], pulses=[ghost] if beside else []))
-        verdicts = made[0].until(lambda made=made: made[0].box.answered >= 3)
-        heard.append([line for line in made[0].heard if ",RES," in line])
+        made = rigged(observers=[ghost] if beside else [])
+        verdicts = made.until(lambda made=made: made.box.answered >= 3)
+        heard.append([line for line in made.heard if ",RES," in line])
         ghost.stopping()
     assert heard[0] == heard[1]
     assert len(heard[0]) == 3

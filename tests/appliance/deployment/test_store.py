@@ -12,7 +12,7 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
-from appliance.cli import bundle_list
+from appliance.cli import bundle_commands
 from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, BundleError, ConfigError
 from appliance.deployment import store
@@ -38,25 +38,25 @@ def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
     with pytest.raises(BundleError, match="no committed bundle to go back to"):
         box.store.rollback()
     nowhere = store.Store(StoreConfig(folder=str(box.folder / "none")), prove=lambda b: None)
-    assert nowhere.choose(box.logged.append).bundle.id == nowhere.running().id == bundle.load(bundle.DEFAULT).id
+    assert nowhere.choose().bundle.id == nowhere.running().id == bundle.load(bundle.DEFAULT).id
     assert nowhere.candidate() is None
 
 
-def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery):
+def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery, logged: list[str]):
     """Install, start on trial, commit, the next one, commit, and back and forth between the two."""
     one = box.installed(1)
-    chosen = box.store.choose(box.logged.append)
+    chosen = box.store.choose()
     assert chosen.trial
     assert (chosen.folder.name, chosen.bundle.manifest.counter) == (one, 1)
-    assert box.logged == [f"bundle {one[:8]} is on trial, start 1 of 3"]
+    assert logged == [f"bundle {one[:8]} is on trial, start 1 of 3"]
     assert box.store.commit()
-    assert box.store.choose(box.logged.append).trial is None
+    assert box.store.choose().trial is None
     two = box.committed(2)
     assert box.start() == two
     for back in (one, two, one):
         assert box.store.rollback() == back
         assert box.start() == back
-    assert len(box.logged) == 1
+    assert len(logged) == 1
 
 
 def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
@@ -69,16 +69,16 @@ def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
     assert box.store.rollback() == one == box.start()
 
 
-def test_three_uncommitted_starts_go_back(box: Delivery):
+def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
     """The fourth start runs what was committed before, says so in one line, and `bundles` says why."""
     one, two = box.committed(1), box.installed(2)
     assert [box.start() for _ in range(MOST_STARTS)] == [two] * MOST_STARTS
-    box.logged.clear()
+    logged.clear()
     assert [box.start(), box.start()] == [one, one]
-    assert box.logged == [
+    assert logged == [
         f"<4>bundle {two[:8]} has failed its trial, and {one[:8]} runs again: it was started 3 times without being committed"
     ]
-    told = {e.sha: e for e in bundle_list.entries(box.store)}
+    told = {e.sha: e for e in bundle_commands.entries(box.store)}
     assert (told[two].role, told[two].detail) == ("left", "it was started 3 times without being committed")
     assert told[one].role == "current"
 
@@ -88,7 +88,7 @@ def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
     one, two, three = box.committed(1), box.installed(2), box.installed(3)
     assert box.start() == three
     assert box.store.rollback() == one
-    told = {e.sha: e.role for e in bundle_list.entries(box.store)}
+    told = {e.sha: e.role for e in bundle_commands.entries(box.store)}
     assert told == {one: "current", two: "left", three: "left", PACKAGED: "previous"}
     assert box.store.rollback() == PACKAGED
 
@@ -276,21 +276,21 @@ def test_a_model_that_hangs_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
         Delivery(tmp_path, hang).installed(1)
 
 
-def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: Delivery):
+def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: Delivery, logged: list[str]):
     """Its files have rotted, or the golden sweeps differ, or it does not fit the settings: what was before runs."""
     one = box.committed(1)
     two = box.installed(2)
     (box.store.bundles.at(two) / bundle.MODEL).write_bytes(b"rotten")
     assert box.start() == one
-    assert "was altered" in box.logged[-1]
+    assert "was altered" in logged[-1]
     for counter, error in ((3, BundleError("golden sweeps differ")), (4, ConfigError("no early heads"))):
 
         def prove(held: Bundle, error: Exception = error) -> None:
             raise error
 
         box.installed(counter)
-        assert store.Store(box.how, prove).choose(box.logged.append).folder.name == one
-        assert str(error) in box.logged[-1]
+        assert store.Store(box.how, prove).choose().folder.name == one
+        assert str(error) in logged[-1]
 
 
 def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
@@ -315,7 +315,7 @@ def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
     """Also the current one: its folder is exchanged for a whole one."""
     one = box.committed(1)
     (box.store.bundles.at(one) / bundle.MODEL).write_bytes(b"rotten")
-    assert [e.role for e in bundle_list.entries(box.store)] == ["previous", "damaged"]
+    assert [e.role for e in bundle_commands.entries(box.store)] == ["previous", "damaged"]
     assert box.installed(1) == one == box.start()
     assert os.listdir(box.store.bundles.folder) == [one]
 
@@ -340,7 +340,7 @@ def test_a_candidate_waits_and_is_promoted(box: Delivery):
     candidate = box.store.candidate()
     assert candidate
     assert candidate.id == two[:8]
-    assert [(e.role, e.sha) for e in bundle_list.entries(box.store)][-1] == ("candidate", two)
+    assert [(e.role, e.sha) for e in bundle_commands.entries(box.store)][-1] == ("candidate", two)
     assert box.store.promote() == two == box.start()
     assert box.store.candidate() is None
     with pytest.raises(BundleError, match="no candidate"):
@@ -363,7 +363,9 @@ def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
         box.store.commit()
 
 
-def test_a_disk_that_takes_no_note_runs_what_was_committed(box: Delivery, monkeypatch: pytest.MonkeyPatch):
+def test_a_disk_that_takes_no_note_runs_what_was_committed(
+    box: Delivery, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
     """A start that cannot be counted is none of a bundle on trial: a loop of crashes could not be told."""
 
     def full(path: Path, data: bytes) -> None:
@@ -374,7 +376,7 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(box: Delivery, monkey
         with monkeypatch.context() as patch:
             patch.setattr("appliance.core.storage.put", full)
             assert box.start() == before
-            assert "No space left on device, so no bundle can be on trial" in box.logged[-1]
+            assert "No space left on device, so no bundle can be on trial" in logged[-1]
         assert box.start() == tried
         box.store.rollback()
 
@@ -401,7 +403,7 @@ def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
     """One line a bundle: role, id, name, counter, signer, trial."""
     one, two = box.committed(1), box.store.install(box.made(2, name="tubes", version="7"))
     box.start()
-    lines = bundle_list.lines(bundle_list.entries(box.store))
+    lines = bundle_commands.lines(bundle_commands.entries(box.store))
     assert [line.split()[0] for line in lines] == ["role", "on", "previous", "kept"]
     assert f"on trial  {two[:8]}  tubes 7" in lines[1]
     assert "2        anna@lab   start 1 of 3, 0 of 5 sweeps, 0 of 600 s" in lines[1]

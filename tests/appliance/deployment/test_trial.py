@@ -48,7 +48,7 @@ class Trying(Delivery):
 
     def tried(self) -> Trial:
         """One more start: its trial."""
-        trial = self.store.choose(self.logged.append).trial
+        trial = self.store.choose().trial
         assert trial
         return trial
 
@@ -102,21 +102,21 @@ def test_nothing_is_written_while_nothing_is_new(box: Trying):
     assert before == (book.stat().st_mtime_ns, book.stat().st_ino)
 
 
-def test_enough_sweeps_commit(box: Trying):
+def test_enough_sweeps_commit(box: Trying, logged: list[str]):
     """Those that got a label, and not while a sweep is open; from then on older bundles are refused."""
     trial = box.tried()
     for _ in range(box.how.trial_sweeps - 1):
-        trial.send(verdict())
+        trial.answered(verdict())
     for _ in range(10):
-        trial.send(verdict(label=""))
+        trial.answered(verdict(label=""))
     trial.turn(health(1))
     assert trial.text == "on trial: 4 of 5 sweeps, 0 of 600 s"
-    trial.send(verdict())
+    trial.answered(verdict())
     trial.turn(health(2, sweeping=True))
     assert not box.standing.committed
     trial.turn(health(3))
     assert box.standing.committed
-    assert box.logged[-1] == f"bundle {box.two[:8]} has stood its trial and is committed"
+    assert logged[-1] == f"bundle {box.two[:8]} has stood its trial and is committed"
     assert (box.store.state.counter, box.store.state.highest, trial.text) == (2, box.two, "")
     trial.stopping()
     trial.turn(health(4, streams=False))
@@ -145,12 +145,12 @@ def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
         trial = box.tried()
         trial.turn(health(0))
         trial.turn(health(100))
-        trial.send(verdict())
-        trial.send(verdict())
+        trial.answered(verdict())
+        trial.answered(verdict())
         trial.stopping()
         assert (box.standing.sweeps, box.standing.streamed_s) == (2 * (n + 1), 100 * (n + 1))
     dies = box.tried()
-    dies.send(verdict())
+    dies.answered(verdict())
     trial = box.tried()
     assert trial.text == "on trial: 4 of 5 sweeps, 200 of 600 s"
 
@@ -168,7 +168,7 @@ def test_what_ends_the_program_decides_whether_the_start_counts(box: Trying, err
     assert box.standing.starts == counts
 
 
-def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
     """Nothing raises; the commit comes when there is room again."""
     trial = box.tried()
     calls: list[float] = []
@@ -183,25 +183,25 @@ def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pyte
             trial.turn(health(t / 10, streams=False))
         assert len(calls) == 1
         for _ in range(5):
-            trial.send(verdict())
+            trial.answered(verdict())
         for t in range(100, 200):
             trial.turn(health(t / 10))
         trial.stopping()
     assert len(calls) == 3
-    assert box.logged[1:] == [
+    assert logged[1:] == [
         f"<4>trial of bundle {box.two[:8]}: ledger.json cannot be written: No space left on device; it is tried again"
     ]
     trial.turn(health(30))
     assert box.standing.committed
 
 
-def test_another_command_is_not_waited_for(box: Trying):
+def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
     """The loop goes on; what was to be written is written later."""
     trial = box.tried()
     with box.store._locked():
         trial.turn(health(0, streams=False))
     assert box.standing.starts == 1
-    assert "in use by another command" in box.logged[-1]
+    assert "in use by another command" in logged[-1]
     trial.turn(health(11, streams=False))
     assert box.standing.starts == 0
 
@@ -212,7 +212,7 @@ def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
         trial = box.tried()
         way()
         for _ in range(5):
-            trial.send(verdict())
+            trial.answered(verdict())
         trial.turn(health(1))
         assert trial.text == ""
         assert not box.standing.committed
@@ -235,7 +235,7 @@ def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
     """The whole way on the rig: five sweeps of the simulated robot, each with its answer."""
     trial = box.tried()
     world = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
-    running = rigged(world, model=bundle.load(box.store.bundles.at(box.two)), also=[trial], pulses=[trial])
+    running = rigged(world, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
     running.until(lambda: running.box.answered >= 5 and not trial.text)
     assert box.standing.committed
 
@@ -245,6 +245,6 @@ def test_a_box_without_a_skin_takes_its_start_back(box: Trying, rigged: Callable
     trial = box.tried()
     world = idle_world()
     world.backend.unplug()
-    running = rigged(world, model=bundle.load(box.store.bundles.at(box.two)), also=[trial], pulses=[trial])
+    running = rigged(world, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
     running.seconds(1)
     assert box.standing.starts == 0

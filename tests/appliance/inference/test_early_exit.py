@@ -22,11 +22,11 @@ from appliance.inference.early_exit import Decider, decides
 from appliance.io.robot_link import StdoutPort
 from appliance.recording.capture import CaptureWriter, Playback
 from appliance.recording.sweep_window import SweepCutter
-from appliance.runtime.loop import Box
+from appliance.runtime.loop import Box, Pipeline
 from appliance.sim import devices, gpio, rig, script
 from appliance.tools import demo
 from appliance.tools.score import Answer
-from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
+from tests.factories.simulated_box import SECOND, SETTLE_S, OnSweep, Rigged
 
 onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
 helper, numpy_helper = onnx.helper, onnx.numpy_helper
@@ -190,8 +190,10 @@ def test_the_robot_stops_and_is_faster(rigged: Callable[..., Rigged]):
 def test_lines_tell_it_in_order(rigged: Callable[..., Rigged]):
     """Sentence, class bits, RESULT VALID, then DECIDED with READY and BUSY; DECIDED falls when the next sweep starts."""
     world = world_of(slid(60), slid(10))
-    box = rigged(world, SETS, toy())
     heard_before: list[bool] = []
+    kept_after: list[bool] = []
+    keep = OnSweep(lambda sweep, verdict: kept_after.append(bool(heard_before)))  # a disk may be slow
+    box = rigged(world, SETS, toy(), observers=[keep])
     stop = world.gpio.watchers[devices.DECIDED]
 
     def watch(t_ns: int) -> None:
@@ -200,8 +202,6 @@ def test_lines_tell_it_in_order(rigged: Callable[..., Rigged]):
         stop(t_ns)
 
     world.gpio.watchers[devices.DECIDED] = watch
-    kept_after: list[bool] = []
-    box.box._keep = lambda sweep, verdict: kept_after.append(bool(heard_before))  # a disk may be slow
     all_of(box)
     names = devices.READY, devices.BUSY, devices.DECIDED, devices.RESULT_VALID, devices.BITS[0]
     start, free = [(devices.READY, False), (devices.BUSY, True)], [(devices.READY, True), (devices.BUSY, False)]
@@ -429,8 +429,8 @@ def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_pat
     classifier = Classifier(toy((0.97, 0.95, 0.93, 0.7)), play)
     again, kept = [], []
     replayed = Box(
-        play, play, SweepCutter(FMT, SweepConfig(lead_ms=100)), classifier, play, early=Decider(classifier),
-        port=StdoutPort("replay", play.commands), keepers=[lambda sweep, verdict: kept.append(sweep)],
+        Pipeline(play, play, SweepCutter(FMT, SweepConfig(lead_ms=100)), classifier, Decider(classifier)), play,
+        port=StdoutPort("replay", play.commands), observers=[OnSweep(lambda sweep, verdict: kept.append(sweep))],
     )  # fmt: skip
     while not play.finished:
         again += replayed.step()

@@ -361,13 +361,13 @@ def test_too_few_sweeps_write_nothing(rig, tmp_path: Path, capsys: pytest.Captur
 
 def test_sigterm_ends_an_enrolment(rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """As it ends a run; nothing is written."""
-    keep = enrolment.Taken.keep
+    keep = enrolment.Taken.sweep
 
     def kept(self: enrolment.Taken, *what) -> None:
         keep(self, *what)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(enrolment.Taken, "keep", kept)
+    monkeypatch.setattr(enrolment.Taken, "sweep", kept)
     assert rig(digits(*FELT)) == 1
     assert not (tmp_path / "new").exists()
 
@@ -441,14 +441,13 @@ def test_lines_that_cannot_tell_the_new_label(rig, monkeypatch: pytest.MonkeyPat
     assert said.out == ""
 
 
-def test_taken_takes_what_it_wants(old: Bundle):
+def test_taken_takes_what_it_wants(old: Bundle, logged: list[str]):
     """No more than it was told, though one turn of the box may answer several; nothing is made of too few."""
-    said: list[str] = []
-    taken, it = enrolment.Taken(2, said.append), Classifier(old, VirtualClock())
+    taken, it = enrolment.Taken(2), Classifier(old, VirtualClock())
     with pytest.raises(ApplianceError, match="0 of 2 good sweeps"):
         taken.windows()
     for i, z in enumerate(FELT[:3]):
         sweep = toy_bundle.sweep(*z, number=i)
-        taken.keep(sweep, it(sweep))
+        taken.sweep(sweep, it(sweep), {})
     assert taken.windows().tolist() == digits(*FELT[:2]).tolist()
-    assert said == ["sweep 0 taken: 1 of 2", "sweep 1 taken: 2 of 2"]
+    assert logged == ["sweep 0 taken: 1 of 2", "sweep 1 taken: 2 of 2"]

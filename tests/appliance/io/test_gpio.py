@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from appliance.core.config import OutputConfig, TriggerConfig
 from appliance.core.errors import LineError
+from appliance.core.types import EdgeKind
 from appliance.io import gpio_lines as room
 from appliance.io.gpio_lines import Lines, check_binding, find_lines
-from appliance.io.trigger import EdgeKind, GpioTrigger
+from appliance.io.trigger import GpioTrigger
 from appliance.sim.gpio import SimGpio, SimRequest
 from appliance.sim.rig import VirtualClock
 

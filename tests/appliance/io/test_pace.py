@@ -13,9 +13,8 @@ import pytest
 import usb.core
 
 from appliance.core.config import SensorConfig, SweepConfig
-from appliance.core.types import EPOCH_BITS, Frames, Status, SweepFormat
+from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, SweepFormat
 from appliance.io import packets as wire
-from appliance.io.trigger import Edge, EdgeKind
 from appliance.io.usb_sensor import UsbSensor
 from appliance.recording.sweep_window import SweepCutter
 from appliance.sim import skin

@@ -249,7 +249,7 @@ def levels(chip: gpio.SimGpio) -> dict[str, bool]:
 def test_class_bits_settle_before_result_valid():
     """The code stands before RESULT VALID rises, by the configured time."""
     lines, chip = lines_on(2)
-    LineSink(lines, LABELS).send(verdict())
+    LineSink(lines, LABELS).answered(verdict())
     assert levels(chip) == {"VALID": True, "C0": True, "C1": True}
     when = {name: t for t, name, level in chip.written if level}
     assert when["VALID"] - max(when["C0"], when["C1"]) >= 200_000
@@ -260,8 +260,8 @@ def test_what_is_not_ok_is_code_zero(status: Status):
     """An unsure or refused sweep raises RESULT VALID with code 0."""
     lines, chip = lines_on(2)
     sink = LineSink(lines, LABELS)
-    sink.send(verdict())
-    sink.send(verdict("metal" if status is Status.UNSURE else "", status))
+    sink.answered(verdict())
+    sink.answered(verdict("metal" if status is Status.UNSURE else "", status))
     assert levels(chip) == {"VALID": True, "C0": False, "C1": False}
 
 

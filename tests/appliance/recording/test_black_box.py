@@ -6,6 +6,7 @@ import errno
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,22 +16,21 @@ from appliance.recording import recording
 from appliance.recording.black_box import BlackBox
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
-from tests.factories.simulated_box import Rigged
+from tests.factories.simulated_box import OnSweep, Rigged
 
 MOST = 3
 
 
-def box(folder: Path, logged: list[str] | None = None, most: int = MOST) -> BlackBox:
+def box(folder: Path, most: int = MOST) -> BlackBox:
     """A black box for the toy skin."""
-    log = (lambda line: None) if logged is None else logged.append
-    return BlackBox(folder, toy_bundle.FORMAT, most, circumstances=lambda: {"bundle": "b"}, log=log)
+    return BlackBox(folder, toy_bundle.FORMAT, most)
 
 
-def judged(number: int, status: Status = Status.OK, window: bool = True) -> tuple[Sweep, Verdict]:
-    """A sweep and its verdict."""
+def judged(number: int, status: Status = Status.OK, window: bool = True) -> tuple[Sweep, Verdict, dict[str, Any]]:
+    """A sweep, its verdict and its circumstances."""
     frames = toy_bundle.sweep(0, 0).frames if window else Frames.empty(toy_bundle.FORMAT)
     sweep = Sweep(number, 0, 1, Status.OK if window else status, frames)
-    return sweep, Verdict(number, 5, status, "", 0.0, 0.0, np.empty(0), 0, 0, 1, "b")
+    return sweep, Verdict(number, 5, status, "", 0.0, 0.0, np.empty(0), 0, 0, 1, "b"), {"bundle": "b"}
 
 
 def held(folder: Path) -> list[int]:
@@ -46,16 +46,16 @@ def test_the_last_sweeps_are_held_over_restarts(tmp_path: Path):
     """Each new one drives the oldest out, in a later run too, whatever its status; one without a window does not."""
     first = box(tmp_path / "b")
     for n in range(1, 6):
-        first.keep(*judged(n, Status.STUCK_TAXEL if n == 4 else Status.OK))
-    first.keep(*judged(6, Status.SHORT, window=False))
+        first.sweep(*judged(n, Status.STUCK_TAXEL if n == 4 else Status.OK))
+    first.sweep(*judged(6, Status.SHORT, window=False))
     assert held(tmp_path / "b") == [3, 4, 5]
     assert sidecar(tmp_path / "b" / "sweep-000004.npy")["verdict"]["status"] == "stuck-taxel"
     first.close()
     second = box(tmp_path / "b")
-    second.keep(*judged(1))
+    second.sweep(*judged(1))
     assert held(tmp_path / "b") == [4, 5, 6]
     second.close()
-    box(tmp_path / "b", most=1).keep(*judged(1))
+    box(tmp_path / "b", most=1).sweep(*judged(1))
     assert held(tmp_path / "b") == [7]
 
 
@@ -63,7 +63,7 @@ def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: py
     """At every moment the last sweeps are there: nothing is removed before the new one has its name."""
     black = box(tmp_path)
     for n in range(1, 4):
-        black.keep(*judged(n))
+        black.sweep(*judged(n))
     there: list[list[str]] = []
     unlink = Path.unlink
 
@@ -72,14 +72,13 @@ def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: py
         unlink(path, missing_ok)
 
     monkeypatch.setattr(Path, "unlink", noted)
-    black.keep(*judged(4))
+    black.sweep(*judged(4))
     assert [len(names) for names in there] == [4, 3]
 
 
-def test_a_full_disk_drops_the_oldest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_drops_the_oldest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
     """A new sweep is worth more than the oldest; where even that makes no room it is said once, and once that it is over."""
-    logged: list[str] = []
-    black = box(tmp_path, logged)
+    black = box(tmp_path)
     room = [2]
 
     def tight(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, object]) -> None:
@@ -90,50 +89,50 @@ def test_a_full_disk_drops_the_oldest_first(tmp_path: Path, monkeypatch: pytest.
     save = recording.save
     monkeypatch.setattr(recording, "save", tight)
     for n in range(1, 5):
-        black.keep(*judged(n))
+        black.sweep(*judged(n))
     assert held(tmp_path) == [3, 4]
     assert logged == []
     room[0] = 0
     for n in range(5, 8):
-        black.keep(*judged(n))
+        black.sweep(*judged(n))
     assert held(tmp_path) == []
     room[0] = 9
     for n in range(8, 10):
-        black.keep(*judged(n))
+        black.sweep(*judged(n))
     assert held(tmp_path) == [8, 9]
     assert logged == [
         f"<4>black box: no sweep is kept: No space left on device; see to {tmp_path}", "black box: sweeps are kept again"
     ]  # fmt: skip
 
 
-def test_another_trouble_costs_no_sweep_that_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_another_trouble_costs_no_sweep_that_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
     """A disk that fails for another reason than room: what is held stays."""
-    logged: list[str] = []
-    black = box(tmp_path, logged)
-    black.keep(*judged(1))
+    black = box(tmp_path)
+    black.sweep(*judged(1))
 
     def broken(*args: object) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(recording, "save", broken)
-    black.keep(*judged(2))
+    black.sweep(*judged(2))
     assert held(tmp_path) == [1]
     assert "Input/output error" in logged[0]
 
 
-def test_a_folder_that_cannot_be_used_yet(tmp_path: Path):
+def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
     """A file in its place, another program in it: the box starts all the same, it is said once each, and then goes well."""
-    logged: list[str] = []
     (tmp_path / "b").write_text("in the way")
-    black = box(tmp_path / "b", logged)
+    black = box(tmp_path / "b")
     for n in (1, 2):
-        black.keep(*judged(n))
+        black.sweep(*judged(n))
     (tmp_path / "b").unlink()
     other = box(tmp_path / "b")
-    other.keep(*judged(1))
-    black.keep(*judged(3))
+    other.sweep(*judged(1))
+    black.sweep(*judged(3))
     other.close()
-    black.keep(*judged(4))
+    black.sweep(*judged(4))
     assert held(tmp_path / "b") == [1, 5]
     assert [line.split(": ", 2)[-1].split(";")[0] for line in logged] == [
         "File exists", "another program keeps sweeps there", "sweeps are kept again"
@@ -145,7 +144,7 @@ def test_its_folder_is_ready_before_the_first_sweep(tmp_path: Path):
     black = box(tmp_path / "b")
     assert (tmp_path / "b").is_dir()
     black.close()
-    box(tmp_path / "b").keep(*judged(1))
+    box(tmp_path / "b").sweep(*judged(1))
     assert held(tmp_path / "b") == [1]
 
 
@@ -153,15 +152,14 @@ def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tm
     """The sentence is on the line before the disk is asked for anything; and the sweep is in the box."""
     world = devices.build(skin.FORMAT, script.tubes(1, 2), rig.VirtualClock(), "sim")
     made: Rigged
-    black = BlackBox(tmp_path, skin.FORMAT, 1, circumstances=lambda: made.box.circumstances(), log=print)
+    black = BlackBox(tmp_path, skin.FORMAT, 1)
     heard_before: list[int] = []
 
-    def keep(sweep: Sweep, verdict: Verdict) -> None:
+    def listen(sweep: Sweep, verdict: Verdict) -> None:
         made.listen(0.05)
         heard_before.append(sum(",RES," in line for line in made.heard))
-        black.keep(sweep, verdict)
 
-    made = rigged(world, keepers=[keep])
+    made = rigged(world, observers=[OnSweep(listen), black])
     made.until(lambda: world.finished(made.box.answered))
     assert heard_before == [1, 2]
     assert held(tmp_path) == [2]

@@ -19,9 +19,9 @@ from appliance.io import packets
 from appliance.io.robot_link import StdoutPort
 from appliance.recording.capture import CaptureWriter, Playback
 from appliance.recording.sweep_window import SweepCutter
-from appliance.runtime.loop import Box
+from appliance.runtime.loop import Box, Pipeline
 from appliance.sim import devices, rig, script, skin
-from tests.factories.simulated_box import SECOND, Rigged
+from tests.factories.simulated_box import SECOND, OnSweep, Rigged
 
 
 def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
@@ -30,8 +30,8 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     sweeps: list[Sweep] = []
     verdicts: list[Verdict] = []
     port = StdoutPort("replay", play.commands)
-    recorder, classifier = SweepCutter(play.format, SweepConfig()), Classifier(model, play)
-    box = Box(play, play, recorder, classifier, play, port=port, keepers=[lambda sweep, verdict: sweeps.append(sweep)])
+    pipeline = Pipeline(play, play, SweepCutter(play.format, SweepConfig()), Classifier(model, play))
+    box = Box(pipeline, play, port=port, observers=[OnSweep(lambda sweep, verdict: sweeps.append(sweep))])
     while not play.finished:
         verdicts += box.step()
     return verdicts, sweeps

@@ -26,14 +26,11 @@ WOOD, NONE = Labels("wood"), Labels()
 
 
 class Desk:
-    """A recording without a box: what it says and logs, and a clock that stands where a test puts it."""
+    """A recording without a box: what it sends, and a clock that stands where a test puts it."""
 
     def __init__(self, folder: Path, labels: Labels = WOOD) -> None:
-        self.t_ns, self.said, self.logged = 0, [], []
-        self.recording = RecordingSession(
-            folder, toy_bundle.FORMAT, labels, self, circumstances=lambda: {"bundle": "b"}, say=self.hear,
-            log=self.logged.append,
-        )  # fmt: skip
+        self.t_ns, self.said = 0, []
+        self.recording = RecordingSession(folder, toy_bundle.FORMAT, labels, self, self.hear)
 
     def now_ns(self) -> int:
         """Clock."""
@@ -52,7 +49,7 @@ class Desk:
 
     def sweep(self, number: int, start_ns: int = 0, status: Status = Status.OK) -> list[str]:
         """Give a sweep; the REC sentence's fields."""
-        self.recording.keep(*judged(number, start_ns, status))
+        self.recording.sweep(*judged(number, start_ns, status), {"bundle": "b"})
         return self.said[-1]
 
 
@@ -81,11 +78,8 @@ def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Callable[..., Rig
 
     def make(world: devices.SimDevices, labels: Labels = NONE) -> Rigged:
         box: Rigged
-        recording = RecordingSession(
-            tmp_path, skin.FORMAT, labels, world.clock, circumstances=lambda: box.box.circumstances(),
-            say=lambda line: box.port.say(line), log=print,
-        )  # fmt: skip
-        box = rigged(world, keepers=[recording.keep], obey=recording.commands)
+        recording = RecordingSession(tmp_path, skin.FORMAT, labels, world.clock, lambda line: box.port.say(line))
+        box = rigged(world, observers=[recording], commands=recording.commands)
         return box
 
     return make
@@ -298,7 +292,7 @@ def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
     [(1 << 20, 16383, "67.1 MB left of 67.1 for the system"), (1000, 49, "0.2 MB left of 0.2 for the system")],
 )
 def test_no_room_for_the_system_stops_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blocks: int, left: int, detail: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blocks: int, left: int, detail: str, logged: list[str]
 ):
     """Below what is kept free nothing is written; it is told, logged once, tried again with the next sweep, and logged."""
     free = [left]
@@ -311,7 +305,7 @@ def test_no_room_for_the_system_stops_recording(
     free[0] += 1
     assert desk.sweep(3)[1:3] == ["stored", "1"]
     desk.recording.close()
-    assert desk.logged == [
+    assert logged == [
         f"<4>record: sweep 1 is not stored: {detail}; make room in {tmp_path}; classifying goes on",
         "record: sweeps are stored again, from sweep 3 on",
         f"record: sweeps of this run in {tmp_path}: 1",
@@ -319,7 +313,9 @@ def test_no_room_for_the_system_stops_recording(
 
 
 @pytest.mark.parametrize(("code", "outcome"), [(errno.ENOSPC, "full"), (errno.EDQUOT, "full"), (errno.EROFS, "failed")])
-def test_a_disk_that_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, outcome: str):
+def test_a_disk_that_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, outcome: str, logged: list[str]
+):
     """No space and no quota are `full`, anything else is `failed`, with the reason."""
     desk = Desk(tmp_path)
 
@@ -328,10 +324,10 @@ def test_a_disk_that_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, co
 
     monkeypatch.setattr(recording, "save", refused)
     assert desk.sweep(1) == ["1", outcome, "0", "wood", "", "", os.strerror(code)]
-    assert len(desk.logged) == 1
+    assert len(logged) == 1
 
 
-def test_what_cannot_be_written_leaves_nothing(tmp_path: Path):
+def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]):
     """The disk ends after n bytes, for n across both files: failed, nothing stays, what was there is whole."""
     desk = Desk(tmp_path)
     desk.sweep(1)
@@ -344,18 +340,18 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path):
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    assert len(desk.logged) == 1
+    assert len(logged) == 1
     assert desk.sweep(2)[1:3] == ["stored", "2"]
 
 
-def test_a_folder_that_is_taken_away(tmp_path: Path):
+def test_a_folder_that_is_taken_away(tmp_path: Path, logged: list[str]):
     """Its sweeps fail and say so; once it is there again recording goes on."""
     desk = Desk(tmp_path / "a" / "b")
     shutil.rmtree(tmp_path / "a")
     assert desk.sweep(1)[1:3] + desk.said[-1][6:] == ["failed", "0", "No such file or directory"]
     (tmp_path / "a" / "b").mkdir(parents=True)
     assert desk.sweep(2)[1] == "stored"
-    assert "stored again" in desk.logged[-1]
+    assert "stored again" in logged[-1]
 
 
 @pytest.mark.parametrize("folder", ["/proc/x", "/dev/null"])

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.core.config import SweepConfig
-from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat
-from appliance.io.trigger import Edge, EdgeKind
+from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
 from appliance.recording.sweep_window import MAX_GAP, SweepCutter
 from appliance.sim import skin
 from tests.factories.simulated_box import SECOND, numbered

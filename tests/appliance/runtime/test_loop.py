@@ -16,7 +16,6 @@ from appliance.core import config
 from appliance.core.types import Status
 from appliance.io.robot_link import StdoutPort
 from appliance.runtime import assembly
-from appliance.service.journal import WARNING
 from appliance.sim import devices, rig, script, skin
 from appliance.tools.score import Answer
 from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
@@ -309,17 +308,16 @@ def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]
     assert box.box.answered == 20
 
 
-def test_trouble_is_logged_once(rigged: Callable[..., Rigged]):
+def test_trouble_is_logged_once(rigged: Callable[..., Rigged], logged: list[str]):
     """What goes wrong is logged when it begins and when it ends, not at every turn."""
-    lines: list[str] = []
     world = quiet()
-    box = rigged(world, log=lines.append)
+    box = rigged(world)
     box.seconds(1)
     world.backend.unplug()
     box.seconds(2)
     world.backend.plug()
     box.seconds(1)
-    skin_lines = [line.removeprefix(WARNING) for line in lines if "skin: " in line]
+    skin_lines = [line.removeprefix("<4>") for line in logged if "skin: " in line]
     assert skin_lines[0] == "skin: streaming"
     assert skin_lines[-1] == "skin: streaming"
     assert 3 <= len(skin_lines) <= 4

@@ -44,11 +44,10 @@ def in_service(run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Pat
     if "heard" not in run:
         acts = [replace(act, new_object=i % PER_OBJECT == 0) for i, act in enumerate(script.tubes(1020, SWEEPS))]
         world = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "replay")
-        box: Rigged
-        keeper = BlackBox(run["folder"], skin.FORMAT, SWEEPS, circumstances=lambda: box.box.circumstances(), log=print)
-        box = rigged(world, sets=("classifier.early=true", "classifier.min_probability=0.97"), keepers=[keeper.keep])
+        black_box = BlackBox(run["folder"], skin.FORMAT, SWEEPS)
+        box = rigged(world, sets=("classifier.early=true", "classifier.min_probability=0.97"), observers=[black_box])
         box.until(lambda: world.finished(box.box.answered), limit_s=300)
-        keeper.close()
+        black_box.close()
         run["heard"] = [line for line in box.heard if ",RES," in line]
     return Path(shutil.copytree(run["folder"], tmp_path / "kept")), run["heard"]
 

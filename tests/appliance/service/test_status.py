@@ -1,4 +1,4 @@
-"""What a person is told: the status file and its reader, and the lines of the journal."""
+"""What a person sees of the service: the status file and its reader, and the log lines of verdicts."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ import pytest
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.health import Health
 from appliance.core.types import Status, Verdict
-from appliance.service import journal, status
+from appliance.service import status
 from appliance.service.status import StatusFile
+from appliance.service.systemd import REASONS, VerdictLog
 from appliance.sim import rig
 from tests.factories.simulated_box import SECOND, Rigged
 
@@ -37,8 +38,8 @@ class Teller:
     """A status file on a virtual clock."""
 
     def __init__(self, folder: Path, **more: object) -> None:
-        self.clock, self.path, self.log = rig.VirtualClock(), folder / "status.json", []
-        self.file = StatusFile(self.path, self.clock, log=self.log.append, **more)
+        self.clock, self.path = rig.VirtualClock(), folder / "status.json"
+        self.file = StatusFile(self.path, self.clock, **more)
 
     def turns(self, seconds: float, health: Health = HEALTH, step_s: float = 0.01) -> int:
         """Take turns; how often the file was written anew."""
@@ -68,7 +69,7 @@ def test_it_is_written_once_a_second_and_soon_after_news(teller: Teller):
     """Four times in four seconds of turns; a verdict, and a lost skin, are there a tenth of a second later."""
     assert teller.turns(4) in (4, 5)
     teller.file.turn(HEALTH)
-    teller.file.send(OK)
+    teller.file.answered(OK)
     teller.turns(0.12)
     assert [v["sweep"] for v in teller.read()["verdicts"]] == [7]
     teller.turns(0.12, AWAY)
@@ -79,7 +80,7 @@ def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(teller: Teller):
     """Verdicts with every turn: one write in a tenth of a second, and the last twenty are kept."""
     written = 0
     for i in range(100):
-        teller.file.send(replace(SHORT, sweep=i))
+        teller.file.answered(replace(SHORT, sweep=i))
         before = teller.path.stat().st_ino if teller.path.exists() else None
         teller.file.turn(HEALTH)
         written += teller.path.stat().st_ino != before
@@ -105,9 +106,9 @@ def test_every_user_may_read_it_whole(teller: Teller):
 def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     """Since when, skin, bundle, further facts, the last verdicts newest first; advice where something is wrong."""
     teller = Teller(tmp_path, more=lambda: {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]})
-    teller.file.send(replace(OK, sweep=6, detail="moved 2.1 mm too far towards row 4"))
-    teller.file.send(OK)
-    teller.file.send(SHORT)
+    teller.file.answered(replace(OK, sweep=6, detail="moved 2.1 mm too far towards row 4"))
+    teller.file.answered(OK)
+    teller.file.answered(SHORT)
     teller.turns(135)
     said = teller.said().splitlines()
     assert said[0] == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source usb)"
@@ -143,11 +144,11 @@ def test_a_program_that_has_ended_is_not_running(teller: Teller):
     assert teller.read()["running"]
     written = json.loads(teller.path.read_text())
     teller.clock.sleep_until(teller.clock.now_ns() + 11 * SECOND)
-    assert "has told nothing for 11 s, it hangs" in teller.said()
+    assert "has written nothing for 11 s, so it hangs" in teller.said()
     gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
     for wrong in ({"pid": int(gone.stdout)}, {"time_ns": 10**18}):
         teller.path.write_text(json.dumps(written | {"time_ns": teller.clock.now_ns()} | wrong))
-        assert "has ended without a word" in teller.said()
+        assert "has ended without closing down" in teller.said()
         assert status.exit_code(teller.read()) == 1
     teller.file.stopping()
     assert not teller.path.exists()
@@ -168,12 +169,12 @@ def test_a_file_that_may_not_be_read_is_named(teller: Teller):
         teller.read()
 
 
-def test_trouble_with_the_file_is_told_once(tmp_path: Path):
+def test_trouble_with_the_file_is_told_once(tmp_path: Path, logged: list[str]):
     """Without its folder the box goes on; one line, and another only after it had worked in between."""
     teller = Teller(tmp_path / "run")
     teller.turns(5)
-    assert len(teller.log) == 1
-    assert "classifying goes on" in teller.log[0]
+    assert len(logged) == 1
+    assert "classifying goes on" in logged[0]
     teller.path.parent.mkdir()
     teller.turns(2)
     assert teller.read()["running"]
@@ -181,21 +182,21 @@ def test_trouble_with_the_file_is_told_once(tmp_path: Path):
     teller.path.parent.rmdir()
     teller.turns(2)
     teller.file.stopping()
-    assert len(teller.log) == 2
+    assert len(logged) == 2
 
 
-def test_a_box_at_work_tells_its_verdicts(rigged, tmp_path: Path):
+def test_a_box_at_work_tells_its_verdicts(rigged, tmp_path: Path, logged: list[str]):
     """On the rig: skin, bundle and verdicts of the box itself, and the same verdicts in the journal."""
     world_clock = rig.VirtualClock()
     told = StatusFile(tmp_path / "status.json", world_clock)
-    lines: list[str] = []
-    box: Rigged = rigged(pulses=[told], also=[told, journal.Journal(lines.append)])
+    box: Rigged = rigged(observers=[told, VerdictLog()])
     verdicts = box.until(lambda: box.box.answered >= 2)
     world_clock.sleep_until(SECOND * 60)
     box.seconds(0.2)
     read = status.read(tmp_path / "status.json", world_clock.now_ns())
     assert (read["skin"], read["answered"], read["bundle"]) == ("streaming", 2, verdicts[0].bundle)
     assert [(v["sweep"], v["label"]) for v in read["verdicts"]] == [(v.sweep, v.label) for v in verdicts]
+    lines = [line.removeprefix("<4>") for line in logged if line.startswith(("sweep", "<4>sweep"))]
     assert [line.split(",")[0] for line in lines] == [f"sweep {v.sweep}: {v.label}" for v in verdicts]
 
 
@@ -213,32 +214,12 @@ def test_a_box_at_work_tells_its_verdicts(rigged, tmp_path: Path):
         (replace(SHORT, status=Status.ABORTED), "sweep 8: no answer, aborted: by command, or because the box was stopping"),
     ],
 )  # fmt: skip
-def test_the_journal_has_one_line_a_verdict(verdict: Verdict, line: str):
-    """In words; what asks for a look is a warning."""
-    lines: list[str] = []
-    journal.Journal(lines.append).send(verdict)
-    assert lines == [line]
+def test_the_log_has_one_line_a_verdict(verdict: Verdict, line: str, logged: list[str]):
+    """In words; one that a person should look at is a warning."""
+    VerdictLog().answered(verdict)
+    assert logged == [line]
 
 
 def test_every_status_without_a_label_has_its_reason():
     """One list: a new status must say what to look at."""
-    assert set(journal.REASONS) == {s for s in Status if not s.classified}
-
-
-def test_levels_are_for_the_journal_alone():
-    """A terminal reads who speaks, and no level; the journal knows the former and wants the latter."""
-    assert journal.spoken("<4>skin: gone", True) == "<4>skin: gone"
-    assert journal.spoken("<4>skin: gone", False) == "palpate: skin: gone"
-    assert journal.spoken("skin: <4>", False) == "palpate: skin: <4>"
-    assert journal.spoken("skin: X\r\n<0>board", True) == "skin: X <0>board"
-
-
-def test_the_journal_is_known_by_its_stream(tmp_path: Path):
-    """JOURNAL_STREAM must name this very stream: a child with its output elsewhere is not in the journal."""
-    with (tmp_path / "out").open("w") as f:
-        held = os.fstat(f.fileno())
-        environ = {"JOURNAL_STREAM": f"{held.st_dev}:{held.st_ino}"}
-        assert journal.attached(environ, f.fileno())
-        assert not journal.attached({}, f.fileno())
-        assert not journal.attached(environ, 0)
-    assert not journal.attached(environ, 1_000_000)
+    assert set(REASONS) == {s for s in Status if not s.classified}

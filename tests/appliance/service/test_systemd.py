@@ -1,4 +1,4 @@
-"""The room of the service manager: what systemd is told and when, and what the box tells it at the end of each turn."""
+"""The box as a service of systemd: what the service manager gets and when, and the log lines of verdicts."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ import pytest
 
 from appliance.core.errors import ConfigError
 from appliance.core.health import Health
-from appliance.service.notify import Manager
+from appliance.core.observer import Observer
+from appliance.service.systemd import Notifier
 from appliance.sim import devices, rig, script, skin
-from tests.factories.simulated_box import SECOND, Rigged, idle_world
+from tests.factories.simulated_box import SECOND, OnSweep, Rigged, idle_world
 
 WATCHDOG = {"WATCHDOG_USEC": "10000000"}
 
@@ -54,10 +55,10 @@ def ear(request: pytest.FixtureRequest, tmp_path: Path):
     ear.socket.close()
 
 
-def told(ear: Ear, **more: str) -> tuple[Manager, rig.VirtualClock]:
+def told(ear: Ear, **more: str) -> tuple[Notifier, rig.VirtualClock]:
     """A manager that speaks to `ear`, and its clock."""
     clock = rig.VirtualClock()
-    return Manager(clock, {"NOTIFY_SOCKET": ear.address, **more}), clock
+    return Notifier(clock, {"NOTIFY_SOCKET": ear.address, **more}), clock
 
 
 def how(streams: bool, text: str) -> Any:
@@ -126,7 +127,7 @@ def test_what_a_device_says_of_itself_is_not_obeyed(ear: Ear):
 def test_without_a_socket_nothing_is_said(monkeypatch: pytest.MonkeyPatch):
     """Started by hand: no socket is even made."""
     monkeypatch.delattr(socket, "socket")
-    manager = Manager(rig.VirtualClock(), WATCHDOG)
+    manager = Notifier(rig.VirtualClock(), WATCHDOG)
     manager.turn(how(True, "fine"))
     manager.stopping()
 
@@ -154,10 +155,10 @@ def test_a_socket_that_is_gone_costs_nothing(ear: Ear, tmp_path: Path):
 def test_a_watchdog_that_is_no_number_is_named():
     """Only a person can have set it."""
     with pytest.raises(ConfigError, match="WATCHDOG_USEC=10s is no number"):
-        Manager(rig.VirtualClock(), {"WATCHDOG_USEC": "10s"})
+        Notifier(rig.VirtualClock(), {"WATCHDOG_USEC": "10s"})
 
 
-class Pulse:
+class Pulse(Observer):
     """Notes what the box tells, and what else happens, in order."""
 
     def __init__(self) -> None:
@@ -179,7 +180,7 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., 
     """Without a skin it says what it waits for; then it streams, and says how many sweeps it has answered."""
     pulse, world = Pulse(), idle_world()
     world.backend.unplug()
-    box = rigged(world, pulses=[pulse])
+    box = rigged(world, observers=[pulse])
     box.seconds(2)
     ((ready, status),) = pulse.notes
     assert not ready
@@ -201,7 +202,7 @@ def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[...,
     """It counts as streaming until it is found silent, but nothing of it has ever come."""
     pulse, world = Pulse(), idle_world()
     world.backend.mangle = lambda data: b""
-    rigged(world, pulses=[pulse]).seconds(3)
+    rigged(world, observers=[pulse]).seconds(3)
     said = {status.split(" for ")[0] for _, status in pulse.notes}
     assert said == {"skin streaming. Sweeps answered: 0", "skin silent: the skin is there but sent no frame"}
     assert not any(ready for ready, _ in pulse.notes)
@@ -210,12 +211,12 @@ def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[...,
 def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
     """One pulse for each whole turn: none for the one that hangs after its sentence, at the disk."""
     pulse = Pulse()
-    box = rigged(devices.build(skin.FORMAT, script.tubes(1, 1), rig.VirtualClock(), "sim"), pulses=[pulse])
 
     def hang(sweep: object, verdict: object) -> None:
         raise TimeoutError
 
-    box.box._keep = hang
+    world = devices.build(skin.FORMAT, script.tubes(1, 1), rig.VirtualClock(), "sim")
+    box = rigged(world, observers=[OnSweep(hang), pulse])
     turns = 0
     with suppress(TimeoutError):
         while True:
@@ -228,10 +229,9 @@ def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
 def test_stopping_is_told_before_the_last_answer(rigged: Callable[..., Rigged]):
     """What is open is answered while the manager knows already."""
     pulse = Pulse()
-    box = rigged(idle_world(), pulses=[pulse])
+    box = rigged(idle_world(), observers=[pulse, OnSweep(lambda sweep, verdict: pulse.notes.append(str(sweep.status)))])
     box.pulse(devices.START, 0.2)
     end = box.world.clock.now_ns() + SECOND
-    box.box._keep = lambda sweep, verdict: pulse.notes.append(str(sweep.status))
     box.box.run(lambda: box.world.clock.now_ns() > end)
     assert pulse.notes[-2:] == ["stopping", "aborted"]
 

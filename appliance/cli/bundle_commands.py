@@ -1,0 +1,148 @@
+"""The commands of `palpate` for the bundles in the store: list, install, verify, commit, roll back, promote.
+
+In: arguments. Out: lines on standard output, exit codes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from appliance.bundle import bundle
+from appliance.cli.commands import load_settings
+from appliance.core.errors import BundleError
+from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
+from appliance.deployment.store import SHA, Store
+from appliance.runtime import assembly
+
+if TYPE_CHECKING:
+    from appliance.core.config import StoreConfig
+
+NEXT = "from the next start on: systemctl restart palpate"
+
+
+@dataclass(frozen=True, slots=True)
+class ListedBundle:
+    """One bundle of the store; sha "" for the packaged one, which nobody signed.
+
+    role: current, on trial, previous (what `palpate rollback` goes back to), candidate, left, kept, or damaged.
+    detail: how far its trial is, why it was left, what is wrong with it.
+    """
+
+    sha: str
+    id: str
+    name: str
+    version: str
+    counter: int
+    signer: str
+    role: str
+    detail: str
+
+
+def entries(store: Store) -> list[ListedBundle]:
+    """The bundles of the store, those that matter most first."""
+    current, state = store.current, store.state
+    names = sorted(p.name for p in store.bundles.folder.iterdir()) if store.bundles.folder.is_dir() else []
+    listed = [_entry(store, sha, current, state) for sha in (*filter(SHA.fullmatch, names), PACKAGED)]
+    order = ("current", "on trial", "previous", "candidate", "left", "kept", "damaged")
+    return sorted(listed, key=lambda e: order.index(e.role))
+
+
+def lines(listed: Iterable[ListedBundle]) -> list[str]:
+    """A table for a person."""
+    rows = [(e.role, e.id, f"{e.name} {e.version}", str(e.counter), e.signer, e.detail) for e in listed]
+    rows = [("role", "id", "bundle", "counter", "signed by", ""), *rows]
+    wide = [max(len(row[i]) for row in rows) for i in range(5)]
+    return ["  ".join([*(t.ljust(w) for t, w in zip(row, wide, strict=False)), row[-1]]).rstrip() for row in rows]
+
+
+def _entry(store: Store, sha: str, current: str, state: StoreState) -> ListedBundle:
+    role, detail = _role(sha, current, state, store.settings)
+    try:
+        if sha == PACKAGED:
+            loaded, signer = bundle.load(bundle.DEFAULT), "palpate"
+        else:
+            signed = store.bundles.get(sha)
+            loaded, signer = signed.bundle, signed.signer
+    except BundleError as e:
+        return ListedBundle(sha, sha[:8], "?", "?", 0, "?", "damaged", " ".join(filter(None, (role, detail, str(e)))))
+    m = loaded.manifest
+    return ListedBundle(sha, loaded.id, m.name, m.version, m.counter, signer, role, detail)
+
+
+def _role(sha: str, current: str, state: StoreState, settings: StoreConfig) -> tuple[str, str]:
+    standing = state.of(sha)
+    if sha == current and standing.committed:
+        return "current", ""
+    if sha == current:
+        return "on trial", (
+            f"start {standing.starts} of {MOST_STARTS}, {standing.sweeps} of {settings.trial_sweeps} sweeps, "
+            f"{standing.streamed_s:.0f} of {settings.trial_s:.0f} s, as of its last start or end"
+        )
+    if sha == state.of(current).previous:
+        return "previous", ""
+    if sha == state.candidate != PACKAGED:
+        return "candidate", ""
+    return ("kept", "") if standing.committed else ("left", standing.why or "another was deployed")
+
+
+def run_bundles(args: argparse.Namespace) -> int:
+    """`palpate bundles`: which bundle runs, and what it goes back to."""
+    from appliance.deployment import shadow
+
+    settings = load_settings(args)
+    store, folder = assembly.store(settings), Path(settings.store.folder) / "shadow"
+    listed, agreement = entries(store), shadow.read(folder)
+    text = lines(listed)
+    if agreement and store.state.candidate.startswith(agreement.candidate):
+        text += agreement.lines(folder)
+    print(json.dumps([asdict(e) for e in listed], indent=1) if args.json else "\n".join(text))
+    return 0
+
+
+def run_install(args: argparse.Namespace) -> int:
+    """`palpate install`: a signed bundle comes into the store."""
+    store = assembly.store(load_settings(args))
+    sha = store.install(args.folder, args.shadow)
+    committed = "it is committed already" if store.state.of(sha).committed else f"it runs on trial {NEXT}"
+    print(f"bundle {sha[:8]} is installed; {'it is the candidate' if args.shadow else committed}")
+    return 0
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    """`palpate verify`: whether a bundle would be taken, but for its counter."""
+    signed = assembly.store(load_settings(args)).examine(args.folder)
+    m = signed.bundle.manifest
+    print(
+        f"bundle {signed.bundle.id}: {m.name} {m.version}, counter {m.counter}, signed by {signed.signer}; all is well"
+    )
+    return 0
+
+
+def run_commit(args: argparse.Namespace) -> int:
+    """`palpate commit`: the trial is over."""
+    print("committed" if assembly.store(load_settings(args)).commit() else "nothing is on trial")
+    return 0
+
+
+def run_rollback(args: argparse.Namespace) -> int:
+    """`palpate rollback`: back to the bundle before."""
+    sha = assembly.store(load_settings(args)).rollback()
+    print(f"{f'bundle {sha[:8]}' if sha else 'the packaged bundle'} runs {NEXT}")
+    return 0
+
+
+def run_promote(args: argparse.Namespace) -> int:
+    """`palpate promote`: the candidate becomes the current bundle."""
+    print(f"bundle {assembly.store(load_settings(args)).promote()[:8]} runs on trial {NEXT}")
+    return 0
+
+
+RUNS = {
+    "bundles": run_bundles, "install": run_install, "verify": run_verify, "commit": run_commit, "rollback": run_rollback,
+    "promote": run_promote,
+}  # fmt: skip

@@ -1,0 +1,35 @@
+"""What happens in the loop, for whatever watches it: captures, recordings, status, the service manager."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from appliance.core.health import Health
+from appliance.core.types import Edge, Sweep, Verdict
+
+
+class Observer:
+    """Base of all observers; each overrides what it wants to know.
+
+    No method may raise or wait: a full disk costs the record, never the classifying. What takes time belongs into
+    `sweep` or `turn`, where all answers of the turn are out.
+    """
+
+    def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
+        """Edges have settled, by `t_ns`."""
+
+    def command(self, t_ns: int, line: str) -> None:
+        """A command, as it stands in a sentence, is about to be carried out."""
+
+    def answered(self, verdict: Verdict) -> None:
+        """The robot has got this verdict on its serial line."""
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """A sweep was answered, and all other answers of the turn are out. circumstances: see Box.circumstances."""
+
+    def turn(self, health: Health) -> None:
+        """A turn has ended: frames were read or the skin is away, edges were polled, answers are out."""
+
+    def stopping(self) -> None:
+        """The loop has ended; what is open is being answered."""

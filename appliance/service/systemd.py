@@ -1,0 +1,121 @@
+"""The box as a service of systemd: sd_notify and the journal. In: how the box is each turn, verdicts. Out: READY, STATUS,
+WATCHDOG and STOPPING as datagrams to the socket that systemd names in the environment, and a log line for each verdict.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Mapping
+from logging import INFO, WARNING
+from types import MappingProxyType
+
+from appliance.core.clock import Clock
+from appliance.core.errors import ConfigError
+from appliance.core.health import Health
+from appliance.core.log import log
+from appliance.core.observer import Observer
+from appliance.core.types import Status, Verdict
+
+FEEDS = 10
+"""How often the watchdog is fed within its time, so that nearly all of it is left for one turn of the loop."""
+REASONS: Mapping[Status, str] = MappingProxyType(
+    {
+        Status.UNKNOWN: "it is like no material that was trained or enrolled",
+        Status.SHORT: "the stop edge came before a window's length had passed",
+        Status.LONG: "no stop edge came in time",
+        Status.GAP: "too many frames in a row are missing; look at the skin's cable",
+        Status.NO_CONTACT: "no taxel is loaded; see that the finger lies on the object",
+        Status.SATURATED: "too many digits at full scale; press less",
+        Status.STUCK_TAXEL: "a loaded taxel does not move; look at the skin",
+        Status.DEAD_TAXEL: "a taxel between loaded ones is silent; look at the skin",
+        Status.SENSOR_LOST: "the skin went away during the sweep; look at its cable",
+        Status.NO_START: "a stop edge without a start; look at the start line",
+        Status.NO_STOP: "a second start edge came; look at the stop line",
+        Status.NOT_READY: "a start edge while READY was low; the robot must wait for READY",
+        Status.EDGES_LOST: "trigger edges were lost; look at the trigger lines",
+        Status.ABORTED: "by command, or because the box was stopping",
+    }
+)
+"""Why a sweep has no label, and what to look at: PROTOCOL.md says it in full."""
+
+
+class Notifier(Observer):
+    """Sends systemd how the box is. Never waits: what the socket does not take is sent again next turn.
+
+    environ: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID as systemd sets them. clock: a real one; systemd's watchdog
+    does not wait for a simulated one. Raises ConfigError where WATCHDOG_USEC is no number.
+    """
+
+    def __init__(self, clock: Clock, environ: Mapping[str, str] = os.environ) -> None:
+        self._clock = clock
+        self._address = environ.get("NOTIFY_SOCKET", "")
+        if self._address.startswith("@"):  # abstract: it has no place in the file system
+            self._address = "\0" + self._address[1:]
+        self._watchdog_us = _watchdog_us(environ)
+        self._next_ns = clock.now_ns()
+        self._ready, self._status = False, ""
+
+    def turn(self, health: Health) -> None:
+        """Feed the watchdog, and send what is new. Once READY, always READY."""
+        ready, status = health.streams, health.text
+        now_ns = self._clock.now_ns()
+        due = self._watchdog_us > 0 and now_ns >= self._next_ns
+        ready = ready or self._ready
+        news = []
+        if status != self._status:
+            news.append("STATUS=" + " ".join(status.splitlines()))  # a line of its own would be another message
+        if ready and not self._ready:
+            news.append("READY=1")
+        if due:
+            news.append("WATCHDOG=1")
+            if not ready:  # the watchdog sleeps until READY; a start that takes its turns may go on
+                news.append(f"EXTEND_TIMEOUT_USEC={self._watchdog_us}")
+        if news and self._send(news):
+            self._ready, self._status = ready, status
+            if due:
+                self._next_ns = now_ns + self._watchdog_us * 1000 // FEEDS
+
+    def stopping(self) -> None:
+        """Say that the program is about to end."""
+        self._send(["STOPPING=1"])
+
+    def _send(self, news: list[str]) -> bool:
+        if not self._address:
+            return True
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+                manager.setblocking(False)
+                manager.sendto("\n".join(news).encode(errors="replace"), self._address)
+        except OSError:  # gone, or full: a fault of the service manager must not become one of the robot's
+            return False
+        return True
+
+
+def _watchdog_us(environ: Mapping[str, str]) -> int:
+    """Microseconds of this process's watchdog, 0 where there is none."""
+    text, pid = environ.get("WATCHDOG_USEC", "0"), environ.get("WATCHDOG_PID")
+    if not text.isdecimal():
+        raise ConfigError(f"WATCHDOG_USEC={text} is no number of microseconds; leave it to systemd, or unset it")
+    return int(text) if pid in (None, str(os.getpid())) else 0
+
+
+def words(v: Verdict) -> str:
+    """A verdict in words: "sweep 7: plastic rough, 98.7 % (1.2 ms)"."""
+    if not v.status.classified:
+        why = "; ".join(filter(None, (REASONS[v.status], v.detail)))
+        return f"sweep {v.sweep}: no answer, {v.status}: {why}"
+    what = v.label if v.status is Status.OK else f"{v.status}, perhaps {v.label}"
+    fused = f" after {v.fused} sweeps" if v.fused > 1 else ""
+    early = f", early at {v.share:.0%} of the window".replace("%", " %") if v.share < 1 else ""
+    detail = f"; {v.detail}" if v.detail else ""
+    return f"sweep {v.sweep}: {what}, {100 * v.probability:.1f} %{fused}{early} ({v.latency_ns / 1e6:.1f} ms){detail}"
+
+
+class VerdictLog(Observer):
+    """Logs each verdict as one line."""
+
+    def answered(self, verdict: Verdict) -> None:
+        """Log it; one without an answer, or of a finger that lies elsewhere than in training, is a warning."""
+        fine = (verdict.status.classified or verdict.status is Status.ABORTED) and not verdict.moved
+        log.log(INFO if fine else WARNING, words(verdict))

@@ -1,0 +1,33 @@
+"""What the box logs while a block runs: one text a line, a warning with `<4>` before it as in systemd's journal."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from appliance.core.log import log
+
+
+class LineCollector(logging.Handler):
+    """Appends each record to `lines`."""
+
+    def __init__(self, lines: list[str]) -> None:
+        super().__init__()
+        self._lines = lines
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Append the record."""
+        self._lines.append("<4>" * (record.levelno >= logging.WARNING) + record.getMessage())
+
+
+@contextmanager
+def collected() -> Iterator[list[str]]:
+    """The lines that are logged in the block."""
+    lines: list[str] = []
+    handler = LineCollector(lines)
+    log.addHandler(handler)
+    try:
+        yield lines
+    finally:
+        log.removeHandler(handler)
