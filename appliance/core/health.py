@@ -10,7 +10,9 @@ class Health:
     """State of the box at the end of a turn.
 
     time_ns: host monotonic. skin: sensor state (PROTOCOL.md). trouble: why the skin does not stream, "" where it does.
-    streams: frames are arriving. The counts are those of the STA sentence.
+    streams: frames are arriving. The counts, since the program started, are those of the STA sentence: of the sensor
+    from `frames` to `enumerations` and from `stale_frames` to `fifo_overflows` (see SensorCounters), of the serial line
+    `dropped`, of the trigger `glitches`, `lost_edges` and `storms` (see EdgeCounters).
     """
 
     time_ns: int
@@ -26,6 +28,12 @@ class Health:
     dropped: int
     bundle: str
     source: str
+    stale_frames: int
+    overflows: int
+    fifo_overflows: int
+    glitches: int
+    lost_edges: int
+    storms: int
 
     @property
     def text(self) -> str:

@@ -85,8 +85,12 @@ def checksum(body: str) -> str:
 
 def sentence(kind: str, *fields: object) -> bytes:
     """`$PPLP,KIND,field,…*hh` with CR and LF. Characters that NMEA reserves become spaces; a line that is too long is
-    cut."""
-    body = ",".join([TALKER, kind, *(_UNSAFE.sub(" ", str(f)) for f in fields)])[: MAX_LINE - 6]
+    cut, but never within a number: last fields that are whole numbers are left out until the rest fits."""
+    body = ",".join([TALKER, kind, *(_UNSAFE.sub(" ", str(f)) for f in fields)])
+    if len(body) > MAX_LINE - 6:
+        if fields and isinstance(fields[-1], int):
+            return sentence(kind, *fields[:-1])
+        body = body[: MAX_LINE - 6]
     return f"${body}*{checksum(body)}\r\n".encode("ascii")
 
 

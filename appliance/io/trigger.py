@@ -19,11 +19,29 @@ if TYPE_CHECKING:
     from appliance.core.config import TriggerConfig
 
 
+@dataclass(slots=True)
+class EdgeCounters:
+    """Counts since the program started.
+
+    glitches: bursts that did not change the level. lost_edges: dropped by the kernel because its queue was full.
+    storms: bursts of more than `trigger.storm_edges` edges.
+    """
+
+    glitches: int = 0
+    lost_edges: int = 0
+    storms: int = 0
+
+
 class Trigger(Protocol):
     """The source of trigger edges."""
 
     def edges(self, now_ns: int) -> list[Edge]:
         """Edges that are settled at `now_ns`, in order of time; never waits."""
+        ...
+
+    @property
+    def edge_counters(self) -> EdgeCounters:
+        """Counts since the start."""
         ...
 
     @property
@@ -69,7 +87,7 @@ class GpioTrigger:
         check_binding(gpio)
         self._glitch_ns = config.glitch_us * 1000
         self._storm_edges = config.storm_edges
-        self._glitches = self._lost_events = self._storms = 0
+        self.edge_counters = EdgeCounters()
         self._pending: list[Edge] = []
         self._blind_ns: int | None  # newest edge since the levels became unknown; None: they are known
         roles = _roles(config)
@@ -84,21 +102,6 @@ class GpioTrigger:
             self._active, self._rising = gpio.line.Value.ACTIVE, gpio.EdgeEvent.Type.RISING_EDGE
             self._read_levels()
             self._open = stack.pop_all()
-
-    @property
-    def glitches(self) -> int:
-        """Bursts that did not change the level."""
-        return self._glitches
-
-    @property
-    def lost_events(self) -> int:
-        """Events that the kernel dropped because its queue was full."""
-        return self._lost_events
-
-    @property
-    def storms(self) -> int:
-        """Bursts of more than `storm_edges` edges."""
-        return self._storms
 
     @property
     def blind(self) -> bool:
@@ -153,7 +156,7 @@ class GpioTrigger:
         dropped = (event.line_seqno - line.seqno - 1) % 2**32  # the kernel counts in 32 bits
         line.seqno, line.known_ns = event.line_seqno, max(line.known_ns, t_ns)
         if dropped:
-            self._lost_events += dropped
+            self.edge_counters.lost_edges += dropped
             self._lose(t_ns)
         if self._blind_ns is not None:
             self._blind_ns = max(self._blind_ns, t_ns)
@@ -165,14 +168,14 @@ class GpioTrigger:
         # a rise may follow a rise: the kernel reads the level only after the interrupt, so the newest event is right
         line.count, line.last_ns, line.after = line.count + 1, t_ns, event.event_type is self._rising
         if line.count > self._storm_edges:
-            self._storms += 1
+            self.edge_counters.storms += 1
             self._lose(t_ns)
 
     def _settle(self, line: _Line) -> None:
         """The burst has ended: report an edge if it changed the level."""
         line.count = 0
         if line.after == line.level:
-            self._glitches += 1
+            self.edge_counters.glitches += 1
             return
         line.level = line.after
         if kind := line.meaning[line.level]:

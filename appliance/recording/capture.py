@@ -22,6 +22,7 @@ from appliance.core.schema import typed
 from appliance.core.types import Edge, EdgeKind, Frames, SweepFormat
 from appliance.io.packets import Identity
 from appliance.io.robot_link import Command, command
+from appliance.io.trigger import EdgeCounters
 from appliance.io.usb_sensor import SensorCounters, Stream
 
 MAGIC = b"PPLPCAP1"
@@ -110,6 +111,7 @@ class Playback:
         self.trouble: SensorError | None = None
         self.identity: Identity | None = None
         self.counters = SensorCounters()
+        self.edge_counters = EdgeCounters()  # a capture holds the edges that were reported, none of the others
         self._stream = Stream(self.format, self.counters)
         self._records = deque(_records(path, data, begin))
         self._now_ns = self._records[0][1] if self._records else 0

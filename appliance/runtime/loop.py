@@ -195,13 +195,15 @@ class Box:
     @property
     def health(self) -> Health:
         """The state now."""
-        sensor, counters = self._sensor, self._sensor.counters
+        sensor, counters, edges = self._sensor, self._sensor.counters, self._trigger.edge_counters
         return Health(
             time_ns=self._clock.now_ns(), skin=sensor.state, trouble=str(sensor.trouble or ""),
             streams=sensor.state == "streaming" and counters.frames > 0, sweeping=self._cutter.sweeping,
             answered=self.answered, frames=counters.frames, lost_frames=counters.lost_frames,
             garbage_bytes=counters.garbage_bytes, enumerations=counters.enumerations,
             dropped=self._port.dropped if self._port else 0, bundle=self._classifier.bundle.id, source=self._source,
+            stale_frames=counters.stale_frames, overflows=counters.overflows, fifo_overflows=counters.fifo_overflows,
+            glitches=edges.glitches, lost_edges=edges.lost_edges, storms=edges.storms,
         )  # fmt: skip
 
     def circumstances(self) -> dict[str, Any]:
@@ -225,7 +227,8 @@ class Box:
         h = self.health
         return [
             f"{h.time_ns / 1e9:.3f}", h.skin, int(h.sweeping), h.answered, h.frames, h.lost_frames, h.garbage_bytes,
-            h.enumerations, h.dropped, h.bundle, h.source,
+            h.enumerations, h.dropped, h.bundle, h.source, h.stale_frames, h.overflows, h.fifo_overflows, h.glitches,
+            h.lost_edges, h.storms,
         ]  # fmt: skip
 
     def _answer_to(self, command: Command) -> bytes:

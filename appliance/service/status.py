@@ -126,6 +126,8 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
     head = f"process {report['pid']}, palpate {report['version']}, source {report['source']}"
     rows = [f"running for {_span(now_ns - report['since_ns'])} ({head})"]
     facts = {"skin": _skin(report), "bundle": report["bundle"], "sweeps": f"{report['answered']} answered"}
+    if edges := _trigger(report):
+        facts["trigger"] = edges
     if report["dropped"]:
         facts["serial"] = f"{report['dropped']} sentences dropped, since nobody read them; check the robot's end"
     shown = {"version", "why", *Health.__slots__}
@@ -139,9 +141,22 @@ def _skin(report: Mapping[str, Any]) -> str:
     counted = f"{report['frames']:,} frames, {report['lost_frames']:,} lost"
     if report["garbage_bytes"]:
         counted += f", {report['garbage_bytes']:,} bytes in no packet"
+    if report["stale_frames"]:
+        counted += f", {report['stale_frames']:,} repeated or late"
+    if report["overflows"]:
+        counted += f", {report['overflows']:,} transfers too large"
+    if report["fifo_overflows"]:
+        counted += f", {report['fifo_overflows']:,} times the board's FIFO was full"
     if report["enumerations"] > 1:
         counted += f", plugged in {report['enumerations']} times"
     return f"{report['skin']}{': ' if report['trouble'] else ''}{report['trouble']} ({counted})"
+
+
+def _trigger(report: Mapping[str, Any]) -> str:
+    """What was wrong with the trigger lines, "" where nothing was."""
+    counts = {"glitches": "glitches", "lost_edges": "edges lost", "storms": "storms of edges"}
+    found = [f"{report[name]:,} {text}" for name, text in counts.items() if report[name]]
+    return f"{', '.join(found)}; check the trigger lines" if found else ""
 
 
 def _line(v: Mapping[str, Any], now_ns: int) -> str:

@@ -123,7 +123,7 @@ def test_break_and_noise(cell: Cell, count: Count, note: Note) -> None:
         cell.state()  # by then noise has been told from commands, and answered; a robot waits so long at least
         cell.serial.say(b"$PPLP,ID\r\n")
         cell.serial.wait_for("$PPLP,ANS,ID,ok", 60, since)
-    assert len(cell.state()) == 11
+    assert len(cell.state()) == 17
     note(f"{size} bytes of noise, with line ends and without", "the next command is obeyed", 2)
 
 

@@ -245,7 +245,8 @@ def test_samples_are_what_the_box_prints():
     health = {
         "time_ns": 0, "skin": "streaming", "trouble": "", "streams": True, "sweeping": False, "answered": 1,
         "frames": 54006, "lost_frames": 0, "garbage_bytes": 0, "enumerations": 1, "dropped": 0, "bundle": "d5b2b6ef",
-        "source": "usb",
+        "source": "usb", "stale_frames": 0, "overflows": 0, "fifo_overflows": 0, "glitches": 0, "lost_edges": 0,
+        "storms": 0,
     }  # fmt: skip
     now_ns = 72_000_000_000
     file = {

@@ -27,7 +27,7 @@ from appliance.sim import rig, skin
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import SECOND
 
-IDLE = Health(0, "streaming", "", True, False, 0, 0, 0, 0, 1, 0, "", "sim")
+IDLE = Health(0, "streaming", "", True, False, 0, 0, 0, 0, 1, 0, "", "sim", *[0] * 6)
 SWEEPING = replace(IDLE, sweeping=True)
 
 

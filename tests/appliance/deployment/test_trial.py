@@ -29,7 +29,7 @@ def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Healt
     return Health(
         time_ns=round(time_s * SECOND), skin="streaming" if streams else "absent", trouble="", streams=streams,
         sweeping=sweeping, answered=0, frames=0, lost_frames=0, garbage_bytes=0, enumerations=1, dropped=0,
-        bundle="", source="sim",
+        bundle="", source="sim", stale_frames=0, overflows=0, fifo_overflows=0, glitches=0, lost_edges=0, storms=0,
     )  # fmt: skip
 
 

@@ -365,7 +365,7 @@ def test_glitches(need: Need):
     with Watcher(u, mode="one-line", glitch_us=1_000_000) as watcher:
         pulse(u, u.trigger.start)
         assert watcher.seconds(1.2) == []
-        assert watcher.trigger.glitches == 1
+        assert watcher.trigger.edge_counters.glitches == 1
         u.drive(u.trigger.start, True)
         assert [kind for kind, _ in watcher.edges(1)] == [EdgeKind.START]
 
@@ -390,7 +390,7 @@ def test_more_edges_than_the_kernel_keeps(need: Need):
         assert [kind for kind, _ in watcher.edges(1)] == [EdgeKind.LOST]
         until(u, lambda: (watcher.look(), not watcher.trigger.blind)[1])
         assert watcher.told == []
-        assert 0 < watcher.trigger.lost_events < 3000
+        assert 0 < watcher.trigger.edge_counters.lost_edges < 3000
         pulse(u, u.trigger.start)
         assert [kind for kind, _ in watcher.edges(1)] == [EdgeKind.START]
 

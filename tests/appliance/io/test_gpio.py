@@ -166,7 +166,7 @@ def test_bounce_keeps_first_stamp() -> None:
     bounce = [10 * MS + us * US for us in (0, 20, 90, 300, 420, 900, 1300)]
     world.drive("START", *bounce, 100 * MS)
     assert world.run(200 * MS) == [(START, 10 * MS), (STOP, 100 * MS)]
-    assert world.trigger.glitches == 0
+    assert world.trigger.edge_counters.glitches == 0
 
 
 @pytest.mark.parametrize("width_ns", [10 * US, 100 * US, GLITCH - 1])
@@ -176,7 +176,7 @@ def test_glitch(width_ns: int, high: bool) -> None:
     world = World(high="START" if high else "", mode="one-line", stop="")
     world.drive("START", 10 * MS, 10 * MS + width_ns, level=not high)
     assert world.run(20 * MS) == []
-    assert world.trigger.glitches == 1
+    assert world.trigger.edge_counters.glitches == 1
 
 
 def test_pulse_of_glitch_us() -> None:
@@ -191,7 +191,7 @@ def test_level_seen_too_late() -> None:
     world = World()
     world.queue((False, MS, 1), (False, MS + US, 2))
     assert world.poll(3 * MS) == []
-    assert world.trigger.glitches == 1
+    assert world.trigger.edge_counters.glitches == 1
     world.queue((True, 4 * MS, 3), (True, 4 * MS + US, 4))
     assert world.poll(6 * MS) == [(START, 4 * MS)]
 
@@ -223,7 +223,7 @@ def test_interrupts_overtake() -> None:
     assert world.poll(MS + 10 * US) == []
     request.queue.append(late)
     assert world.run(3 * MS, 100 * US) == [(START, MS), (STOP, MS + 5 * US)]
-    assert world.trigger.lost_events == 0
+    assert world.trigger.edge_counters.lost_edges == 0
 
 
 def test_edges_that_the_kernel_joins() -> None:
@@ -233,7 +233,7 @@ def test_edges_that_the_kernel_joins() -> None:
     told = (fall, MS + 20 * US, 2, 1), (rise, 5 * MS + 20 * US, 5, 2)  # kind, stamp, edges so far, events so far
     world.gpio.requests[0].queue.extend(gpiod.EdgeEvent(k, world.t0 + t, 1, edges, n) for k, t, edges, n in told)
     assert world.poll(9 * MS) == [(START, 5 * MS + 20 * US)]
-    assert (world.trigger.lost_events, world.trigger.glitches) == (0, 1)
+    assert (world.trigger.edge_counters.lost_edges, world.trigger.edge_counters.glitches) == (0, 1)
 
 
 def test_event_numbers_wrap() -> None:
@@ -242,7 +242,7 @@ def test_event_numbers_wrap() -> None:
     world.trigger._lines[0].seqno = 2**32 - 2
     world.queue((True, MS, 2**32 - 1), (False, 3 * MS, 0), (True, 5 * MS, 1))
     assert world.poll(9 * MS) == [(START, MS), (START, 5 * MS)]
-    assert world.trigger.lost_events == 0
+    assert world.trigger.edge_counters.lost_edges == 0
 
 
 # ---------------------------------------------------------------- losses and storms
@@ -255,10 +255,10 @@ def test_overrun() -> None:
     assert world.run(6 * MS) == [(START, 5 * MS)]
     world.drive("START", *(t * MS for t in range(10, 17)), level=False)
     assert world.poll(20 * MS) == [(LOST, 13 * MS)]  # the first that was left
-    assert world.trigger.lost_events == 3
+    assert world.trigger.edge_counters.lost_edges == 3
     world.drive("START", 30 * MS, 40 * MS)  # it is low now, though a START was told last
     assert world.run(50 * MS) == [(START, 30 * MS), (STOP, 40 * MS)]
-    assert world.trigger.glitches == world.trigger.storms == 0
+    assert world.trigger.edge_counters.glitches == world.trigger.edge_counters.storms == 0
 
 
 def test_blind_until_quiet() -> None:
@@ -278,9 +278,9 @@ def test_loss_upon_loss() -> None:
     world = World(queue=32)
     world.drive("START", *(10 * MS + i * US for i in range(100)))
     assert world.poll(10 * MS + 49 * US) == [(LOST, 10 * MS + 18 * US)]
-    assert world.trigger.lost_events == 50 - 32
+    assert world.trigger.edge_counters.lost_edges == 50 - 32
     assert world.run(20 * MS) == []
-    assert world.trigger.lost_events == 100 - 32 - 32
+    assert world.trigger.edge_counters.lost_edges == 100 - 32 - 32
 
 
 def test_loss_ends_what_is_open() -> None:
@@ -308,7 +308,7 @@ def test_storm(step_ns: int) -> None:
     world = World(mode="one-line", stop="")
     world.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
     assert world.run(200 * MS) == [(LOST, 10 * MS + 2000 * step_ns)]
-    assert (world.trigger.storms, world.trigger.lost_events) == (1, 0)
+    assert (world.trigger.edge_counters.storms, world.trigger.edge_counters.lost_edges) == (1, 0)
     world.drive("START", 300 * MS, 400 * MS)
     assert world.run(500 * MS) == [(START, 300 * MS), (STOP, 400 * MS)]
 
@@ -325,7 +325,7 @@ def test_storm_between_two_calls() -> None:
     world = World()
     world.drive("START", *(10 * MS + i * US for i in range(10_000)))
     assert world.poll(50 * MS) == [(LOST, 10 * MS + 8976 * US)]
-    assert world.trigger.lost_events == 8976
+    assert world.trigger.edge_counters.lost_edges == 8976
     world.drive("START", 60 * MS)
     assert world.run(70 * MS) == [(START, 60 * MS)]
 
@@ -348,7 +348,7 @@ def test_unread_rest_of_a_burst() -> None:
     told = [world.poll((50 + i) * MS) for i in range(5)]
     assert [edge for edges in told for edge in edges] == [(START, 10 * MS), (STOP, 11 * MS)]
     assert told[0] == told[1] == []
-    assert world.trigger.glitches == 0
+    assert world.trigger.edge_counters.glitches == 0
 
 
 def test_unread_edges_of_another_chip() -> None:
@@ -427,7 +427,7 @@ def test_any_losses(gaps_us: list[int], step_us: int, storm_edges: int, queue: i
     assert all(a <= b for (_, a), (_, b) in pairwise(told))
     by_the_book = {(START if level != high else STOP, t_ns) for t_ns, level in settled(times)}
     assert {edge for edge in told if edge[0] is not LOST} <= by_the_book
-    lost = world.trigger.lost_events + world.trigger.storms
+    lost = world.trigger.edge_counters.lost_edges + world.trigger.edge_counters.storms
     assert bool(lost) == any(kind is LOST for kind, _ in told)
     assert not world.trigger.blind
 

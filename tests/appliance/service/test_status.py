@@ -7,6 +7,7 @@ import os
 import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,15 +17,17 @@ import pytest
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.health import Health
 from appliance.core.types import Status, Verdict
+from appliance.io.robot_link import MAX_LINE, sentence
 from appliance.service import status
 from appliance.service.status import StatusFile
 from appliance.service.systemd import REASONS, VerdictLog
-from appliance.sim import rig
-from tests.factories.simulated_box import SECOND, Rigged
+from appliance.sim import devices, rig
+from tests.factories.simulated_box import SECOND, Rigged, idle_world
 
 HEALTH = Health(
     time_ns=0, skin="streaming", trouble="", streams=True, sweeping=False, answered=7, frames=5_000_000, lost_frames=3,
     garbage_bytes=0, enumerations=1, dropped=0, bundle="9f3c2a1b", source="usb",
+    stale_frames=0, overflows=0, fifo_overflows=0, glitches=0, lost_edges=0, storms=0,
 )  # fmt: skip
 AWAY = replace(HEALTH, skin="absent", trouble="no skin on USB; check cable", streams=False)
 OK = Verdict(
@@ -223,3 +226,67 @@ def test_the_log_has_one_line_a_verdict(verdict: Verdict, line: str, logged: lis
 def test_every_status_without_a_label_has_its_reason():
     """One list: a new status must say what to look at."""
     assert set(REASONS) == {s for s in Status if not s.classified}
+
+
+def once(change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """A fault of the bus that changes one transfer."""
+    left = [change]
+    return lambda data: left.pop()(data) if left else data
+
+
+def burst(line: str, edges: int, apart_s: float) -> Callable[[Rigged], None]:
+    """A fault of a trigger line: so many edges, the last one down."""
+
+    def drive(box: Rigged) -> None:
+        for i in range(edges):
+            box.edge(line, 0.1 + i * apart_s, i % 2 == 0)
+
+    return drive
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "fault", "text"),
+    [
+        ("stale_frames", 12, lambda box: setattr(box.world.backend, "mangle", once(lambda data: data * 2)),
+         "4 repeated or late"),
+        ("overflows", 13, lambda box: setattr(box.world.backend, "mangle", once(lambda data: data + bytes(5000))),
+         "1 transfers too large"),
+        ("fifo_overflows", 14, lambda box: box.world.clock.sleep_until(box.world.clock.now_ns() + 2 * SECOND),
+         "1 times the board's FIFO was full"),
+        ("glitches", 15, burst(devices.START, 2, 1e-4), "1 glitches; check the trigger lines"),
+        ("lost_edges", 16, burst(devices.STOP, 3000, 1e-6), "edges lost; check the trigger lines"),
+        ("storms", 17, burst(devices.STOP, 60, 1e-4), "1 storms of edges; check the trigger lines"),
+    ],
+)  # fmt: skip
+def test_what_is_counted_is_shown(
+    rigged: Callable[..., Rigged], tmp_path: Path, name: str, field: int, fault: Callable[[Rigged], None], text: str
+):
+    """Each fault is in the STA sentence, in its answer to STATE, in the file and in words, and was not before it."""
+    world = idle_world(60)
+    file = StatusFile(tmp_path / "status.json", world.clock)
+    box = rigged(world, ("trigger.storm_edges=50",) if name == "storms" else (), observers=[file])
+    box.seconds(1.5)
+
+    def shown() -> tuple[int, int, int, bool]:
+        report = status.read(tmp_path / "status.json", world.clock.now_ns())
+        answer = box.ask("$PPLP,STATE").split("*")[0].split(",")[4:]
+        sentence = next(h for h in reversed(box.heard) if ",STA," in h).split("*")[0].split(",")[2:]
+        in_words = text in "\n".join(status.lines(report, world.clock.now_ns()))
+        return int(sentence[field - 1]), int(answer[field - 1]), report[name], in_words
+
+    assert shown() == (0, 0, 0, False)
+    fault(box)
+    box.seconds(2.5)
+    said, answered, written, in_words = shown()
+    assert said == answered == written == getattr(box.box.health, name) > 0
+    assert in_words
+
+
+def test_numbers_of_a_state_are_left_out_rather_than_cut():
+    """After years of faults the line is full: the counts that are there are whole, and the line is no longer than ever."""
+    states = ["31536000.125", "streaming", 1, 10_000_000, 23_652_000_000, 99_999_999, 99_999_999, 99_999, 9_999_999]
+    for kind in (("STA",), ("ANS", "STATE", "ok")):
+        line = sentence(*kind, *states, "9f3c2a1b", "usb", *[987_654_321] * 6).decode()
+        assert len(line) <= MAX_LINE
+        assert set(line.split("*")[0].split(",")[len(kind) + 12 :]) <= {"987654321"}
+        assert ",9f3c2a1b,usb" in line
