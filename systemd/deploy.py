@@ -1,8 +1,8 @@
 """Delivers a bundle to boxes. In: which boxes, the bundle's folder. Out: a line for each box.
 
-What is copied to a box is not trusted there: `palpate install` checks signature, manifest, model and golden sweeps with the
-box's own runtime and has it run from the next start on, on trial. Cut at any moment, the box has the old bundle or the
-new one; run the command again to finish.
+A box does not trust what is copied to it: `palpate install` checks signature, manifest, model and golden sweeps with the
+box's own runtime, and the bundle runs on trial from the next start on. If the delivery is interrupted at any moment, the
+box has the old bundle or the new one; run the command again to finish.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from appliance.deployment import signature
 from appliance.inference.classifier import Classifier
 
 READY_S, STARTS = 60, 5
-"""After three starts in vain a box goes back by itself: one that does not come up then will not."""
+"""After three failed starts a box goes back by itself; one that is not READY after five will not be."""
 LIMIT_S = 300
-"""For all of one box."""
+"""Longest time for all of one box."""
 
 
 @dataclass(frozen=True)
-class Parcel:
-    """What goes to the boxes. sha: of the manifest, hexadecimal. name: for a person. archive: a tar of its files."""
+class BundleArchive:
+    """A bundle as it is copied to boxes. sha: of its manifest, hexadecimal. name: for a person. archive: a tar of its files."""
 
     sha: str
     name: str
@@ -46,18 +46,18 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--shadow", action="store_true", help="as the candidate, which classifies beside")
     args = parser.parse_args(argv)
     try:
-        parcel = checked(args.bundle, args.signers)
+        packed = checked(args.bundle, args.signers)
     except ApplianceError as e:
         print(f"palpate: {e}", file=sys.stderr)
         return e.exit_code
-    return each(args, lambda box: deliver(box, parcel, args.shadow))
+    return each(args, lambda box: deliver(box, packed, args.shadow))
 
 
-def checked(folder: Path, signers: Path | None) -> Parcel:
-    """The bundle in `folder`, when it does here what its manifest says. Raises ApplianceError where it does not."""
+def checked(folder: Path, signers: Path | None) -> BundleArchive:
+    """The bundle in `folder`, once it has passed its checks and golden sweeps here. Raises ApplianceError where it does not."""
     files = bundle.files(folder)
-    held = bundle.made(files, str(folder))
-    Classifier(held, SystemClock()).self_test()
+    loaded = bundle.made(files, str(folder))
+    Classifier(loaded, SystemClock()).self_test()
     if bundle.SIGNATURE not in files:
         raise BundleError(f"{folder} is not signed; sign it with palpate-train sign")
     if signers:
@@ -68,59 +68,59 @@ def checked(folder: Path, signers: Path | None) -> Parcel:
             member = tarfile.TarInfo(name)
             member.size = len(data)
             tar.addfile(member, io.BytesIO(data))
-    m = held.manifest
+    m = loaded.manifest
     sha = bundle.digest(files[bundle.MANIFEST])
-    return Parcel(sha, f"{m.name} {m.version} ({held.id})", archive.getvalue())
+    return BundleArchive(sha, f"{m.name} {m.version} ({loaded.id})", archive.getvalue())
 
 
-def deliver(box: Box, parcel: Parcel, shadow: bool) -> str:
-    """Have one box run the bundle, or take it as its candidate; its line."""
+def deliver(box: Box, packed: BundleArchive, shadow: bool) -> str:
+    """Install the bundle on one box, or make it the candidate there; the line for this box."""
     store, status = where(box)
-    if not shadow and _runs(box, parcel, store, status):
-        return f"{parcel.name} runs already"
-    file, incoming = f".palpate-{parcel.sha[:16]}.tar", f"{store}/incoming"
-    box.put(io.BytesIO(parcel.archive), file)
-    # what an earlier one left there goes, too
-    fresh = f"umask 077; mkdir -p {incoming} && find {incoming} -mindepth 1 -delete && mkdir {incoming}/{parcel.sha}"
-    box.run("copying", f"{fresh} && tar -x -C {incoming}/{parcel.sha}", user="palpate", stdin=file)
+    if not shadow and _runs(box, packed, store, status):
+        return f"{packed.name} runs already"
+    file, incoming = f".palpate-{packed.sha[:16]}.tar", f"{store}/incoming"
+    box.put(io.BytesIO(packed.archive), file)
+    # also removes what an interrupted delivery left there
+    fresh = f"umask 077; mkdir -p {incoming} && find {incoming} -mindepth 1 -delete && mkdir {incoming}/{packed.sha}"
+    box.run("copying", f"{fresh} && tar -x -C {incoming}/{packed.sha}", user="palpate", stdin=file)
     box.run("tidying up", f"rm {file}")
-    install = f"{PALPATE} install {incoming}/{parcel.sha}{' --shadow' if shadow else ''}"
+    install = f"{PALPATE} install {incoming}/{packed.sha}{' --shadow' if shadow else ''}"
     box.run("checking it there", install, user="palpate", limit_s=120)
-    box.run("tidying up", f"rm -r {incoming}/{parcel.sha}", user="palpate")
-    return told(box, parcel, ready=box.restart(READY_S, STARTS), shadow=shadow)
+    box.run("tidying up", f"rm -r {incoming}/{packed.sha}", user="palpate")
+    return outcome(box, packed, ready=box.restart(READY_S, STARTS), shadow=shadow)
 
 
 def where(box: Box) -> tuple[str, str]:
-    """The folder of the box's store and the file of its status. Raises Failed where a bundle would not be used."""
+    """Paths on the box: the folder of its store and its status file. Raises Failed where it would not use a delivered bundle."""
     lacks = "{ echo 'no Palpate is installed there; make install HOST=... first' >&2; exit 1; }"
     settings = tomllib.loads(box.run("asking for its settings", f"test -x {PALPATE} || {lacks}; {PALPATE} config"))
     if own := settings["classifier"]["bundle"]:
         raise Failed(f"its settings name a bundle, classifier.bundle = {own!r}; take that out of them first")
-    return settings["store"]["folder"], settings["store"]["status"]
+    return str(settings["store"]["folder"]), str(settings["store"]["status"])
 
 
-def _runs(box: Box, parcel: Parcel, store: str, status: str) -> bool:
-    """Whether the box's program runs the bundle now, and will after a start, too."""
+def _runs(box: Box, packed: BundleArchive, store: str, status: str) -> bool:
+    """Whether the box runs the bundle now, and will after a restart."""
     look = f"readlink {store}/current && cat {status}"
-    link, _, said = box.run("asking what runs", f"{look} || true", user="root").partition("\n")
-    return link == f"bundles/{parcel.sha}" and bool(said) and json.loads(said)["bundle"] == parcel.sha[:8]
+    link, _, text = box.run("asking what runs", f"{look} || true", user="root").partition("\n")
+    return link == f"bundles/{packed.sha}" and bool(text) and json.loads(text)["bundle"] == packed.sha[:8]
 
 
-def told(box: Box, parcel: Parcel, *, ready: bool, shadow: bool) -> str:
-    """What became of the bundle, in words. Raises Failed where the box has left it already."""
+def outcome(box: Box, packed: BundleArchive, *, ready: bool, shadow: bool) -> str:
+    """What the box does with the bundle now, in words. Raises Failed where it has gone back already."""
     listed = json.loads(box.run("asking for its bundles", f"{PALPATE} bundles --json", user="palpate"))
-    entry = next((one for one in listed if one["sha"] == parcel.sha), None)
+    entry = next((one for one in listed if one["sha"] == packed.sha), None)
     if entry is None or entry["role"] not in ("current", "on trial", "candidate"):
         raise Failed(f"the box went back to what it had: {entry['detail'] if entry else 'the bundle is gone'}")
     if shadow != (entry["role"] == "candidate"):
         raise Failed(f"the bundle is {entry['role']} there; somebody else was at work, too")
     role = f"{entry['role']}: {entry['detail']}" if entry["detail"] else entry["role"]
-    if not ready and box.told["waits"].startswith("skin mismatch"):
-        raise Failed(f"the bundle is {role}, but {box.told['waits']}; palpate rollback goes back")
+    if not ready and box.result["waits"].startswith("skin mismatch"):
+        raise Failed(f"the bundle is {role}, but {box.result['waits']}; palpate rollback goes back")
     if not ready:
-        return f"{parcel.name} is {role}; READY waits: {box.told['waits']}"
-    lost = f"{box.told['lost_s']} s without classifying; " if "lost_s" in box.told else ""
-    return f"{parcel.name} is READY {box.told['ready_s']} s after the command; {lost}{role}"
+        return f"{packed.name} is {role}; READY waits: {box.result['waits']}"
+    lost = f"{box.result['lost_s']} s without classifying; " if "lost_s" in box.result else ""
+    return f"{packed.name} is READY {box.result['ready_s']} s after the command; {lost}{role}"
 
 
 if __name__ == "__main__":

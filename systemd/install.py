@@ -1,9 +1,9 @@
 """Installs or upgrades the runtime on bare Debian boxes. In: which boxes, this checkout. Out: a line for each box.
 
 A release is one folder, /opt/palpate-<version>-<hash>: virtual environment, unit, users, rules, board files, manual. All
-places outside lead into it through the link /opt/palpate, which is swapped by one rename when the folder is whole and
-has passed its self-test. So after a cut at any moment a box starts with the old runtime and the old unit, or the new
-ones; run the command again to finish. The boxes need no internet, but for packages of Debian that are missing.
+paths outside lead into it through the link /opt/palpate, which is swapped by one rename when the folder is complete and
+has passed its self-test. So after an interruption at any moment a box starts with the old runtime and the old unit, or with
+the new ones; run the command again to finish. The boxes need internet only for missing Debian packages.
 """
 
 from __future__ import annotations
@@ -14,17 +14,18 @@ import tempfile
 from pathlib import Path
 
 from fleet import Box, Failed, each, options
-from parcel import ROOT, Parcels
+from release import ROOT, ReleaseArchives
 
 from appliance import __version__
 
 WHEEL = ROOT / "dist" / f"palpate-{__version__}-py3-none-any.whl"
 PACKAGES = ("python3-venv", "libusb-1.0-0", "openssh-client")
-"""Debian's: a virtual environment, the skin on USB, signatures (ssh-keygen)."""
+"""Debian packages: for a virtual environment, the skin on USB, signatures (ssh-keygen)."""
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
-"""Debian's name of an architecture, and that of Python's wheels."""
-HERE = "/opt/palpate"
-PLACES = {
+"""Names of an architecture: by Debian, and in Python's wheels."""
+LINK = "/opt/palpate"
+"""Leads to the release that runs."""
+PATHS = {
     "systemd/palpate.service": "/etc/systemd/system/palpate.service",
     "systemd/palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "systemd/palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
@@ -37,28 +38,29 @@ PLACES = {
     "docs/alignment/page.png": "/usr/share/doc/palpate/alignment/page.png",
     "firmware_config/PROTOCOL.md": "/usr/share/doc/palpate/PROTOCOL.md",
 }
-"""Files of this checkout, and where a box looks for them."""
-LINKS = {place: f"{HERE}/share/palpate/{Path(name).name}" for name, place in PLACES.items()} | {
+"""Files of this checkout, and their paths on a box."""
+LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS.items()} | {
     "/etc/systemd/system/multi-user.target.wants/palpate.service": "../palpate.service",
-    "/usr/local/bin/palpate": f"{HERE}/bin/palpate",
+    "/usr/local/bin/palpate": f"{LINK}/bin/palpate",
 }
-"""What leads from these places into the release."""
+"""Symlinks on a box, and where each leads to."""
 PIP = "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index --root-user-action=ignore"
 SELF_TEST = """
 import sys; from pathlib import Path; from appliance.bundle import bundle
 from appliance.cli.commands import load_bundle; from appliance.core import clock, config
 from appliance.inference import classifier
 settings = config.load(None, folder=Path(sys.argv[1]))
-for held in (bundle.load(bundle.DEFAULT), load_bundle(settings)):
-    classifier.Classifier(held, clock.SystemClock()).self_test()
+for one in (bundle.load(bundle.DEFAULT), load_bundle(settings)):
+    classifier.Classifier(one, clock.SystemClock()).self_test()
 """
-"""The settings are understood, and the bundle that is packaged and the one in use do what they should."""
+"""Program that a new release must run without an error: reads the settings, and runs the golden sweeps of the packaged bundle
+and of the one in use."""
 PACKAGES_S = BUILD_S = 600
-"""For packages, and for the environment, on a slow card."""
+"""Limits for installing packages and for building the environment, on a slow card."""
 READY_S, STARTS = 40, 2
-"""When a release counts as one that does not come up."""
+"""A release has failed that is not READY after so many seconds, or has ended so often."""
 LIMIT_S = 1800
-"""For all of one box."""
+"""Longest time for all of one box."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -73,55 +75,57 @@ def main(argv: list[str] | None = None) -> int:
             sys.exit(f"palpate: no file {file}; check the path (make wheel makes the wheel)")
     signers = args.signers.read_text() if args.signers else ""
     with tempfile.TemporaryDirectory() as folder:
-        parcels = Parcels(args.wheel, [*PLACES], Path(folder))
-        return each(args, lambda box: install(box, parcels, box.data("board", args.board), signers))
+        archives = ReleaseArchives(args.wheel, [*PATHS], Path(folder))
+        return each(args, lambda box: install(box, archives, box.data("board", args.board), signers))
 
 
-def install(box: Box, parcels: Parcels, board: str, signers: str) -> str:
-    """Bring one box to this release, whatever it has now; its line."""
+def install(box: Box, archives: ReleaseArchives, board: str, signers: str) -> str:
+    """Install this release on one box, whatever it has now; the line for this box."""
     machine = survey(box)
     packages(box)
     python = box.run("asking for Python", "python3 -c 'import platform; print(platform.python_version())'")
     if tuple(map(int, python.split(".")[:2])) < (3, 11):
         raise Failed(f"its Python is {python}; Palpate needs 3.11 or later, which Debian 12 has")
-    name, parcel = parcels.of(machine, python)
-    release = f"{HERE}-{name}"
+    name, archive = archives.of(machine, python)
+    release = f"{LINK}-{name}"
     if not box.run("looking for the release", f"cat {release}/stamp 2>/dev/null || true"):
-        box.say(f"copying {name}, {parcel.stat().st_size / 1e6:.0f} MB")
-        box.put(parcel, f".palpate-{name}.tar")
-        box.say("building its environment")
+        box.report(f"copying {name}, {archive.stat().st_size / 1e6:.0f} MB")
+        box.put(archive, f".palpate-{name}.tar")
+        box.report("building its environment")
         box.run("building the environment", build(release), user="root", stdin=f".palpate-{name}.tar", limit_s=BUILD_S)
         box.run("tidying up", f"rm -f .palpate-{name}.tar")
     kept = box.run("users, folders and settings", prepare(release, board, signers), user="root")
     if kept:
-        box.say(f"{' '.join(kept.split())} stays as it is there: a file, not the link to the release's")
+        box.report(f"{' '.join(kept.split())} stays as it is there: a file, not the link to the release's")
     box.run("self-test", self_test(release), user="root", limit_s=120)
     return switch(box, name, release)
 
 
 def survey(box: Box) -> str:
-    """Python's name of the box's architecture. Raises Failed where Palpate does not run on such a box."""
-    said = box.run("looking at its system", '. /etc/os-release; echo "$PRETTY_NAME"; dpkg --print-architecture || true')
-    system, _, arch = said.partition("\n")
+    """The box's architecture as wheels name it. Raises Failed where Palpate does not run on such a box."""
+    output = box.run(
+        "looking at its system", '. /etc/os-release; echo "$PRETTY_NAME"; dpkg --print-architecture || true'
+    )
+    system, _, arch = output.partition("\n")
     if arch not in MACHINES:
         raise Failed(f"its system is {system}, {arch or 'not Debian'}; Palpate needs Debian 12 for arm64 or amd64")
-    # systemd reads units before it mounts anything, and the unit lies in the release
+    # systemd reads units before it mounts anything, and the unit is in the release
     if box.run("looking at /opt", "stat -c %m /opt") != "/":
         raise Failed("/opt is a file system of its own there; it must be part of the root file system")
-    if box.run(f"looking at {HERE}", f"test -e {HERE} && test ! -L {HERE} && echo folder || true"):
-        raise Failed(f"{HERE} is a folder there, not the link that this command swaps; move it away first")
+    if box.run(f"looking at {LINK}", f"test -e {LINK} && test ! -L {LINK} && echo folder || true"):
+        raise Failed(f"{LINK} is a folder there, not the link that this command swaps; move it away first")
     return MACHINES[arch]
 
 
 def packages(box: Box) -> None:
-    """Get what is missing of Debian's packages."""
+    """Install the Debian packages that are missing. Raises Failed where they cannot be installed."""
     status = "dpkg-query -W -f '${db:Status-Status} ${binary:Package}\\n' " + " ".join(PACKAGES)
-    said = box.run("looking for packages", f"{status} 2>/dev/null || true")
-    there = {line.split()[1].split(":")[0] for line in said.splitlines() if line.startswith("installed ")}
-    missing = " ".join(name for name in PACKAGES if name not in there)
+    output = box.run("looking for packages", f"{status} 2>/dev/null || true")
+    present = {line.split()[1].split(":")[0] for line in output.splitlines() if line.startswith("installed ")}
+    missing = " ".join(name for name in PACKAGES if name not in present)
     if not missing:
         return
-    box.say(f"installing {missing}")
+    box.report(f"installing {missing}")
     get = f"DEBIAN_FRONTEND=noninteractive apt-get -q -y -o DPkg::Lock::Timeout=120 install --no-install-recommends {missing}"
     try:
         box.run("apt-get", f"{get} || {{ apt-get update -q && {get}; }}", user="root", limit_s=PACKAGES_S)
@@ -132,9 +136,9 @@ def packages(box: Box) -> None:
 
 
 def build(release: str) -> str:
-    """The commands that make a release of the parcel on standard input: whole, on the disk, then stamped.
+    """Commands that build a release from the archive on standard input, write it to the disk, and stamp it as complete.
 
-    Those of an install whose desktop died may be at it still: they are waited for.
+    The commands of an earlier install, whose desktop died, may still run: a lock waits for them.
     """
     return f"""set -e; umask 022
 exec 9> /run/palpate-install.lock; flock -w {BUILD_S} 9; ! [ -e {release}/stamp ] || exit 0
@@ -149,7 +153,7 @@ sync -f {release}"""
 
 
 def prepare(release: str, board: str, signers: str) -> str:
-    """The commands that make what the new release needs outside and what does not harm the old one."""
+    """Commands that set up users, folders, settings and links outside the release. The old release can run with them, too."""
     share = f"{release}/share/palpate"
     lines = [
         "set -e; umask 022",
@@ -166,12 +170,12 @@ def prepare(release: str, board: str, signers: str) -> str:
         file = "/etc/palpate/palpate.toml"
         text = shlex.quote(f'board = "{board}"\n')
         lines += [f"if [ ! -e {file} ]; then {_put(file, text)}; fi"]
-    for place, target in LINKS.items():
-        settings = place.startswith("/etc/palpate/")
-        own = f"echo {place}" if settings else f"echo '{place} is a file there, not a link; move it away' >&2; exit 1"
+    for path, target in LINKS.items():
+        settings = path.startswith("/etc/palpate/")
+        own = f"echo {path}" if settings else f"echo '{path} is a file there, not a link; move it away' >&2; exit 1"
         lines += [
-            f"mkdir -p {Path(place).parent}",
-            f"if [ -e {place} ] && [ ! -L {place} ]; then {own}; else ln -sfn {target} {place}; fi",
+            f"mkdir -p {Path(path).parent}",
+            f"if [ -e {path} ] && [ ! -L {path} ]; then {own}; else ln -sfn {target} {path}; fi",
         ]
     return "\n".join([*lines, "sync -f /etc; sync -f /usr"])
 
@@ -181,14 +185,14 @@ def _put(file: str, text: str) -> str:
 
 
 def self_test(release: str) -> str:
-    """The command that tries the new runtime, as the service's user, with the settings and bundles of the box."""
-    as_it = "setpriv --reuid=palpate --regid=palpate --init-groups"
-    return f"{as_it} {release}/bin/python -I -c {shlex.quote(SELF_TEST)} {release}/share/palpate"
+    """The command that runs SELF_TEST in the new runtime as the service's user, with the settings and bundles of the box."""
+    as_user = "setpriv --reuid=palpate --regid=palpate --init-groups"
+    return f"{as_user} {release}/bin/python -I -c {shlex.quote(SELF_TEST)} {release}/share/palpate"
 
 
 def switch(box: Box, name: str, release: str) -> str:
-    """Swap the link and start the service from it, where that is not so already; the box's line."""
-    before = box.run("looking for the old release", f"readlink {HERE} || true")
+    """Swap the link and start the service from it, unless that is done already; the line for this box."""
+    before = box.run("looking for the old release", f"readlink {LINK} || true")
     runs = f"""pid=$(systemctl show palpate -p MainPID --value)
 [ "$pid" != 0 ] && grep -q {release}/ /proc/$pid/maps && echo runs || true"""
     if before == Path(release).name and box.run("looking at the process", runs, user="root"):
@@ -198,19 +202,19 @@ def switch(box: Box, name: str, release: str) -> str:
     try:
         ready = _start(box)
     except Failed as e:
-        raise Failed(f"{e}{_back(box, release)}") from e
-    keep = f"$(readlink -e {HERE}) $(readlink -e {HERE}.previous || true)"
-    tidy = f'for one in {HERE}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
+        raise Failed(f"{e}{_swap_back(box, release)}") from e
+    keep = f"$(readlink -e {LINK}) $(readlink -e {LINK}.previous || true)"
+    tidy = f'for one in {LINK}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
     box.run("removing older releases", tidy, user="root", limit_s=120)
     if not ready:
-        return f"{name} installed; it waits: {box.told['waits']}"
-    lost = f", {box.told['lost_s']} s without classifying" if "lost_s" in box.told else ""
-    return f"{name} is READY {box.told['ready_s']} s after the command{lost}"
+        return f"{name} installed; it waits: {box.result['waits']}"
+    lost = f", {box.result['lost_s']} s without classifying" if "lost_s" in box.result else ""
+    return f"{name} is READY {box.result['ready_s']} s after the command{lost}"
 
 
-def _back(box: Box, release: str) -> str:
-    """Have the release before run again, where there is one; how the sentence ends that says why."""
-    before = box.run("looking for the old release", f"readlink {HERE}.previous || true")
+def _swap_back(box: Box, release: str) -> str:
+    """Let the previous release run again, if there is one; text to append to the reason."""
+    before = box.run("looking for the old release", f"readlink {LINK}.previous || true")
     if before in ("", Path(release).name):
         return ""
     box.run("swapping back", swap(f"/opt/{before}", Path(release).name), user="root")
@@ -222,15 +226,15 @@ def _back(box: Box, release: str) -> str:
 
 
 def swap(release: str, before: str) -> str:
-    """The commands that make the link lead to a release, and keep where it led before."""
-    previous = f"ln -sfn {before} {HERE}.previous" if before else "true"
+    """Commands that make the link lead to a release, and record the previous one."""
+    previous = f"ln -sfn {before} {LINK}.previous" if before else "true"
     return f"""set -e; {previous}
-ln -sfn {Path(release).name} {HERE}.new; sync -f /opt
-mv -T {HERE}.new {HERE}; sync -f /opt"""
+ln -sfn {Path(release).name} {LINK}.new; sync -f /opt
+mv -T {LINK}.new {LINK}; sync -f /opt"""
 
 
 def _start(box: Box) -> bool:
-    """Have systemd and udev read what the link leads to now, and start the service; see Box.restart."""
+    """Let systemd and udev read the files behind the link, and start the service; see Box.restart."""
     udev = "udevadm control --reload && udevadm trigger"
     box.run(
         "reading the unit", f"systemctl daemon-reload; ! command -v udevadm > /dev/null || {{ {udev}; }}", user="root"

@@ -76,7 +76,7 @@ def _inside(root: Path, *command: str) -> None:
 
 
 FETCH = """
-import platform, sys; from parcel import LOCK, fetch, locked
+import platform, sys; from release import LOCK, fetch, locked
 fetch(locked(LOCK.read_text(), sys.argv[1], platform.machine()), sys.argv[1], platform.machine())
 """
 

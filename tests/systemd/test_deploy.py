@@ -446,7 +446,7 @@ import install
 class Box:
     def __init__(self, **said): self.said = {"looking at its system": "Debian\\namd64", "looking at /opt": "/"} | said
     def run(self, what, command, **how): return self.said.get(what, "")
-    def say(self, text): pass
+    def report(self, text): pass
 for said in ({"looking at its system": "Alpine Linux v3.19\\n"}, {"looking at its system": "Raspbian 11\\narmhf"},
              {"looking at /opt": "/opt"}, {"asking for Python": "3.9.2"}):
     try: install.install(Box(**said), None, "", "")
@@ -474,7 +474,7 @@ for text in ("pi@box", "Box.lab:2222", "pi@[fe80::1]:22", "pi@", "a@b@c"):
 def test_the_lock_is_read_for_the_box_not_for_the_desktop():
     """Markers are those of the box's Python: numpy's version differs from 3.11 to 3.12; hashes stay with their names."""
     for python, numpy in (("3.11.2", "2.4"), ("3.13.5", "2.5")):
-        code = f"import parcel; print(parcel.locked(parcel.LOCK.read_text(), {python!r}, 'aarch64'))"
+        code = f"import release; print(release.locked(release.LOCK.read_text(), {python!r}, 'aarch64'))"
         lock = desk(code)
         (line,) = re.findall(r"^numpy==(\S+) \\$", lock, re.MULTILINE)
         assert line.startswith(numpy)

@@ -1,4 +1,4 @@
-"""What is copied to a box that is installed. In: the wheel, the lock, this checkout. Out: an archive for each kind of box.
+"""Packs a release for a box. In: the wheel, the lock, files of this checkout. Out: an archive for each architecture and Python.
 
 Wheels for another architecture or Python are fetched here, each checked by its hash: the boxes need no internet for them.
 """
@@ -24,13 +24,13 @@ from appliance.core import storage
 ROOT = Path(__file__).resolve().parent.parent
 LOCK = ROOT / "appliance" / "requirements.lock"
 GLIBC = 36
-"""Wheels may want glibc 2.36, that of Debian 12, or an older one."""
+"""Wheels may need glibc 2.36, that of Debian 12, or an older one."""
 
 
-class Parcels:
-    """What is copied to a box: one archive for each architecture and Python, made when a box wants it.
+class ReleaseArchives:
+    """What is copied to a box: one archive for each architecture and Python, made when the first box needs it.
 
-    wheel: Palpate's own. shares: files and folders of this checkout that go along. folder: where the archives are put.
+    wheel: of Palpate. shares: files and folders of this checkout that are copied as well. folder: for the archives.
     """
 
     def __init__(self, wheel: Path, shares: Sequence[str], folder: Path) -> None:
@@ -41,7 +41,7 @@ class Parcels:
         self._made: dict[tuple[str, str], tuple[str, Path]] = {}
 
     def of(self, machine: str, python: str) -> tuple[str, Path]:
-        """The name of the release and its archive. Raises Failed where a wheel is not to be had."""
+        """Name of the release, and its archive. Raises Failed where a wheel cannot be fetched."""
         with self._lock:
             if (machine, python) not in self._made:
                 self._made[machine, python] = self._make(machine, python)
@@ -50,9 +50,9 @@ class Parcels:
     def _make(self, machine: str, python: str) -> tuple[str, Path]:
         lock = locked(LOCK.read_text(), python, machine)
         content = hashlib.sha256(f"{python.rpartition('.')[0]}\n{lock}".encode())
-        with zipfile.ZipFile(self._wheel) as held:  # its bytes hold dates
-            content.update(repr([(name, held.read(name)) for name in sorted(held.namelist())]).encode())
-        for file in sorted(one for share in self._shares for one in (share, *share.rglob("*")) if one.is_file()):
+        with zipfile.ZipFile(self._wheel) as wheel:  # not the file itself: it has dates in it
+            content.update(repr([(name, wheel.read(name)) for name in sorted(wheel.namelist())]).encode())
+        for file in sorted(path for share in self._shares for path in (share, *share.rglob("*")) if path.is_file()):
             content.update(f"{file.relative_to(ROOT)}\n".encode() + file.read_bytes())
         name = f"{__version__}-{content.hexdigest()[:8]}"
         archive = self._folder / f"{name}-{machine}.tar"
@@ -71,22 +71,23 @@ def _plain(member: tarfile.TarInfo) -> tarfile.TarInfo:
 
 
 def locked(text: str, python: str, machine: str) -> str:
-    """The lock without what another Python or architecture has: pip looks only at its own when it fetches for another."""
-    there = {
+    """The lock without the lines for another Python or architecture: pip evaluates markers for the Python it runs on, also when
+    it fetches for another."""
+    box = {
         "python_full_version": python, "python_version": python.rpartition(".")[0], "platform_machine": machine,
     }  # fmt: skip
     kept = []
     for block in re.split(r"(?m)^(?=\w)", text):
         first, rest = block.partition("\\\n")[::2]
         if rest:
-            wanted = Requirement(first.strip())
-            if not wanted.marker or wanted.marker.evaluate(there):
-                kept.append(f"{wanted.name}{wanted.specifier} \\\n{rest}")
+            requirement = Requirement(first.strip())
+            if not requirement.marker or requirement.marker.evaluate(box):
+                kept.append(f"{requirement.name}{requirement.specifier} \\\n{rest}")
     return "".join(kept)
 
 
 def fetch(lock: str, python: str, machine: str) -> Path:
-    """The folder with the lock and its wheels, kept for the next time. Raises Failed."""
+    """A folder with the lock and its wheels, kept for the next time. Raises Failed where pip cannot fetch them."""
     short = python.rpartition(".")[0]
     target = ROOT / "build" / "wheels" / f"{machine}-{short}-{hashlib.sha256(lock.encode()).hexdigest()[:8]}"
     if target.exists():
@@ -95,7 +96,7 @@ def fetch(lock: str, python: str, machine: str) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     with storage.folder(target) as part:
         (part / "requirements.lock").write_text(lock)
-        command = (
+        command: tuple[str | Path, ...] = (
             sys.executable, "-m", "pip", "--disable-pip-version-check", "-q", "download", "--no-deps",
             "--only-binary", ":all:", "--implementation", "cp", "--python-version", short, *tags,
             f"--platform=manylinux2014_{machine}", "--require-hashes", "-r", part / "requirements.lock", "-d", part,
