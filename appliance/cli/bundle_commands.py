@@ -30,7 +30,7 @@ class ListedBundle:
     """One bundle of the store; sha "" for the packaged one, which nobody signed.
 
     role: current, on trial, previous (what `palpate rollback` goes back to), candidate, left, kept, or damaged.
-    detail: how far its trial is, why it was left, what is wrong with it.
+    detail: the progress of its trial, why it was left, or what is wrong with it.
     """
 
     sha: str

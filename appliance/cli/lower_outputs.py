@@ -1,8 +1,8 @@
-"""`python -m appliance.cli.lower_outputs`: takes the output lines low after a program that could not. In: its settings. Out: levels.
+"""`python -m appliance.cli.lower_outputs`: sets the output lines low after a program that could not. In: its settings.
 
 systemd runs it whenever `palpate run` has ended (ExecStopPost=). A program that was killed leaves its lines to the
-chip's driver, and some drivers leave them as they were: READY high, with nobody there. It loads neither numpy nor
-onnxruntime, so that it is done before a robot has noticed.
+driver of the chip, and some drivers keep the levels: READY stays high without a box behind it. It loads neither numpy
+nor onnxruntime, so that the lines are low before the robot acts on them.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from appliance.io.gpio_lines import Lines
 
 
 def main(argv: list[str] | None = None, gpio: Any = gpiod) -> int:
-    """Drive all configured outputs low and let them go; the exit code, as `palpate` has them."""
-    about = "Takes all output lines low. Options as for palpate run."
+    """Drive all configured outputs low and release them; the exit code, as those of `palpate`."""
+    about = "Sets all output lines low. Options as for palpate run."
     args = argparse.ArgumentParser(
         "python -m appliance.cli.lower_outputs", description=about, parents=[settings()]
     ).parse_args(argv)
     try:
         loaded = config.load(args.board, args.set, folder=args.config_dir)
-        Lines(loaded.output, gpio, SystemClock()).close()  # requested low, then given back
+        Lines(loaded.output, gpio, SystemClock()).close()  # requested as low, then released
     except ApplianceError as e:
         print(f"palpate: outputs may not be low: {e}", file=sys.stderr)
         return e.exit_code

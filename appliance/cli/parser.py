@@ -1,4 +1,4 @@
-"""The words of the command `palpate`. In: what each command runs. Out: a parser, which knows help and exit codes."""
+"""The arguments of the command `palpate`. In: what each command runs. Out: a parser with help and exit codes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 from appliance import __version__
 
 EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments; 65 a file of
-another form; 69 hardware is not there; 78 configuration or bundle; 130 interrupted. For a skin or a serial port `run`
-waits, however long; `check` names it"""
+another form; 69 hardware is not there; 78 configuration or bundle; 130 interrupted. `run` waits for
+a skin or a serial port without limit; `check` names what is missing"""
 WEB_PORT = 8137
 MOST_SWEEPS = 10
-"""What a person may be asked to take for an enrolment; a mean of more would hardly be better."""
+"""Most sweeps for an enrolment; a mean of more would hardly be better."""
 
 
 def settings() -> argparse.ArgumentParser:
-    """What every command that has settings takes."""
+    """The options of every command that has settings."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--board", help="board file to use: firmware_config/board-NAME.toml")
     common.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one value")
@@ -27,28 +27,28 @@ def settings() -> argparse.ArgumentParser:
 
 
 def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argparse.ArgumentParser]:
-    """What several commands take: the settings, the world, the number of answers."""
+    """The options that several commands share: settings, devices, number of answers."""
     common = settings()
-    world = argparse.ArgumentParser(add_help=False)
-    world.add_argument(
+    devices = argparse.ArgumentParser(add_help=False)
+    devices.add_argument(
         "--sim",
         metavar="skin|rest|replay:FILE",
         help="simulated tubes, a finger at rest on one, or a sweep set, instead of the devices",
     )
-    world.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
-    world.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
-    some = argparse.ArgumentParser(add_help=False)
-    some.add_argument("--sweeps", type=int, metavar="N", help="stop after N answers")
-    return common, world, some
+    devices.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
+    devices.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
+    answers = argparse.ArgumentParser(add_help=False)
+    answers.add_argument("--sweeps", type=int, metavar="N", help="stop after N answers")
+    return common, devices, answers
 
 
 def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.ArgumentParser:
-    """The parser of all commands; `runs` has what each command's name runs, `args.run` is that of the one given."""
+    """The parser of all commands. runs: command name -> function, which becomes `args.run` of that command."""
     parser = argparse.ArgumentParser(
         "palpate", description="Names the material a robot has just touched.", epilog=EXIT_CODES
     )
     parser.add_argument("--version", action="version", version=f"palpate {__version__}")
-    common, world, some = _shared()
+    common, devices, answers = _shared()
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def add(name: str, text: str, *parents: argparse.ArgumentParser) -> Any:
@@ -56,29 +56,35 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
         command.set_defaults(run=runs[name])
         return command
 
-    _at_work(add, world, some)
-    _by_hand(add, world, some)
-    _of_bundles(add)
+    _service_commands(add, devices, answers)
+    _local_commands(add, devices, answers)
+    _bundle_commands(add)
     return parser
 
 
-def _at_work(add: Callable[..., Any], world: argparse.ArgumentParser, some: argparse.ArgumentParser) -> None:
+def _service_commands(
+    add: Callable[..., Any], devices: argparse.ArgumentParser, answers: argparse.ArgumentParser
+) -> None:
     """The commands that answer a robot."""
-    run = add("run", "classify sweeps until SIGTERM", world, some)
-    record = add("record", "the same, and keep each sweep with its label, for training", world, some)
+    run = add("run", "classify sweeps until SIGTERM", devices, answers)
+    record = add("record", "the same, and keep each sweep with its label, for training", devices, answers)
     for command in (run, record):
-        command.add_argument("--capture", type=Path, metavar="FILE", help="write all that comes in to FILE, for replay")
+        command.add_argument("--capture", type=Path, metavar="FILE", help="write all input to FILE, for replay")
         command.add_argument(
             "--shadow", nargs="?", const="", metavar="DIR",
-            help="classify with the bundle in DIR beside, by default the store's candidate; its answers go nowhere",
+            help="also classify with the bundle in DIR, by default the candidate of the store; its answers are only compared",
         )  # fmt: skip
-    record.add_argument("--out", type=Path, metavar="DIR", help="where to (default: sweeps/ in the store's folder)")
+    record.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the sweeps (default: sweeps/ in the store's folder)"
+    )
     for name in ("material", "position", "session"):
-        record.add_argument(f"--{name}", default="", metavar="TEXT", help="until the serial line says otherwise")
-    enrol = add("enrol", "learn one more material from a few sweeps, without training; write a new bundle", world)
-    enrol.add_argument("label", metavar="LABEL", help="its name; every sweep from now on is of it")
+        record.add_argument(
+            f"--{name}", default="", metavar="TEXT", help="until a command on the serial line changes it"
+        )
+    enrol = add("enrol", "learn one more material from a few sweeps, without training; write a new bundle", devices)
+    enrol.add_argument("label", metavar="LABEL", help="its name; all sweeps from now on are of this material")
     enrol.add_argument("--out", type=Path, required=True, metavar="DIR", help="the new bundle's folder")
-    enrol.add_argument("--replace", action="store_true", help="a bundle at DIR gives way to it")
+    enrol.add_argument("--replace", action="store_true", help="replace a bundle at DIR")
     enrol.add_argument(
         "--sweeps", type=int, choices=range(1, MOST_SWEEPS + 1), default=5, dest="good", metavar="N",
         help=f"how many good sweeps it takes, 1 to {MOST_SWEEPS} (default 5)",
@@ -86,37 +92,41 @@ def _at_work(add: Callable[..., Any], world: argparse.ArgumentParser, some: argp
     enrol.set_defaults(sweeps=None)
 
 
-def _by_hand(add: Callable[..., Any], world: argparse.ArgumentParser, some: argparse.ArgumentParser) -> None:
-    """The commands for a person who sets the box up, or looks at it."""
-    add("demo", "watch simulated sweeps being classified", world, some).add_argument(
+def _local_commands(
+    add: Callable[..., Any], devices: argparse.ArgumentParser, answers: argparse.ArgumentParser
+) -> None:
+    """The commands for a person who sets up or inspects the box."""
+    add("demo", "watch simulated sweeps being classified", devices, answers).add_argument(
         "--raw", action="store_true", help="print the sentences alone"
     )
-    align = add("align", "show where the contact lies on the skin, and where it should", world)
+    align = add("align", "show where the contact lies on the skin, and where it should", devices)
     align.add_argument(
         "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
-        help=f"as a page on localhost as well (default port {WEB_PORT})",
+        help=f"also as a page on localhost (default port {WEB_PORT})",
     )  # fmt: skip
     align.set_defaults(sweeps=None)
-    add("check", "self-test: bundle, golden sweeps, devices", world, some)
-    add("status", "how the service is, and its last verdicts").add_argument("--json", action="store_true")
+    add("check", "self-test: bundle, golden sweeps, devices", devices, answers)
+    add("status", "state of the service, and its last verdicts").add_argument("--json", action="store_true")
     add("replay", "judge a capture, a kept sweep or a folder of them again").add_argument("file", type=Path)
     add("config", "print each value with its source")
     bench = add("bench", "measure latency, memory, start and processor share on this machine")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
     bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")
     bench.add_argument("--references", type=Path, default=Path("build/references"), help="fp32.onnx, paper_int8.onnx")
-    bench.add_argument("--part", choices=("memory", "stream"), help="one part alone, as JSON, playing --acts")
+    bench.add_argument(
+        "--part", choices=("memory", "stream"), help="one part alone, as JSON, with the sweeps of --acts"
+    )
     bench.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
 
 
-def _of_bundles(add: Callable[..., Any]) -> None:
+def _bundle_commands(add: Callable[..., Any]) -> None:
     """The commands for the bundles in the store."""
-    listed = add("bundles", "the bundles on this box: which one runs, and what it goes back to")
+    listed = add("bundles", "the bundles on this box: which one runs, and which one `rollback` returns to")
     listed.add_argument("--json", action="store_true")
-    install = add("install", "check the signed bundle in DIR, and have it run on trial from the next start on")
+    install = add("install", "check the signed bundle in DIR, and run it on trial from the next start on")
     install.add_argument("--shadow", action="store_true", help="as the candidate of `run --shadow` instead")
     for command in (install, add("verify", "check the signed bundle in DIR, and change nothing")):
         command.add_argument("folder", type=Path, metavar="DIR")
     add("commit", "end the trial of the bundle that runs: it stays")
-    add("rollback", "go back to the bundle before, from the next start on")
-    add("promote", "have the candidate run on trial from the next start on")
+    add("rollback", "go back to the previous bundle, from the next start on")
+    add("promote", "run the candidate on trial from the next start on")

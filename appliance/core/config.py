@@ -199,7 +199,7 @@ def describe(config: Config) -> str:
         section, _, last = name.partition(".")
         value = getattr(getattr(config, section), last)
         values[name] = f"0x{value:04x}" if "hex" in key.limits else json.dumps(value, ensure_ascii=False)
-    return "\n".join(f"{f'{name} = {value}':<32}   # {config.sources[name]}" for name, value in values.items())
+    return "\n".join(f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items())
 
 
 def _folder() -> Path:

@@ -1,1 +1,1 @@
-"""The loop, how it is put together, its self-test, and replay."""
+"""The loop, its assembly from components, the self-test, and replay."""

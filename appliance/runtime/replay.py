@@ -1,4 +1,4 @@
-"""The room where what was seen once is judged again. In: a capture, a kept sweep, a folder of them. Out: its sentences.
+"""Judges recorded data again. In: a capture, a kept sweep, a folder of these. Out: their sentences, and whether they differ.
 
 A kept sweep is judged as it was: by the same rule, with the same tare, after the same sweeps of its object, at the same
 time. So its verdict must be that of its sidecar, bit for bit.
@@ -29,7 +29,7 @@ from appliance.runtime import assembly
 from appliance.runtime.loop import Box, Pipeline
 
 SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
-"""Bit for bit; so are the scores of this sweep, but not all earlier ones of its object are there; it is not."""
+"""SAME: the verdict, bit for bit. ALONE: the scores of this sweep, but earlier sweeps of its object are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
 FUSIONS = get_args(get_type_hints(ClassifierConfig)["fuse"])
 
@@ -38,24 +38,25 @@ class OtherBundle(FormatError):
     """A kept sweep that another bundle has judged."""
 
 
-def replay(path: Path, settings: Config, model: Bundle, out: Callable[[str], object]) -> int:
-    """Play what is at `path` and tell all sentences, and of each kept sweep whether its verdict is the same; 1 if not.
+def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], object]) -> int:
+    """Replay the file or folder at `path`: its sentences, and for each kept sweep whether the verdict is the same.
 
-    Raises FormatError where it is not readable, of another format or of another bundle.
+    out: takes each line. Returns 1 where a verdict differs, else 0. Raises FormatError where the file is not readable,
+    of another format or of another bundle.
     """
     if path.is_dir():
-        return _folder(path, Judge(settings, model), out)
+        return _folder(path, Judge(settings, bundle), out)
     if path.suffix != ".npy":
-        _capture(path, settings, model)
+        _capture(path, settings, bundle)
         return 0
-    judge = Judge(settings, model)
+    judge = Judge(settings, bundle)
     *_, judged = [judge(kept) for kept in _with_earlier(path)]
-    return int(_tell(path, judged, out) == DIFFERENT)
+    return int(_print(path, judged, out) == DIFFERENT)
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayRule:
-    """How a classifier makes answers of probabilities, under the names that sidecars have."""
+    """The rule by which a classifier turns probabilities into answers. Its fields are the keys of sidecars."""
 
     how: str
     sure: float
@@ -67,11 +68,11 @@ class ReplayRule:
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
-    """A kept sweep with what its sidecar says; an older one says less.
+class KeptSweep:
+    """A kept sweep with the content of its sidecar; older sidecars hold less.
 
-    object: whose sweeps were fused. rule: None where it is not told. tare: [R, C] digits. bundle: its id or "".
-    verdict: as `Verdict.as_dict` gives it, or empty.
+    object: the folder, run and object number that fused sweeps share. rule: None where the sidecar has none. tare:
+    [R, C] raw counts. bundle: its id, or "". verdict: as `Verdict.as_dict` gives it, or empty.
     """
 
     sweep: Sweep
@@ -83,63 +84,63 @@ class Kept:
     verdict: dict[str, Any]
 
     @classmethod
-    def read(cls, path: Path) -> Kept:
+    def read(cls, path: Path) -> KeptSweep:
         """The sweep at `path`. Raises FormatError."""
         sweep, fmt = load(path)
         about = sidecar(path)
         try:
             tare = np.broadcast_to(np.asarray(about.get("tare", 0.0), np.float64), (fmt.rows, fmt.cols))
             rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
-            whose = path.parent, int(about.get("run", 0)), sweep.object
+            touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))
             if any(type(verdict.get(name, 0)) is not int for name in ("fused", "time_ns")):
                 raise TypeError("the verdict's fused and time_ns must be whole numbers")
-            return cls(sweep, fmt, whose, rule, tare, about.get("bundle", ""), verdict)
+            return cls(sweep, fmt, touched, rule, tare, about.get("bundle", ""), verdict)
         except (TypeError, ValueError) as e:
             raise FormatError(f"{path}: its sidecar cannot be used: {e}; take one that was not changed") from e
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """What came of a kept sweep. verdict: None where there is none any more."""
+class ReplayResult:
+    """The result for a kept sweep. verdict: None where there is none any more."""
 
     verdict: Verdict | None
     outcome: str
     detail: str = ""
 
 
-class Then:
-    """A clock that stands where it is put: a verdict is given again at the time at which it was given."""
+class ReplayClock:
+    """A clock that stands still until it is set: a verdict is given again at the time at which it was given."""
 
     def __init__(self) -> None:
         self.t_ns = 0
 
     def now_ns(self) -> int:
-        """The time it was put to."""
+        """The time it was set to."""
         return self.t_ns
 
     def sleep_until(self, t_ns: int) -> None:
-        """Nothing here waits."""
+        """Return at once: nothing waits in a replay."""
 
 
 class Judge:
-    """Judges kept sweeps, given in their order, again. Holds what the sweeps of one object have said so far."""
+    """Judges kept sweeps again, in their order. Holds the fused probabilities of the object so far."""
 
-    def __init__(self, settings: Config, model: Bundle) -> None:
-        self._settings, self._model = settings, model
-        self._clock = Then()
+    def __init__(self, settings: Config, bundle: Bundle) -> None:
+        self._settings, self._bundle = settings, bundle
+        self._clock = ReplayClock()
         self._classifier: Classifier | None = None
         self._made: object = None  # what the classifier was made for
         self._last: object = None  # (object, sweeps fused) of the last sweep with all earlier ones of its object
 
-    def __call__(self, kept: Kept) -> Judged:
-        """The verdict on `kept`, and whether it is that of its sidecar. Raises FormatError where it is not of the bundle."""
-        if kept.bundle not in ("", self._model.id):
+    def __call__(self, kept: KeptSweep) -> ReplayResult:
+        """The verdict on `kept`, compared with that of its sidecar. Raises FormatError where it is not of the bundle."""
+        if kept.bundle not in ("", self._bundle.id):
             raise OtherBundle(
-                f"sweep {kept.sweep.id} was judged by bundle {kept.bundle}, this is {self._model.id}; "
-                "name its own with --set classifier.bundle=DIR"
+                f"sweep {kept.sweep.id} was judged by bundle {kept.bundle}, this is {self._bundle.id}; "
+                "name that one with --set classifier.bundle=DIR"
             )
-        _check(f"sweep {kept.sweep.id}", kept.format, self._model)
+        _check(f"sweep {kept.sweep.id}", kept.format, self._bundle)
         _check_length(kept.sweep, kept.format)
         was = kept.verdict
         fused = was.get("fused", 0)
@@ -152,24 +153,24 @@ class Judge:
         if not whole:
             own = verdict.own if verdict else Decider(classifier).scores(sweep)[-1]
             same = own.tolist() == was.get("own")
-            return Judged(verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there")
+            return ReplayResult(verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there")
         if verdict is None:
-            return Judged(verdict, DIFFERENT, "it was answered early, which this bundle does not do")
+            return ReplayResult(verdict, DIFFERENT, "it was answered early, which this bundle does not do")
         if not was:
-            return Judged(verdict, SILENT)
+            return ReplayResult(verdict, SILENT)
         now = verdict.as_dict()
         changed = [_change(name, was[name], now.get(name)) for name in was if was[name] != now.get(name)]
-        return Judged(verdict, DIFFERENT if changed else SAME, ", ".join(changed))
+        return ReplayResult(verdict, DIFFERENT if changed else SAME, ", ".join(changed))
 
-    def _prepared(self, kept: Kept) -> Classifier:
-        """The classifier as it was, with what it has fused in this run."""
+    def _prepared(self, kept: KeptSweep) -> Classifier:
+        """The classifier as it was set then, with the sweeps that it has fused in this replay."""
         made = kept.object[:2], kept.rule
         if self._classifier is None or made != self._made:
             self._made = made
             if kept.rule:
-                self._classifier = Classifier(self._model, self._clock, *astuple(kept.rule))
+                self._classifier = Classifier(self._bundle, self._clock, *astuple(kept.rule))
             else:
-                self._classifier = assembly.classifier(self._settings, self._model, self._clock)
+                self._classifier = assembly.classifier(self._settings, self._bundle, self._clock)
         self._classifier.tare = kept.tare
         self._clock.t_ns = kept.verdict.get("time_ns", kept.sweep.complete_ns)
         return self._classifier
@@ -179,7 +180,7 @@ def _change(name: str, was: object, now: object) -> str:
     return f"other {name}" if isinstance(was, list) else f"{name} {was!r} is now {now!r}"
 
 
-def _tell(path: Path, judged: Judged, out: Callable[[str], object]) -> str:
+def _print(path: Path, judged: ReplayResult, out: Callable[[str], object]) -> str:
     if judged.verdict:
         out(result(judged.verdict, "replay").decode("ascii"))
     out(f"{path.name}: {judged.outcome}{judged.detail and f' ({judged.detail})'}\n")
@@ -187,17 +188,17 @@ def _tell(path: Path, judged: Judged, out: Callable[[str], object]) -> str:
 
 
 def _folder(folder: Path, judge: Judge, out: Callable[[str], object]) -> int:
-    """All kept sweeps in `folder` and below. Those of another bundle are told, and no difference."""
+    """Replay all kept sweeps in `folder` and below; one of another bundle is named, but counts as no difference."""
     outcomes: Counter[str] = Counter()
     paths = sorted(folder.rglob("*.npy"), key=_order)
     if not paths:
         raise FormatError(f"{folder}: no kept sweep is there; name a folder of `palpate record` or of the black box")
     for path in paths:
         try:
-            judged = judge(Kept.read(path))
-        except FormatError as e:  # the others may be whole
-            judged = Judged(None, OTHER if isinstance(e, OtherBundle) else BROKEN, str(e))
-        outcomes[_tell(path, judged, out)] += 1
+            judged = judge(KeptSweep.read(path))
+        except FormatError as e:  # the others may be readable
+            judged = ReplayResult(None, OTHER if isinstance(e, OtherBundle) else BROKEN, str(e))
+        outcomes[_print(path, judged, out)] += 1
     out(f"{len(paths)} sweeps: {', '.join(f'{n} {outcome}' for outcome, n in outcomes.items())}\n")
     return int(bool(outcomes.keys() & {DIFFERENT, BROKEN}) or outcomes[OTHER] == len(paths))
 
@@ -206,22 +207,22 @@ def _order(path: Path) -> tuple[Path, int, str]:
     return path.parent, len(path.name), path.name
 
 
-def _with_earlier(path: Path) -> list[Kept]:
-    """The sweep at `path`, after those of its object that lie beside it. Raises FormatError."""
-    found = [Kept.read(path)]
+def _with_earlier(path: Path) -> list[KeptSweep]:
+    """The sweep at `path`, after the earlier sweeps of its object in the same folder. Raises FormatError."""
+    found = [KeptSweep.read(path)]
     if found[0].sweep.object:
         for earlier in sorted((p for p in path.parent.glob("*.npy") if _order(p) < _order(path)), key=_order)[::-1]:
-            kept = Kept.read(earlier)
+            kept = KeptSweep.read(earlier)
             if kept.object != found[0].object:
                 break
             found.insert(0, kept)
     return found
 
 
-def _check(what: str, fmt: SweepFormat, model: Bundle) -> None:
-    if fmt != model.format:
+def _check(what: str, fmt: SweepFormat, bundle: Bundle) -> None:
+    if fmt != bundle.format:
         raise FormatError(
-            f"{what} is of {fmt}, the bundle wants {model.format}; name its bundle with --set classifier.bundle=DIR"
+            f"{what} is of {fmt}, the bundle wants {bundle.format}; name its bundle with --set classifier.bundle=DIR"
         )
 
 
@@ -233,12 +234,12 @@ def _check_length(sweep: Sweep, fmt: SweepFormat) -> None:
         )
 
 
-def _capture(path: Path, settings: Config, model: Bundle) -> None:
-    """The box itself on a capture: what came in then comes in again."""
+def _capture(path: Path, settings: Config, bundle: Bundle) -> None:
+    """Run the box on a capture, which stands for sensor, trigger, clock and commands."""
     play = Playback(path)
-    _check(str(path), play.format, model)
-    classifier = assembly.classifier(settings, model, play)
+    _check(str(path), play.format, bundle)
+    classifier = assembly.classifier(settings, bundle, play)
     port = StdoutPort("replay", play.commands)
-    cutter = SweepCutter(model.format, settings.sweep)
+    cutter = SweepCutter(bundle.format, settings.sweep)
     pipeline = Pipeline(play, play, cutter, classifier, assembly.early_exit(settings, classifier))
     Box(pipeline, play, port=port, source="replay").run(lambda: play.finished)

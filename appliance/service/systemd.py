@@ -1,5 +1,5 @@
-"""The box as a service of systemd: sd_notify and the journal. In: how the box is each turn, verdicts. Out: READY, STATUS,
-WATCHDOG and STOPPING as datagrams to the socket that systemd names in the environment, and a log line for each verdict.
+"""The box as a service of systemd. In: health each turn, verdicts. Out: READY, STATUS, WATCHDOG and STOPPING as datagrams
+(sd_notify) to the socket that systemd names in the environment, and a log line for each verdict.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ REASONS: Mapping[Status, str] = MappingProxyType(
         Status.LONG: "no stop edge came in time",
         Status.GAP: "too many frames in a row are missing; look at the skin's cable",
         Status.NO_CONTACT: "no taxel is loaded; see that the finger lies on the object",
-        Status.SATURATED: "too many digits at full scale; press less",
+        Status.SATURATED: "too many raw counts at full scale; press less",
         Status.STUCK_TAXEL: "a loaded taxel does not move; look at the skin",
         Status.DEAD_TAXEL: "a taxel between loaded ones is silent; look at the skin",
         Status.SENSOR_LOST: "the skin went away during the sweep; look at its cable",
@@ -37,11 +37,11 @@ REASONS: Mapping[Status, str] = MappingProxyType(
         Status.ABORTED: "by command, or because the box was stopping",
     }
 )
-"""Why a sweep has no label, and what to look at: PROTOCOL.md says it in full."""
+"""Why a sweep has no label, and what to check; PROTOCOL.md has the details."""
 
 
 class Notifier(Observer):
-    """Sends systemd how the box is. Never waits: what the socket does not take is sent again next turn.
+    """Sends systemd the state of the box. Never waits: what the socket does not accept is sent again next turn.
 
     environ: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID as systemd sets them. clock: a real one; systemd's watchdog
     does not wait for a simulated one. Raises ConfigError where WATCHDOG_USEC is no number.
@@ -62,16 +62,16 @@ class Notifier(Observer):
         now_ns = self._clock.now_ns()
         due = self._watchdog_us > 0 and now_ns >= self._next_ns
         ready = ready or self._ready
-        news = []
+        messages = []
         if status != self._status:
-            news.append("STATUS=" + " ".join(status.splitlines()))  # a line of its own would be another message
+            messages.append("STATUS=" + " ".join(status.splitlines()))  # a line of its own would be another message
         if ready and not self._ready:
-            news.append("READY=1")
+            messages.append("READY=1")
         if due:
-            news.append("WATCHDOG=1")
-            if not ready:  # the watchdog sleeps until READY; a start that takes its turns may go on
-                news.append(f"EXTEND_TIMEOUT_USEC={self._watchdog_us}")
-        if news and self._send(news):
+            messages.append("WATCHDOG=1")
+            if not ready:  # the watchdog begins with READY; until then each turn extends the time for the start
+                messages.append(f"EXTEND_TIMEOUT_USEC={self._watchdog_us}")
+        if messages and self._send(messages):
             self._ready, self._status = ready, status
             if due:
                 self._next_ns = now_ns + self._watchdog_us * 1000 // FEEDS
@@ -80,13 +80,13 @@ class Notifier(Observer):
         """Say that the program is about to end."""
         self._send(["STOPPING=1"])
 
-    def _send(self, news: list[str]) -> bool:
+    def _send(self, messages: list[str]) -> bool:
         if not self._address:
             return True
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
                 manager.setblocking(False)
-                manager.sendto("\n".join(news).encode(errors="replace"), self._address)
+                manager.sendto("\n".join(messages).encode(errors="replace"), self._address)
         except OSError:  # gone, or full: a fault of the service manager must not become one of the robot's
             return False
         return True

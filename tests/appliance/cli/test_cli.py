@@ -66,32 +66,32 @@ def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsysbinary: pyt
     where = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
     assert main(["record", "--sim", "skin", *VIRTUAL, *where]) == 0
 
-    def said() -> list[list[bytes]]:
+    def output() -> list[list[bytes]]:
         return [line.split(b",")[4:8] for line in capsysbinary.readouterr().out.splitlines() if b",RES," in line]
 
-    first = said()
+    first = output()
     assert main(["replay", str(tmp_path / "c")]) == 0
-    assert said() == first
+    assert output() == first
     for path in sorted((tmp_path / "kept").glob("*.npy")):
         assert main(["replay", str(path)]) == 0
-    assert said() == first
+    assert output() == first
 
 
 def test_a_full_disk_costs_the_recording_never_the_classifying(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
-    """Neither sweeps nor capture can be written: each is told, every sweep is answered, exit code 0."""
+    """Neither sweeps nor capture can be written: each is logged, every sweep is answered, exit code 0."""
 
     def full(*args: object, **options: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("appliance.core.storage.write", full)
     assert main(["record", "--sim", "skin", *VIRTUAL, "--out", str(tmp_path), "--capture", "/dev/full"]) == 0
-    said = capfd.readouterr()
-    assert said.out.count(",RES,") == 3
-    assert said.out.count(",full,0,,,,No space left on device*") == 3
-    assert said.err.count("not stored: No space left on device") == 1
-    assert said.err.count("capture: /dev/full cannot be written: No space left on device") == 1
+    output = capfd.readouterr()
+    assert output.out.count(",RES,") == 3
+    assert output.out.count(",full,0,,,,No space left on device*") == 3
+    assert output.err.count("not stored: No space left on device") == 1
+    assert output.err.count("capture: /dev/full cannot be written: No space left on device") == 1
 
 
 def test_a_log_on_a_full_disk_costs_the_log_alone():
@@ -141,19 +141,19 @@ def test_the_sequential_test_is_configured(
     played = ["record", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
     kept = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
 
-    def said() -> list[bytes]:
+    def output() -> list[bytes]:
         return [r.split(b",")[4] for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
 
     p = softmax(default_bundle.golden_logits[0]).max()
     assert p < 0.9999, "take a golden sweep that is less sure"
     assert main([*played, *never, *kept]) == 0
-    assert said()[:2] == [b"unsure", b"undecided"]
+    assert output()[:2] == [b"unsure", b"undecided"]
     assert main(["replay", str(tmp_path / "c"), *never]) == 0
-    assert said()[:2] == [b"unsure", b"undecided"]
+    assert output()[:2] == [b"unsure", b"undecided"]
     assert main(["replay", str(next((tmp_path / "kept").glob("*.npy"))), *never]) == 0
-    assert said() == [b"unsure"]
+    assert output() == [b"unsure"]
     assert main(["run", *played[1:]]) == 0
-    assert said() == [b"ok"] * 3
+    assert output() == [b"ok"] * 3
 
 
 def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -163,9 +163,9 @@ def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFix
     (folder / bundle.MANIFEST).write_text(json.dumps(manifest))
     which = ["--set", "classifier.early=true", "--set", f"classifier.bundle={folder}"]
     assert main(["run", "--sim", "skin", *VIRTUAL, *which]) == BundleError.exit_code
-    said = capsys.readouterr()
-    assert "has no early heads" in said.err
-    assert said.out == ""
+    output = capsys.readouterr()
+    assert "has no early heads" in output.err
+    assert output.out == ""
     assert main(["check", "--sim", "skin", "--virtual", *which]) == 1
     assert "FAIL  golden sweeps" in capsys.readouterr().out
 
@@ -178,10 +178,10 @@ def test_a_sweep_that_was_answered_early_is_replayed_so(tmp_path: Path, capsysbi
         made = toy_bundle.files(early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early"))
         folder = toy_bundle.put(tmp_path / f"b{least}", made)
         assert main(["replay", str(tmp_path / "s.npy"), "--set", f"classifier.bundle={folder}"]) == code
-    said = capsysbinary.readouterr()
-    assert said.out.count(b",RES,1,") == 1
-    assert b",ok,a," in said.out
-    assert b"answered early, which this bundle does not do" in said.out
+    output = capsysbinary.readouterr()
+    assert output.out.count(b",RES,1,") == 1
+    assert b",ok,a," in output.out
+    assert b"answered early, which this bundle does not do" in output.out
 
 
 def test_check_says_ok_part_by_part(capsys: pytest.CaptureFixture[str]):

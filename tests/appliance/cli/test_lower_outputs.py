@@ -52,13 +52,13 @@ def test_what_cannot_be_lowered_is_said(
     chip: gpio.SimGpio, args: list[str], code: int, message: str, capsys: pytest.CaptureFixture[str]
 ):
     """Held by another program, or settings that cannot be read: one line, and the exit code of its kind."""
-    held = chip.request_lines("/dev/gpiochip0", {(23,): chip.LineSettings()})
+    request = chip.request_lines("/dev/gpiochip0", {(23,): chip.LineSettings()})
     assert lower_outputs.main(args, chip) == code
     error = capsys.readouterr().err
     assert error.startswith("palpate: outputs may not be low: ")
     assert error.count("\n") == 1
     assert re.search(message, error)
-    assert chip.requests == [held]
+    assert chip.requests == [request]
 
 
 def test_it_is_quick_as_it_loads_little():

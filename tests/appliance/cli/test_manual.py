@@ -138,12 +138,12 @@ def allowed(key: Key) -> str:
 
 def test_settings_are_those_of_the_code():
     """Key, default and what is allowed, in the code's order; each with a word on what it is."""
-    told = {cells[0].strip("`"): cells[1:] for cells in rows("Settings", "key")}
-    assert [*told] == ["board", *config._KEYS]
-    assert all(about for *_, about in told.values())
+    shown = {cells[0].strip("`"): cells[1:] for cells in rows("Settings", "key")}
+    assert [*shown] == ["board", *config._KEYS]
+    assert all(about for *_, about in shown.values())
     for name, key in config._KEYS.items():
         default = f"0x{key.default:04x}" if "hex" in key.limits else json.dumps(key.default)
-        assert told[name][:2] == [default, allowed(key)], name
+        assert shown[name][:2] == [default, allowed(key)], name
 
 
 def test_settings_of_the_text_exist():
@@ -156,13 +156,13 @@ def test_settings_of_the_text_exist():
 
 def test_exit_codes_are_those_of_the_code():
     """The codes of `palpate --help`, of the errors, and what the unit does about them."""
-    told = {int(cells[0]): cells for cells in rows("Commands and exit codes", "exit code")}
-    assert [*told] == [int(n) for n in re.findall(r"(?:^|[;:] )(\d+) ", parser.EXIT_CODES)]
+    shown = {int(cells[0]): cells for cells in rows("Commands and exit codes", "exit code")}
+    assert [*shown] == [int(n) for n in re.findall(r"(?:^|[;:] )(\d+) ", parser.EXIT_CODES)]
     codes = {k.exit_code for k in vars(errors).values() if isinstance(k, type)}
-    assert codes <= told.keys()
+    assert codes <= shown.keys()
     unit = (ROOT / "systemd" / "palpate.service").read_text()
     stays = [int(n) for n in re.findall(r"(?m)^RestartPreventExitStatus=(.*)", unit)[0].split()]
-    assert [code for code, cells in told.items() if "stopped" in cells[2]] == stays
+    assert [code for code, cells in shown.items() if "stopped" in cells[2]] == stays
 
 
 @pytest.mark.parametrize("board", ["rpi4", "rpi5"])
@@ -176,9 +176,9 @@ def test_wiring_is_that_of_the_board_files(board: str):
            for name in ("ready", "busy", "result_valid", "fault", "decided")},
         **{f"class bit {i}": name for i, name in enumerate(settings.output.class_bits)},
     }  # fmt: skip
-    told = {cells[0]: cells[1:] for cells in rows("Wiring", "line")}
-    assert told.keys() - lines.keys() == {"serial TXD", "serial RXD"}
-    for role, (_, name, pin, _) in told.items():
+    shown = {cells[0]: cells[1:] for cells in rows("Wiring", "line")}
+    assert shown.keys() - lines.keys() == {"serial TXD", "serial RXD"}
+    for role, (_, name, pin, _) in shown.items():
         assert name == lines.get(role, name)
         assert re.search(rf"\({pin}\) +{name}\b|\b{name} +\({pin}\)", text), role
     header = ["    " + line[2:].rstrip() for line in text.splitlines() if re.search(r"\(\d+\) \(\d+\)", line)]
@@ -241,7 +241,7 @@ def verdict(sweep: int, what: Status, label: str = "", probability: float = 0.0,
 
 def test_samples_are_what_the_box_prints():
     """Lines of the journal, of `palpate status` and of `palpate bundles`, from the code that prints them."""
-    told = [systemd.words(verdict(1, Status.OK, "wood", 0.991)), systemd.words(verdict(8, Status.SENSOR_LOST))]
+    shown = [systemd.words(verdict(1, Status.OK, "wood", 0.991)), systemd.words(verdict(8, Status.SENSOR_LOST))]
     health = {
         "time_ns": 0, "skin": "streaming", "trouble": "", "streams": True, "sweeping": False, "answered": 1,
         "frames": 54006, "lost_frames": 0, "garbage_bytes": 0, "enumerations": 1, "dropped": 0, "bundle": "d5b2b6ef",
@@ -254,22 +254,22 @@ def test_samples_are_what_the_box_prints():
         "model": "default 2, 6 labels",
         "verdicts": [verdict(1, Status.OK, "wood", 0.991, time_ns=now_ns - 9_000_000_000).as_dict(arrays=False)],
     }  # fmt: skip
-    told += status.lines(file, now_ns)
+    shown += status.lines(file, now_ns)
     detail = "start 1 of 3, 7 of 20 sweeps, 41 of 600 s, as of its last start or end"
-    told += bundle_commands.lines([
+    shown += bundle_commands.lines([
         bundle_commands.ListedBundle("9" * 64, "9f3c2a1b", "mine", "2", 2, "anna", "on trial", detail),
         bundle_commands.ListedBundle("5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""),
         bundle_commands.ListedBundle("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
     ])  # fmt: skip
-    assert [line for line in told if line not in BLOCKS] == []
+    assert [line for line in shown if line not in BLOCKS] == []
 
 
-def test_the_trial_is_told_as_it_is():
-    """How many starts, sweeps and seconds: the ledger's and the settings' defaults."""
-    how = config.StoreConfig()
+def test_the_trial_is_described_as_it_is():
+    """Starts, sweeps and seconds are those of the program and of the default settings."""
+    settings = config.StoreConfig()
     text = SECTIONS["Record, train, sign, deliver"]
-    assert f"`store.trial_sweeps` ({how.trial_sweeps})" in text.replace("\n", " ")
-    assert f"`store.trial_s` ({how.trial_s:.0f} s)" in text.replace("\n", " ")
+    assert f"`store.trial_sweeps` ({settings.trial_sweeps})" in text.replace("\n", " ")
+    assert f"`store.trial_s` ({settings.trial_s:.0f} s)" in text.replace("\n", " ")
     assert f" {state.MOST_STARTS} starts " in text.replace("\n", " ")
 
 

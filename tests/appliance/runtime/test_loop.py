@@ -1,4 +1,4 @@
-"""The whole way on the rig: USB bytes and GPIO edges in, sentences and lines out, and every way in which it can fail."""
+"""The whole box on simulated devices: USB bytes and GPIO edges in, sentences and lines out, and each way to fail."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ def slide(label: str = "wood", seed: int = 3) -> np.ndarray:
     return skin.sweep(label, place, np.random.default_rng(seed), rest_s=0, slide_s=3, after_s=0)
 
 
-def world_of(acts: list[rig.Act] | Iterator[rig.Act]) -> devices.SimDevices:
-    """A world that plays `acts`."""
+def simulated_devices(acts: list[rig.Act] | Iterator[rig.Act]) -> devices.SimDevices:
+    """Simulated devices that play `acts`."""
     return devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
 
 
 def quiet() -> devices.SimDevices:
-    """A world in which the skin is idle for a minute; a test drives the lines itself."""
+    """Simulated devices whose skin is idle for a minute; a test drives the lines itself."""
     off = np.zeros((60 * RATE, 4, 4), np.uint8)
-    return world_of([rig.Act(off, 10**7, 10**7 + 1, "")])
+    return simulated_devices([rig.Act(off, 10**7, 10**7 + 1, "")])
 
 
 def test_sweeps_become_sentences(rigged: Callable[..., Rigged]):
     """Twelve sweeps: each answered once, with a right checksum, nothing lost, at the far end of the serial line."""
-    world = world_of(script.tubes(1000, 12))
-    box = rigged(world)
-    verdicts = box.until(lambda: world.finished(box.box.answered))
+    simulated = simulated_devices(script.tubes(1000, 12))
+    box = rigged(simulated)
+    verdicts = box.until(lambda: simulated.finished(box.box.answered))
     box.seconds(0.1)
     heard = answers(box)
     assert [a.sweep for a in heard] == list(range(1, 13))
@@ -69,11 +69,11 @@ def test_sweeps_become_sentences(rigged: Callable[..., Rigged]):
 
 
 def test_windows_are_the_middle_of_what_was_slid(rigged: Callable[..., Rigged]):
-    """The window that reaches the network is, digit for digit, the middle of the act that the robot played."""
-    world = world_of(script.tubes(1001, 3))
-    box = rigged(world)
-    box.until(lambda: world.finished(box.box.answered))
-    for sweep, act in zip(box.kept, world.robot.played, strict=True):
+    """The window that reaches the network is, count for count, the middle of the act that the robot played."""
+    simulated = simulated_devices(script.tubes(1001, 3))
+    box = rigged(simulated)
+    box.until(lambda: simulated.finished(box.box.answered))
+    for sweep, act in zip(box.kept, simulated.robot.played, strict=True):
         middle = (act.start + act.stop) // 2
         near = [(act.frames[middle - 750 + k : middle + 750 + k] == sweep.frames.taxels).all() for k in (-1, 0, 1)]
         assert any(near)
@@ -81,13 +81,13 @@ def test_windows_are_the_middle_of_what_was_slid(rigged: Callable[..., Rigged]):
 
 def test_lines_follow_the_sweep(rigged: Callable[..., Rigged]):
     """READY falls and BUSY rises with the sweep; class bits, then RESULT VALID; both fall when the next one starts."""
-    world = world_of(script.tubes(1002, 2))
-    box = rigged(world)
-    box.until(lambda: world.finished(box.box.answered))
+    simulated = simulated_devices(script.tubes(1002, 2))
+    box = rigged(simulated)
+    box.until(lambda: simulated.finished(box.box.answered))
     box.seconds(0.1)
 
     def changes(*names: str) -> list[tuple[int, str, bool]]:
-        return [w for w in world.gpio.written if w[1] in names]
+        return [w for w in simulated.gpio.written if w[1] in names]
 
     cycle = [(devices.READY, False), (devices.BUSY, True), (devices.READY, True), (devices.BUSY, False)]
     assert [w[1:] for w in changes(devices.READY, devices.BUSY)] == [(devices.READY, True), *cycle, *cycle]
@@ -99,43 +99,43 @@ def test_lines_follow_the_sweep(rigged: Callable[..., Rigged]):
 
 def test_dead_process_is_not_ready(default_bundle: bundle.Bundle):
     """A killed process closes nothing: the kernel takes its lines back, and READY reads low."""
-    world = quiet()
-    box = assembly.box(config.load(None), default_bundle, world, StdoutPort("sim"), ExitStack())
+    simulated = quiet()
+    box = assembly.box(config.load(None), default_bundle, simulated, StdoutPort("sim"), ExitStack())
     for _ in range(5):
         box.step()
-    assert [v for _, n, v in world.gpio.written if n == devices.READY] == [True]
-    for request in list(world.gpio.requests):
+    assert [v for _, n, v in simulated.gpio.written if n == devices.READY] == [True]
+    for request in list(simulated.gpio.requests):
         request.release()
-    assert [v for _, n, v in world.gpio.written if n == devices.READY] == [True, False]
+    assert [v for _, n, v in simulated.gpio.written if n == devices.READY] == [True, False]
 
 
 def test_unplugged_during_a_sweep(rigged: Callable[..., Rigged]):
     """The sweep is answered `sensor-lost` at once; FAULT; a trigger meanwhile is `not-ready`; after replugging all is well."""
-    world = world_of(script.tubes(1003, 3))
-    box = rigged(world)
+    simulated = simulated_devices(script.tubes(1003, 3))
+    box = rigged(simulated)
     box.until(lambda: box.box.answered == 1)
-    begin = world.clock.now_ns()
-    world.backend.at(begin + 2 * SECOND, world.backend.unplug)
-    world.backend.at(begin + round(3.9 * SECOND), world.backend.plug)
+    begin = simulated.clock.now_ns()
+    simulated.backend.at(begin + 2 * SECOND, simulated.backend.unplug)
+    simulated.backend.at(begin + round(3.9 * SECOND), simulated.backend.plug)
     lost = box.until(lambda: box.box.answered == 2)
     assert lost[0].status is Status.SENSOR_LOST
-    assert world.clock.now_ns() - begin < 2.2 * SECOND
-    box.until(lambda: world.finished(box.box.answered))
+    assert simulated.clock.now_ns() - begin < 2.2 * SECOND
+    box.until(lambda: simulated.finished(box.box.answered))
     box.seconds(0.1)
     assert [a.status for a in answers(box)][1:] in (
         ["sensor-lost", "ok"],
         ["sensor-lost", "not-ready"],
         ["sensor-lost", "unsure"],
     )
-    fault = [level for _, name, level in world.gpio.written if name == devices.FAULT]
-    assert fault == [True, False]
+    fault_line = [level for _, name, level in simulated.gpio.written if name == devices.FAULT]
+    assert fault_line == [True, False]
 
 
 def test_trigger_while_not_ready_is_answered(rigged: Callable[..., Rigged]):
     """No skin: the start edge gets its answer, its stop edge none."""
-    world = quiet()
-    world.backend.unplug()
-    box = rigged(world)
+    simulated = quiet()
+    simulated.backend.unplug()
+    box = rigged(simulated)
     box.pulse(devices.START, 0.5)
     box.pulse(devices.STOP, 3)
     verdicts = box.seconds(4)
@@ -166,8 +166,8 @@ def test_storm_of_edges(rigged: Callable[..., Rigged]):
     """10,000 edges in a second: answered `edges-lost`, no frame lost, and the next sweep is fine."""
     frames = slide()
     quiet_act = rig.Act(np.zeros((6 * RATE, 4, 4), np.uint8), 10**7, 10**7 + 1, "")
-    world = world_of([quiet_act, *touched(frames)])
-    box = rigged(world)
+    simulated = simulated_devices([quiet_act, *touched(frames)])
+    box = rigged(simulated)
     box.seconds(0.5)
     for i in range(10_000):
         box.edge(devices.START, 0.5 + i * 1e-4, i % 2 == 0)
@@ -185,11 +185,11 @@ def test_storm_of_edges(rigged: Callable[..., Rigged]):
 @pytest.mark.parametrize(("packet_frames", "statuses"), [(2, {"ok", "unsure"}), (4, {"gap"})])
 def test_missing_frames(rigged: Callable[..., Rigged], packet_frames: int, statuses: set[str]):
     """A lost packet within the window: two frames are interpolated and counted, four make it a `gap`."""
-    world = world_of(touched(slide()))
-    world.backend.board = rig.Board(skin.FORMAT, world.robot, world.clock, packet_frames=packet_frames)
+    simulated = simulated_devices(touched(slide()))
+    simulated.backend.board = rig.Board(skin.FORMAT, simulated.robot, simulated.clock, packet_frames=packet_frames)
     count = itertools.count()
-    world.backend.mangle = lambda data: b"" if next(count) == 1500 // packet_frames else data
-    box = rigged(world)
+    simulated.backend.mangle = lambda data: b"" if next(count) == 1500 // packet_frames else data
+    box = rigged(simulated)
     box.until(lambda: box.box.answered == 1)
     box.seconds(0.1)
     (answer,) = answers(box)
@@ -197,29 +197,29 @@ def test_missing_frames(rigged: Callable[..., Rigged], packet_frames: int, statu
     assert answer.lost == box.box.counters.lost_frames == packet_frames
 
 
-def spoiled(how: str) -> np.ndarray:
+def spoiled(fault: str) -> np.ndarray:
     """A slide with a skin that is not as it should be."""
     frames = slide("plastic rough")
-    if how == "saturated":
+    if fault == "saturated":
         frames[:, 1:3, 1:3] = 255 - (np.arange(len(frames)) % 7 == 0)[:, None, None]
-    elif how == "stuck-taxel":
+    elif fault == "stuck-taxel":
         frames[:, 1, 2] = 77
-    elif how == "dead-taxel":
+    elif fault == "dead-taxel":
         frames[:, 2, 1] = 0
-    elif how == "no-contact":
+    elif fault == "no-contact":
         frames = np.random.default_rng(0).integers(0, 2, frames.shape).astype(np.uint8)
     return frames
 
 
 @pytest.mark.parametrize(
-    ("how", "detail"),
+    ("fault", "detail"),
     [("saturated", "taxel 2.2"), ("stuck-taxel", "taxel 2.3"), ("dead-taxel", "taxel 3.2"), ("no-contact", "digits")],
 )
-def test_a_spoiled_skin_is_seen_before_the_network_is_asked(rigged: Callable[..., Rigged], how: str, detail: str):
+def test_a_spoiled_skin_is_seen_before_the_network_is_asked(rigged: Callable[..., Rigged], fault: str, detail: str):
     """Saturation, stuck and dead taxels, no contact: a status with the place, and no label."""
-    box = rigged(world_of(touched(spoiled(how))))
+    box = rigged(simulated_devices(touched(spoiled(fault))))
     (verdict,) = box.until(lambda: box.box.answered == 1)
-    assert (verdict.status, verdict.label) == (how, "")
+    assert (verdict.status, verdict.label) == (fault, "")
     assert detail in verdict.detail
     assert len(verdict.scores) == 0
 
@@ -227,7 +227,7 @@ def test_a_spoiled_skin_is_seen_before_the_network_is_asked(rigged: Callable[...
 def test_sweeps_of_one_object_are_fused(rigged: Callable[..., Rigged]):
     """Before NEW OBJECT sweeps stand alone; after it they count together, until the next one."""
     acts = [replace(a, new_object=i in (1, 4)) for i, a in enumerate(script.tubes(1005, 6))]
-    box = rigged(world_of(acts))
+    box = rigged(simulated_devices(acts))
     verdicts = box.until(lambda: box.box.answered == 6)
     assert [v.fused for v in verdicts] == [1, 1, 2, 3, 1, 2]
 
@@ -235,7 +235,7 @@ def test_sweeps_of_one_object_are_fused(rigged: Callable[..., Rigged]):
 def test_fusing_can_be_turned_off(rigged: Callable[..., Rigged]):
     """With `classifier.fuse=none` NEW OBJECT changes nothing."""
     acts = [replace(a, new_object=i == 0) for i, a in enumerate(script.tubes(1005, 3))]
-    box = rigged(world_of(acts), sets=("classifier.fuse=none",))
+    box = rigged(simulated_devices(acts), sets=("classifier.fuse=none",))
     assert [v.fused for v in box.until(lambda: box.box.answered == 3)] == [1, 1, 1]
 
 
@@ -256,7 +256,7 @@ def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):
 def test_tare_moves_the_contact_threshold(rigged: Callable[..., Rigged]):
     """An offset that looks like a touch is none after a tare; a tare during a sweep is refused."""
     offset = np.random.default_rng(0).integers(40, 42, (9 * RATE, 4, 4)).astype(np.uint8)
-    box = rigged(world_of([rig.Act(offset, 10**7, 10**7 + 1, "")]))
+    box = rigged(simulated_devices([rig.Act(offset, 10**7, 10**7 + 1, "")]))
     box.seconds(1)
     assert "largest 4" in box.ask("$PPLP,TARE")
     box.pulse(devices.START, 0.1)
@@ -278,7 +278,7 @@ def test_abort_answers_the_open_sweep(rigged: Callable[..., Rigged]):
 
 
 def test_stopping_answers_what_is_open(rigged: Callable[..., Rigged]):
-    """The loop ends when told, and the sweep that was open is answered `aborted`."""
+    """The loop ends when it is stopped, and the sweep that was open is answered `aborted`."""
     box = rigged(quiet())
     box.pulse(devices.START, 0.2)
     end = box.world.clock.now_ns() + SECOND
@@ -287,7 +287,7 @@ def test_stopping_answers_what_is_open(rigged: Callable[..., Rigged]):
     assert [a.status for a in answers(box)] == ["aborted"]
 
 
-def test_state_is_said_once_a_second(rigged: Callable[..., Rigged]):
+def test_state_is_sent_once_a_second(rigged: Callable[..., Rigged]):
     """One STA sentence a second, with the frames so far."""
     box = rigged(quiet())
     box.seconds(10)
@@ -299,9 +299,9 @@ def test_state_is_said_once_a_second(rigged: Callable[..., Rigged]):
 
 def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]):
     """The line is full: sentences are dropped and counted, every frame and every sweep is still taken."""
-    world = world_of(script.tubes(1006, 20))
-    box = rigged(world, sets=("serial.queue=4", "serial.state_s=0.05"))
-    while not world.finished(box.box.answered):
+    simulated = simulated_devices(script.tubes(1006, 20))
+    box = rigged(simulated, sets=("serial.queue=4", "serial.state_s=0.05"))
+    while not simulated.finished(box.box.answered):
         box.box.step()
     assert box.port.dropped > 0
     assert box.box.counters.lost_frames == 0
@@ -310,12 +310,12 @@ def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]
 
 def test_trouble_is_logged_once(rigged: Callable[..., Rigged], logged: list[str]):
     """What goes wrong is logged when it begins and when it ends, not at every turn."""
-    world = quiet()
-    box = rigged(world)
+    simulated = quiet()
+    box = rigged(simulated)
     box.seconds(1)
-    world.backend.unplug()
+    simulated.backend.unplug()
     box.seconds(2)
-    world.backend.plug()
+    simulated.backend.plug()
     box.seconds(1)
     skin_lines = [line.removeprefix("<4>") for line in logged if "skin: " in line]
     assert skin_lines[0] == "skin: streaming"

@@ -43,10 +43,12 @@ def in_service(run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Pat
     """A copy of a folder of 30 sweeps, three an object, some answered early; and the sentences that went out."""
     if "heard" not in run:
         acts = [replace(act, new_object=i % PER_OBJECT == 0) for i, act in enumerate(script.tubes(1020, SWEEPS))]
-        world = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "replay")
+        simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "replay")
         black_box = BlackBox(run["folder"], skin.FORMAT, SWEEPS)
-        box = rigged(world, sets=("classifier.early=true", "classifier.min_probability=0.97"), observers=[black_box])
-        box.until(lambda: world.finished(box.box.answered), limit_s=300)
+        box = rigged(
+            simulated, sets=("classifier.early=true", "classifier.min_probability=0.97"), observers=[black_box]
+        )
+        box.until(lambda: simulated.finished(box.box.answered), limit_s=300)
         black_box.close()
         run["heard"] = [line for line in box.heard if ",RES," in line]
     return Path(shutil.copytree(run["folder"], tmp_path / "kept")), run["heard"]
@@ -54,9 +56,9 @@ def in_service(run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Pat
 
 def played(path: Path, model: bundle.Bundle, settings: config.Config = HERE) -> tuple[int, list[str], list[str]]:
     """Exit code, sentences, and what came of each sweep."""
-    said: list[str] = []
-    code = replay(path, settings, model, said.append)
-    lines = "".join(said).splitlines()
+    printed: list[str] = []
+    code = replay(path, settings, model, printed.append)
+    lines = "".join(printed).splitlines()
     return code, [line for line in lines if line.startswith("$")], [line for line in lines if line[0] != "$"]
 
 
@@ -89,7 +91,7 @@ def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundl
 
 
 def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, default_bundle: bundle.Bundle):
-    """The ring has dropped an object's first sweep: the others' own scores are compared, and that is said."""
+    """The ring has dropped an object's first sweep: the others' own scores are compared, and the output says so."""
     folder, _ = in_service
     counts = {n: sidecar(folder / f"sweep-{n:06d}.npy")["verdict"]["fused"] for n in range(1, SWEEPS + 1)}
     threes = [n for n in counts if counts[n] == PER_OBJECT]  # the last sweeps of objects of which all were fused
@@ -164,7 +166,7 @@ def test_a_changed_byte_is_told(in_service, default_bundle: bundle.Bundle):
 
 
 def test_another_bundle_is_named(in_service, tmp_path: Path, default_bundle: bundle.Bundle):
-    """One sweep: both ids and what to try. A folder: those of the bundle are judged, the others are told."""
+    """One sweep: both ids and what to try. A folder: those of the bundle are judged, the others are named."""
     folder, _ = in_service
     other = replace(default_bundle, id="0badcafe")
     with pytest.raises(
@@ -191,7 +193,7 @@ def test_the_next_run_begins_anew(tmp_path: Path):
 
 
 def test_a_sweep_that_is_not_answered_early_any_more(tmp_path: Path):
-    """By a bundle that decides there; another one is told, and no answer is made up."""
+    """By a bundle that decides there; another one is named, and no answer is made up."""
     frames = Frames(np.arange(10), np.arange(10), toy_bundle.window(1, 0)[:10])
     early = Sweep(1, 0, 0, Status.OK, frames, share=0.5)
     save(tmp_path / "s.npy", early, toy_bundle.FORMAT)

@@ -37,7 +37,7 @@ OK = Verdict(
 SHORT = replace(OK, sweep=8, status=Status.SHORT, label="", probability=0.0, fused=0, scores=np.empty(0))
 
 
-class Teller:
+class ClockedStatus:
     """A status file on a virtual clock."""
 
     def __init__(self, folder: Path, **more: object) -> None:
@@ -54,149 +54,151 @@ class Teller:
         return len(set(inodes))
 
     def read(self) -> dict:
-        """What a reader makes of it now."""
+        """What a reader gets now."""
         return status.read(self.path, self.clock.now_ns())
 
-    def said(self) -> str:
+    def text(self) -> str:
         """The same in words."""
         return "\n".join(status.lines(self.read(), self.clock.now_ns()))
 
 
 @pytest.fixture
-def teller(tmp_path: Path) -> Teller:
+def status_file(tmp_path: Path) -> ClockedStatus:
     """A status file that nobody has written yet."""
-    return Teller(tmp_path)
+    return ClockedStatus(tmp_path)
 
 
-def test_it_is_written_once_a_second_and_soon_after_news(teller: Teller):
+def test_it_is_written_once_a_second_and_soon_after_news(status_file: ClockedStatus):
     """Four times in four seconds of turns; a verdict, and a lost skin, are there a tenth of a second later."""
-    assert teller.turns(4) in (4, 5)
-    teller.file.turn(HEALTH)
-    teller.file.answered(OK)
-    teller.turns(0.12)
-    assert [v["sweep"] for v in teller.read()["verdicts"]] == [7]
-    teller.turns(0.12, AWAY)
-    assert teller.read()["skin"] == "absent"
+    assert status_file.turns(4) in (4, 5)
+    status_file.file.turn(HEALTH)
+    status_file.file.answered(OK)
+    status_file.turns(0.12)
+    assert [v["sweep"] for v in status_file.read()["verdicts"]] == [7]
+    status_file.turns(0.12, AWAY)
+    assert status_file.read()["skin"] == "absent"
 
 
-def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(teller: Teller):
+def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: ClockedStatus):
     """Verdicts with every turn: one write in a tenth of a second, and the last twenty are kept."""
     written = 0
     for i in range(100):
-        teller.file.answered(replace(SHORT, sweep=i))
-        before = teller.path.stat().st_ino if teller.path.exists() else None
-        teller.file.turn(HEALTH)
-        written += teller.path.stat().st_ino != before
-        teller.clock.sleep_until(teller.clock.now_ns() + SECOND // 100)
+        status_file.file.answered(replace(SHORT, sweep=i))
+        before = status_file.path.stat().st_ino if status_file.path.exists() else None
+        status_file.file.turn(HEALTH)
+        written += status_file.path.stat().st_ino != before
+        status_file.clock.sleep_until(status_file.clock.now_ns() + SECOND // 100)
     assert 9 <= written <= 11
-    assert len(teller.read()["verdicts"]) == 20
+    assert len(status_file.read()["verdicts"]) == 20
 
 
-def test_every_user_may_read_it_whole(teller: Teller):
+def test_every_user_may_read_it_whole(status_file: ClockedStatus):
     """Mode 644 under the service's umask; the file is replaced, so a reader that had it open still has it whole."""
     before = os.umask(0o027)
     try:
-        teller.turns(0.01)
+        status_file.turns(0.01)
     finally:
         os.umask(before)
-    assert stat.S_IMODE(teller.path.stat().st_mode) == 0o644
-    with teller.path.open() as f:
-        teller.turns(2)
+    assert stat.S_IMODE(status_file.path.stat().st_mode) == 0o644
+    with status_file.path.open() as f:
+        status_file.turns(2)
         assert json.load(f)["answered"] == 7
-    assert [p.name for p in teller.path.parent.iterdir()] == ["status.json"]
+    assert [p.name for p in status_file.path.parent.iterdir()] == ["status.json"]
 
 
 def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     """Since when, skin, bundle, further facts, the last verdicts newest first; advice where something is wrong."""
-    teller = Teller(tmp_path, more=lambda: {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]})
-    teller.file.answered(replace(OK, sweep=6, detail="moved 2.1 mm too far towards row 4"))
-    teller.file.answered(OK)
-    teller.file.answered(SHORT)
-    teller.turns(135)
-    said = teller.said().splitlines()
-    assert said[0] == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source usb)"
-    assert said[1:5] == [
+    status_file = ClockedStatus(
+        tmp_path, more=lambda: {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
+    )
+    status_file.file.answered(replace(OK, sweep=6, detail="moved 2.1 mm too far towards row 4"))
+    status_file.file.answered(OK)
+    status_file.file.answered(SHORT)
+    status_file.turns(135)
+    text = status_file.text().splitlines()
+    assert text[0] == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source usb)"
+    assert text[1:5] == [
         "skin     streaming (5,000,000 frames, 3 lost)",
         "bundle   9f3c2a1b",
         "sweeps   7 answered",
         "trial    start 1 of 3, 7 of 20 sweeps",
     ]
-    assert [line.split()[1] for line in said[5:]] == ["8", "7", "6"]
-    assert "short        the stop edge came before a window" in said[5]
-    assert said[6].split()[-6:] == ["plastic", "rough", "98.7", "%", "1.2", "ms"]
-    assert said[7].endswith("1.2 ms; moved 2.1 mm too far towards row 4")
-    assert status.exit_code(teller.read()) == 0
-    teller.turns(1.5, replace(AWAY, garbage_bytes=9, enumerations=2, dropped=4))
-    said = teller.said()
-    assert "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, plugged in 2 t" in said
-    assert "serial   4 sentences dropped, since nobody read them" in said
-    assert status.exit_code(teller.read()) == 69
+    assert [line.split()[1] for line in text[5:]] == ["8", "7", "6"]
+    assert "short        the stop edge came before a window" in text[5]
+    assert text[6].split()[-6:] == ["plastic", "rough", "98.7", "%", "1.2", "ms"]
+    assert text[7].endswith("1.2 ms; moved 2.1 mm too far towards row 4")
+    assert status.exit_code(status_file.read()) == 0
+    status_file.turns(1.5, replace(AWAY, garbage_bytes=9, enumerations=2, dropped=4))
+    text = status_file.text()
+    assert "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, plugged in 2 t" in text
+    assert "serial   4 sentences dropped, since nobody read them" in text
+    assert status.exit_code(status_file.read()) == 69
 
 
-def test_what_a_device_says_does_not_steer_a_terminal(teller: Teller):
+def test_text_of_a_device_does_not_steer_a_terminal(status_file: ClockedStatus):
     """Escape characters from outside are shown as question marks."""
-    teller.turns(0.01, replace(AWAY, trouble="\x1b[2Jgone\n"))
-    assert "?[2Jgone?" in teller.said()
+    status_file.turns(0.01, replace(AWAY, trouble="\x1b[2Jgone\n"))
+    assert "?[2Jgone?" in status_file.text()
 
 
-def test_a_program_that_has_ended_is_not_running(teller: Teller):
-    """Stopped in order the file is gone; killed, hung, or of before the last boot it says why; all exit 1."""
-    assert status.exit_code(teller.read()) == 1
-    assert "does not run" in teller.said()
-    teller.turns(0.01)
-    assert teller.read()["running"]
-    written = json.loads(teller.path.read_text())
-    teller.clock.sleep_until(teller.clock.now_ns() + 11 * SECOND)
-    assert "has written nothing for 11 s, so it hangs" in teller.said()
+def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
+    """Stopped in order: the file is gone. Killed, hung, or from before the last boot: it says why. All exit with 1."""
+    assert status.exit_code(status_file.read()) == 1
+    assert "does not run" in status_file.text()
+    status_file.turns(0.01)
+    assert status_file.read()["running"]
+    written = json.loads(status_file.path.read_text())
+    status_file.clock.sleep_until(status_file.clock.now_ns() + 11 * SECOND)
+    assert "has written nothing for 11 s, so it hangs" in status_file.text()
     gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
     for wrong in ({"pid": int(gone.stdout)}, {"time_ns": 10**18}):
-        teller.path.write_text(json.dumps(written | {"time_ns": teller.clock.now_ns()} | wrong))
-        assert "has ended without closing down" in teller.said()
-        assert status.exit_code(teller.read()) == 1
-    teller.file.stopping()
-    assert not teller.path.exists()
+        status_file.path.write_text(json.dumps(written | {"time_ns": status_file.clock.now_ns()} | wrong))
+        assert "has ended without closing down" in status_file.text()
+        assert status.exit_code(status_file.read()) == 1
+    status_file.file.stopping()
+    assert not status_file.path.exists()
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"schema": 2}', "[" * 100_000, '{"schema": 1, "pid": "x"}'])
-def test_a_file_of_another_form_is_named(teller: Teller, text: str):
+def test_a_file_of_another_form_is_named(status_file: ClockedStatus, text: str):
     """What is no status of this version is an error, not a guess."""
-    teller.path.write_text(text)
+    status_file.path.write_text(text)
     with pytest.raises(FormatError, match="not a status of this version"):
-        teller.read()
+        status_file.read()
 
 
-def test_a_file_that_may_not_be_read_is_named(teller: Teller):
+def test_a_file_that_may_not_be_read_is_named(status_file: ClockedStatus):
     """A folder in its place: the error names the path and what to try."""
-    teller.path.mkdir()
+    status_file.path.mkdir()
     with pytest.raises(ApplianceError, match="cannot be read"):
-        teller.read()
+        status_file.read()
 
 
-def test_trouble_with_the_file_is_told_once(tmp_path: Path, logged: list[str]):
+def test_trouble_with_the_file_is_logged_once(tmp_path: Path, logged: list[str]):
     """Without its folder the box goes on; one line, and another only after it had worked in between."""
-    teller = Teller(tmp_path / "run")
-    teller.turns(5)
+    status_file = ClockedStatus(tmp_path / "run")
+    status_file.turns(5)
     assert len(logged) == 1
     assert "classifying goes on" in logged[0]
-    teller.path.parent.mkdir()
-    teller.turns(2)
-    assert teller.read()["running"]
-    teller.path.unlink()
-    teller.path.parent.rmdir()
-    teller.turns(2)
-    teller.file.stopping()
+    status_file.path.parent.mkdir()
+    status_file.turns(2)
+    assert status_file.read()["running"]
+    status_file.path.unlink()
+    status_file.path.parent.rmdir()
+    status_file.turns(2)
+    status_file.file.stopping()
     assert len(logged) == 2
 
 
-def test_a_box_at_work_tells_its_verdicts(rigged, tmp_path: Path, logged: list[str]):
-    """On the rig: skin, bundle and verdicts of the box itself, and the same verdicts in the journal."""
-    world_clock = rig.VirtualClock()
-    told = StatusFile(tmp_path / "status.json", world_clock)
-    box: Rigged = rigged(observers=[told, VerdictLog()])
+def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list[str]):
+    """On simulated devices: skin, bundle and verdicts of the box, and the same verdicts in the log."""
+    clock = rig.VirtualClock()
+    file = StatusFile(tmp_path / "status.json", clock)
+    box: Rigged = rigged(observers=[file, VerdictLog()])
     verdicts = box.until(lambda: box.box.answered >= 2)
-    world_clock.sleep_until(SECOND * 60)
+    clock.sleep_until(SECOND * 60)
     box.seconds(0.2)
-    read = status.read(tmp_path / "status.json", world_clock.now_ns())
+    read = status.read(tmp_path / "status.json", clock.now_ns())
     assert (read["skin"], read["answered"], read["bundle"]) == ("streaming", 2, verdicts[0].bundle)
     assert [(v["sweep"], v["label"]) for v in read["verdicts"]] == [(v.sweep, v.label) for v in verdicts]
     lines = [line.removeprefix("<4>") for line in logged if line.startswith(("sweep", "<4>sweep"))]
@@ -224,7 +226,7 @@ def test_the_log_has_one_line_a_verdict(verdict: Verdict, line: str, logged: lis
 
 
 def test_every_status_without_a_label_has_its_reason():
-    """One list: a new status must say what to look at."""
+    """One list: a new status must say what to check."""
     assert set(REASONS) == {s for s in Status if not s.classified}
 
 
@@ -262,23 +264,23 @@ def test_what_is_counted_is_shown(
     rigged: Callable[..., Rigged], tmp_path: Path, name: str, field: int, fault: Callable[[Rigged], None], text: str
 ):
     """Each fault is in the STA sentence, in its answer to STATE, in the file and in words, and was not before it."""
-    world = idle_world(60)
-    file = StatusFile(tmp_path / "status.json", world.clock)
-    box = rigged(world, ("trigger.storm_edges=50",) if name == "storms" else (), observers=[file])
+    simulated = idle_world(60)
+    file = StatusFile(tmp_path / "status.json", simulated.clock)
+    box = rigged(simulated, ("trigger.storm_edges=50",) if name == "storms" else (), observers=[file])
     box.seconds(1.5)
 
     def shown() -> tuple[int, int, int, bool]:
-        report = status.read(tmp_path / "status.json", world.clock.now_ns())
+        report = status.read(tmp_path / "status.json", simulated.clock.now_ns())
         answer = box.ask("$PPLP,STATE").split("*")[0].split(",")[4:]
         sentence = next(h for h in reversed(box.heard) if ",STA," in h).split("*")[0].split(",")[2:]
-        in_words = text in "\n".join(status.lines(report, world.clock.now_ns()))
+        in_words = text in "\n".join(status.lines(report, simulated.clock.now_ns()))
         return int(sentence[field - 1]), int(answer[field - 1]), report[name], in_words
 
     assert shown() == (0, 0, 0, False)
     fault(box)
     box.seconds(2.5)
-    said, answered, written, in_words = shown()
-    assert said == answered == written == getattr(box.box.health, name) > 0
+    sent, answered, written, in_words = shown()
+    assert sent == answered == written == getattr(box.box.health, name) > 0
     assert in_words
 
 
