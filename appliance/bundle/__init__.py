@@ -1,1 +1,1 @@
-"""The model bundle: a folder of files, checked before anything in it is believed."""
+"""The model bundle: a folder of files that are checked before any of them is used."""

@@ -1,14 +1,14 @@
-"""The model bundle: a folder in, a checked Bundle out. Nothing in it is trusted before its hash and form are.
+"""The model bundle. In: a folder. Out: a checked Bundle. No file is used before its hash and form were checked.
 
-A bundle is `manifest.json`, `model.onnx`, `golden.npz` and, where the manifest has `known`, `means.npz`. The graph
-takes the sensor's own digits as `sweep` [1, T, R, C] (or float32 features [1, n] as `features`, where the manifest's
-input is one of features.KINDS); all scaling is inside it. It gives, by name:
+A bundle is `manifest.json`, `model.onnx`, `golden.npz` and, if the manifest has `known`, `means.npz`. The graph takes
+the sensor's raw counts as `sweep` [1, T, R, C] (or float32 features [1, n] as `features`, if the manifest's input is
+one of features.KINDS); all scaling is inside it. Its outputs by name:
 
-- `logits` float32 [1, K0] for the K0 labels that training knew;
-- `early` float32 [1, D, K0], optional: row d (from 0) is the logits after (d + 1) / (D + 1) of the window;
-- `embedding` float32 [1, r], optional: a linear image in which the sweeps of each material scatter with covariance 1.
+- `logits` float32 [1, K0] for the K0 labels of training;
+- `early` float32 [1, D, K0], optional: row d (from 0) holds the logits after (d + 1) / (D + 1) of the window;
+- `embedding` float32 [1, r], optional: a linear projection in which the sweeps of each material have covariance 1.
 
-Golden sweeps come with the logits that export, or the box at enrolment, saw.
+Golden sweeps are test sweeps with the logits that were computed at export, or by the box at enrolment.
 """
 
 from __future__ import annotations
@@ -44,30 +44,31 @@ from appliance.core.errors import BundleError
 from appliance.core.types import UNREADABLE, SweepFormat
 from appliance.signal import features
 
-try:  # not from hashlib: that loads OpenSSL, 4 MB for a function which Python has by itself
+try:  # not from hashlib: it loads OpenSSL, 4 MB, for a function that Python has built in
     from _sha2 import sha256  # type: ignore[import-not-found,unused-ignore]
 except ImportError:  # Python 3.11
     from _sha256 import sha256  # type: ignore[import-not-found,unused-ignore]
 
 __all__ = [
     "DEFAULT", "GOLDEN", "GOLDEN_TOLERANCE", "INPUTS", "LABEL", "MANIFEST", "MEANS", "MODEL", "SIGNATURE",
-    "Bundle", "Classes", "Early", "Known", "Manifest", "Thresholds", "digest", "file_entry", "files", "identity", "load", "made",
+    "Bundle", "Classes", "Early", "Known", "Manifest", "Thresholds", "digest", "file_entry", "files",
+    "from_files", "identity", "load",
 ]  # fmt: skip
 DEFAULT = Path(__file__).parents[1] / "default_bundle"
 SIGNATURE = MANIFEST + ".sig"
 MOST_SMALL = 1 << 20
-"""Bytes of a manifest or a signature at most: read before anything is known of them."""
+"""Largest size in bytes of a manifest or a signature, which are read before anything is known about them."""
 GOLDEN_TOLERANCE = 0.02
-"""Largest allowed difference of a probability between export and this machine; the label must be the same."""
+"""Largest allowed difference of a golden sweep's probability between export and this machine; labels must be equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Classes:
-    """means.npz: where each label lies in the embedding, in the order of the labels.
+    """Content of means.npz: the class means in the embedding, in the order of the labels.
 
-    means: float32 [K, r]. bias: float32 [K], what is added to means . embedding. sweeps: int64 [K], how many a label
-    was enrolled from; 0 where it was trained. spread: float32 [K], variance of its sweeps in a direction of the
-    embedding; 1 where it was trained, and for all labels where the file does not hold this array.
+    means: float32 [K, r]. bias: float32 [K], added to the product of mean and embedding. sweeps: int64 [K], number of
+    sweeps that a label was enrolled from; 0 for a trained label. spread: float32 [K], variance of the label's sweeps
+    per direction of the embedding; 1 for a trained label, and for all labels if the file has no such array.
     """
 
     means: NDArray[np.float32]
@@ -78,10 +79,10 @@ class Classes:
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """A bundle whose files were found as its manifest says.
+    """A bundle whose files agree with its manifest.
 
-    golden: digits [G, T, R, C]; golden_logits float32 [G, K]. id: see `identity`.
-    classes: where the manifest has `known`.
+    id: see `identity`. model: the bytes of model.onnx. golden: raw counts [G, T, R, C]; golden_logits: float32 [G, K].
+    classes: the class means, None if the manifest has no `known`.
     """
 
     manifest: Manifest
@@ -93,7 +94,7 @@ class Bundle:
 
     @property
     def enrolled(self) -> dict[str, int]:
-        """The labels that training did not know, with the number of sweeps they come from."""
+        """The labels that were enrolled, with the number of sweeps each was enrolled from."""
         if self.classes is None:
             return {}
         return {label: int(n) for label, n in zip(self.manifest.labels, self.classes.sweeps, strict=True) if n}
@@ -105,53 +106,54 @@ class Bundle:
 
 
 def file_entry(data: bytes) -> dict[str, Any]:
-    """sha256 and size of one file, as the manifest holds them."""
+    """The manifest's entry for one file: sha256 and size."""
     return {"sha256": digest(data), "bytes": len(data)}
 
 
 def digest(data: bytes) -> str:
-    """The sha256 in hexadecimal; of its manifest it is what a bundle goes by in a store."""
+    """The sha256 in hexadecimal. The digest of its manifest is a bundle's name in the store."""
     return str(sha256(data).hexdigest())
 
 
 def identity(manifest: bytes) -> str:
-    """A bundle's id: the first eight hex digits of its manifest's sha256."""
+    """A bundle's id: the first eight hexadecimal digits of its manifest's sha256."""
     return digest(manifest)[:8]
 
 
 def load(folder: Path) -> Bundle:
-    """Read and check the bundle in `folder`. Raises BundleError where a file is missing, altered or of another form."""
-    return made(files(folder), str(folder))
+    """Read and check the bundle in `folder`. Raises BundleError if a file is missing, altered or of another form."""
+    return from_files(files(folder), str(folder))
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """The files of the bundle in `folder` by name: the manifest, those that it names, the signature where there is one.
+    """The files of the bundle in `folder` by name: the manifest, the files that it names, the signature if there is
+    one.
 
-    Whatever else lies there is not looked at. Nothing is followed out of the folder, and of each file no more is read
-    than the manifest says. Raises BundleError where one cannot be read or is larger.
+    Other files are ignored. Links are not followed, and no file is read beyond the size in the manifest.
+    Raises BundleError if a file cannot be read or is larger.
     """
     try:
-        held = {MANIFEST: _read(folder / MANIFEST, MOST_SMALL)}
+        found = {MANIFEST: _read(folder / MANIFEST, MOST_SMALL)}
     except OSError as e:
         raise BundleError(f"no bundle at {folder}: {MANIFEST}: {e.strerror}; name the folder of one") from e
-    for name, size in _named(held[MANIFEST]).items():
+    for name, size in _named(found[MANIFEST]).items():
         try:
-            held[name] = _read(folder / name, size)
+            found[name] = _read(folder / name, size)
         except OSError as e:
             if name == SIGNATURE and e.errno == errno.ENOENT:
                 continue
             what = "was altered" if e.errno == errno.EFBIG else "cannot be read"
             raise BundleError(f"{folder}: {name} {what}: {e.strerror}; copy the bundle again") from e
-    return held
+    return found
 
 
 def _named(manifest: bytes) -> dict[str, int]:
-    """What else is to be read, with the most bytes of each."""
+    """The other files to read, with the largest size of each."""
     return {SIGNATURE: MOST_SMALL} | {name: entry["bytes"] for name, entry in Manifest.parse(manifest).files.items()}
 
 
 def _read(path: Path, most: int) -> bytes:
-    """A plain file's bytes, at most one more than `most`: never a link, a device, or a pipe that would wait."""
+    """Bytes of a regular file, at most one more than `most`: no link, no device, no pipe that would block."""
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as f:
         if not stat.S_ISREG(os.fstat(f.fileno()).st_mode):
             raise OSError(errno.EINVAL, "it is no plain file", str(path))
@@ -161,8 +163,8 @@ def _read(path: Path, most: int) -> bytes:
     return data
 
 
-def made(files: Mapping[str, bytes], where: str) -> Bundle:
-    """The bundle that `files` are, checked; `where` they come from. Raises BundleError as `load`."""
+def from_files(files: Mapping[str, bytes], where: str) -> Bundle:
+    """The checked bundle of `files` by name. where: their origin, for messages. Raises BundleError as `load`."""
     manifest = Manifest.parse(files[MANIFEST])
     model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
     samples, logits = _golden(golden, manifest)
@@ -175,7 +177,7 @@ def made(files: Mapping[str, bytes], where: str) -> Bundle:
 
 
 def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: str) -> bytes:
-    """The bytes of one file, compared with its entry in the manifest."""
+    """The bytes of one file after comparing them with its entry in the manifest."""
     if name not in manifest.files or name not in files:
         raise BundleError(f"{where}: the manifest does not name {name}; export the bundle again")
     want, have = manifest.files[name], file_entry(files[name])
@@ -185,7 +187,7 @@ def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: s
 
 
 def _arrays(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
-    """Arrays of an .npz by name, `names` among them; never unpickled."""
+    """Arrays of an .npz by name, `names` among them; pickled objects are refused."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as packed:
             size = sum(entry.file_size for entry in packed.infolist())
@@ -194,17 +196,17 @@ def _arrays(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
                 f"{file} unpacks to {size} bytes, {MOST_BYTES} are allowed; export the bundle with fewer sweeps"
             )
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
-            held = dict(z.items())
-        return {name: held[name] for name in names} | held
+            arrays = dict(z.items())
+        return {name: arrays[name] for name in names} | arrays
     except (*UNREADABLE, OSError, KeyError, zipfile.BadZipFile) as e:
         raise BundleError(f"{file} cannot be read: {e}; export the bundle again") from e
 
 
 def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Golden sweeps and their logits."""
+    """Golden sweeps [G, T, R, C] and their logits [G, K]."""
     f = manifest.format
-    held = _arrays(data, GOLDEN, "samples", "logits")
-    samples, logits = held["samples"], held["logits"]
+    arrays = _arrays(data, GOLDEN, "samples", "logits")
+    samples, logits = arrays["samples"], arrays["logits"]
     if samples.shape[1:] != (f.window, f.rows, f.cols) or samples.dtype != f.digits or not len(samples):
         raise BundleError(f"{GOLDEN} holds {samples.dtype} {samples.shape}, which does not fit the format {f}")
     if logits.shape != (len(samples), len(manifest.labels)):
@@ -215,12 +217,12 @@ def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.f
 
 
 def _classes(data: bytes, manifest: Manifest) -> Classes:
-    """What means.npz holds: one row a label, trained ones first."""
+    """Content of means.npz: one row per label, trained labels first."""
     n = len(manifest.labels)
-    held = {"spread": np.ones(n, np.float32)} | _arrays(data, MEANS, "means", "bias", "sweeps")
-    found = Classes(*(held[name] for name in Classes.__slots__))
+    arrays = {"spread": np.ones(n, np.float32)} | _arrays(data, MEANS, "means", "bias", "sweeps")
+    found = Classes(*(arrays[name] for name in Classes.__slots__))
     for name, kind in (("means", "float32"), ("bias", "float32"), ("sweeps", "int64"), ("spread", "float32")):
-        values = held[name]
+        values = arrays[name]
         if values.dtype != kind or values.ndim != 1 + (name == "means") or len(values) != n or 0 in values.shape:
             raise BundleError(
                 f"{MEANS} holds {name} {values.dtype} {values.shape} for {n} labels; {kind} is wanted, a row a label"

@@ -1,6 +1,6 @@
-"""What a bundle says of itself: the manifest. In: the bytes of manifest.json. Out: a checked Manifest, and back.
+"""The manifest of a bundle. In: the bytes of manifest.json. Out: a checked Manifest, and the bytes of one.
 
-The dataclasses are its schema. What is read can be reckoned with, shown and written again.
+The dataclasses are its schema. What was read can be computed with, printed and written again.
 """
 
 from __future__ import annotations
@@ -19,24 +19,25 @@ from appliance.signal import features
 from appliance.signal.contact import ContactPositions
 
 SCHEMA = 3
-"""What is written. Schema 1 has no `early` and no `known`, schema 2 no `runtime`, `counter` and `place`; both are read."""
+"""Version that is written. Versions 1 (without `early`, `known`) and 2 (without `runtime`, `counter`, `place`) are
+read."""
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
 LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
-"""What a label may look like: it travels in a sentence, so no comma, star or dollar, and at most 24 characters."""
+"""Form of a label. It is sent in sentences, so it has no comma, star or dollar sign and at most 24 characters."""
 MOST_BYTES = 64 << 20
-"""Of one file. The largest of our own, the paper's network in int8, takes 16 MB; the box's memory is limited to 128 MB."""
+"""Largest file. The largest of our models, the paper's network in int8, has 16 MB; the service is limited to 128 MB."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
 
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """What is checked before the network is asked, in digits above the tare, and what its answer must reach.
+    """Limits for a window before the network runs, and for the network's answer.
 
-    contact: least temporal mean of a loaded taxel. full_scale: the highest digit the sensor gives.
-    saturated: share of full-scale digits in a window that is still accepted. dead_taxels: how many the model bears.
-    unsure: least probability for status ok.
+    contact: least mean over time of a loaded taxel, in counts above the tare. full_scale: the sensor's highest count.
+    saturated: largest accepted share of full-scale counts in a window. dead_taxels: largest number that the model
+    tolerates. unsure: least probability for status ok.
     """
 
     contact: float
@@ -48,10 +49,10 @@ class Thresholds:
 
 @dataclass(frozen=True, slots=True)
 class Early:
-    """When the answer goes out before the sweep has ended. Raises BundleError where a number makes no sense.
+    """Rule for answers before the sweep has ended. Raises BundleError for a number out of range.
 
-    least: [D], the probability that a label must reach at each step; above 1: never there. agree: so many steps, the
-    newest included, must name the same label.
+    least: [D], the probability that a label must reach at each step; above 1 a step never answers. agree: number of
+    steps in a row, including the newest, that must name the same label.
     """
 
     least: tuple[float, ...]
@@ -66,10 +67,10 @@ class Early:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What a trained material looks like. Raises BundleError where a number makes no sense.
+    """Rule for unknown materials. Raises BundleError for a number out of range.
 
-    limit: largest squared distance of a sweep's embedding to the nearest class mean; beyond it the material is unknown.
-    temperature: what logits from class means are divided by.
+    limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it the material is
+    unknown. temperature: divisor of the logits from class means.
     """
 
     limit: float
@@ -87,11 +88,13 @@ def _positive(value: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a bundle says of itself. `files` maps each name to its sha256 and size, `figures` each protocol to numbers,
-    `made` names commit, seed and machine. early, known, place: None where the bundle cannot do it.
+    """The manifest of a bundle. Raises BundleError for values out of range.
 
-    runtime: the least version of the box that can run it. counter: grows with each bundle that is signed, so that none
-    can be put back unnoticed; 0 was never signed.
+    input: "raw" or a feature set. files: name -> sha256 and size. figures: results by evaluation protocol. made:
+    commit, seed and machine of the export. early, known, place: rules for early answers and unknown materials, and
+    contact positions of training; None if the bundle does not support them.
+    runtime: least version of the box that can run it. counter: increases with each signed bundle, so that an older one
+    cannot be installed unnoticed; 0 was never signed.
     """
 
     name: str
@@ -133,7 +136,7 @@ class Manifest:
         _check_labels(self.labels)
 
     def json(self) -> bytes:
-        """The manifest as it is written: one text for one content."""
+        """The bytes of manifest.json; equal manifests give equal bytes."""
         return (json.dumps(asdict(self), indent=1, sort_keys=True) + "\n").encode()
 
     @classmethod
@@ -141,21 +144,21 @@ class Manifest:
         """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong type."""
         try:
             made = typed(cls, json.loads(text))
-            made.json()  # nested so deeply that it could not be written again after enrolment
+            made.json()  # raises if it is nested too deeply to be written again after enrolment
             return made
         except (ValueError, TypeError, AttributeError, RecursionError, FormatError) as e:
             raise BundleError(f"manifest cannot be read: {e}; export the bundle again") from e
 
 
 def version(text: object) -> tuple[int, ...]:
-    """A version as numbers that compare. Raises BundleError where it is not of the form 1.2.3."""
+    """A version as a tuple of numbers, for comparison. Raises BundleError if it is not of the form 1.2.3."""
     if not isinstance(text, str) or not _VERSION.fullmatch(text):
         raise BundleError(f"version {text!r} is not of the form 1.2.3; export the bundle again")
     return tuple(map(int, text.split(".")))
 
 
 def _check_age(m: Manifest) -> None:
-    """Raises BundleError where a manifest has what its schema does not know."""
+    """Raises BundleError if a manifest has keys that its schema version does not have."""
     if m.schema == 1 and (m.early or m.known):
         raise BundleError("manifest schema 1 has no `early` and no `known`; export the bundle again")
     if m.schema < 3 and (m.place or m.counter or m.runtime != "0.0.0"):
@@ -163,7 +166,7 @@ def _check_age(m: Manifest) -> None:
 
 
 def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raises BundleError where a file is none that a bundle has, or its entry does not pin it down."""
+    """Raises BundleError for a file that no bundle has, or an entry without sha256 and size."""
     for name, entry in files.items():
         if name not in (MODEL, GOLDEN, MEANS):
             raise BundleError(f"manifest names a file {name!r}; a bundle has {MODEL}, {GOLDEN} and {MEANS} alone")
@@ -179,7 +182,7 @@ def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def _check_labels(labels: tuple[str, ...]) -> None:
-    """Raises BundleError where labels are too few, equal, or cannot be sent."""
+    """Raises BundleError if labels are too few, equal, or cannot be sent."""
     if len(labels) < 2 or len(set(labels)) < len(labels):
         raise BundleError(f"manifest labels {list(labels)} must be at least two different names")
     for label in labels:

@@ -184,11 +184,11 @@ def run_enrol(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     settings = _without_early_answers(load_settings(args))
     current = load_bundle(settings)
     enrolment.admit(current, args.label)
-    enrolment.check_place(args.out, args.replace)
+    enrolment.check_target(args.out, args.replace)
     devices = open_devices(lambda: current.format)
     stopped = stop_flag()
     with ExitStack() as stack:
-        taken = enrolment.Taken(args.good)
+        taken = enrolment.SweepCollector(args.good)
         port = assembly.port(settings, devices)
         box = assembly.box(settings, current, devices, port, stack, observers=[taken], labels=(args.label,))
         box.run(lambda: taken.enough or stopped() or devices.finished(box.answered))

@@ -75,7 +75,7 @@ class BundleFolder:
         if bundle.SIGNATURE not in files:
             raise BundleError(f"{folder} is not signed; sign the bundle (palpate-train sign)")
         signer = signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers)
-        loaded = bundle.made(files, str(folder))
+        loaded = bundle.from_files(files, str(folder))
         if version(loaded.manifest.runtime) > version(__version__):
             raise BundleError(
                 f"bundle needs palpate {loaded.manifest.runtime} and this is {__version__}; update the box (make install)"

@@ -1,1 +1,1 @@
-"""From a sweep to a verdict: network, novelty, early exit, enrolment."""
+"""From a sweep to a verdict: network, novelty detection, early exit; enrolment of new materials."""

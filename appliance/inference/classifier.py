@@ -1,7 +1,8 @@
-"""Bundle + Sweep -> Verdict: looks at the window before the network does, runs it, fuses the sweeps of one object.
+"""Classifies sweeps. In: a Bundle and Sweeps. Out: Verdicts; the window is checked, classified, and fused with the
+other sweeps of its object.
 
-The graph takes the raw digits; nothing is scaled here. What is refused is refused by status, with its reason: a faulty
-window, and a material that looks like none of those trained or enrolled.
+The graph takes the raw counts; nothing is scaled here. A faulty window, or a material unlike all that were trained or
+enrolled, gets a status with the reason instead of a label.
 """
 
 from __future__ import annotations
@@ -28,64 +29,64 @@ if TYPE_CHECKING:
 
 _NONE = np.empty(0)
 LEAST_PROBABILITY = 1e-12
-"""What a probability counts as at least when sweeps are fused: one sure beyond float64 cannot veto all others."""
+"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto all others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a look at the window found: ok, or why it is refused, and where."""
+    """Result of the check of a window: status ok, or why it is refused, with the taxels in `detail`."""
 
     status: Status
     detail: str = ""
 
 
-def _places(mask: Any) -> str:
+def _taxels(mask: Any) -> str:
     return "taxel " + " ".join(f"{r + 1}.{c + 1}" for r, c in np.argwhere(mask))
 
 
 def inspect(taxels: NDArray[Any], tare: NDArray[np.float64], limits: Thresholds) -> Finding:
-    """Look at a window [T, R, C] before it is classified; `tare` [R, C] is the unloaded skin in digits.
+    """Check a window before it is classified. taxels: raw counts [T, R, C]; tare: counts [R, C] of the unloaded skin.
 
-    A loaded taxel always moves: one that is constant is stuck. A silent taxel is dead where every direct neighbour is
-    loaded; at the edge of the contact it may be silent by right. One that gives no numbers is dead anywhere.
+    A loaded taxel always varies, so that a constant one is stuck. A constant unloaded taxel is dead if all its direct
+    neighbours are loaded; at the edge of the contact it may be unloaded. One that gives no numbers is always dead.
     """
-    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # [R*C, T]: three times as fast to reduce
+    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # [R * C, T]: three times as fast to reduce
     still = (series.min(axis=1) == series.max(axis=1)).reshape(tare.shape)
     load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
-    if not np.isfinite(load).all():  # of a float skin: whatever the network makes of it is no answer
-        return Finding(Status.DEAD_TAXEL, _places(~np.isfinite(load)))
+    if not np.isfinite(load).all():  # possible with float32 counts; no output of the network is an answer then
+        return Finding(Status.DEAD_TAXEL, _taxels(~np.isfinite(load)))
     loaded = load >= limits.contact
     if not loaded.any():
         return Finding(Status.NO_CONTACT, f"strongest taxel {load.max():.1f} digits")
     full = (series >= limits.full_scale).mean(axis=1).reshape(tare.shape)
     stuck = still & loaded & (full < 1)
     if stuck.any():
-        return Finding(Status.STUCK_TAXEL, _places(stuck))
+        return Finding(Status.STUCK_TAXEL, _taxels(stuck))
     if full.mean() > limits.saturated:
-        return Finding(Status.SATURATED, _places(full > 0))
+        return Finding(Status.SATURATED, _taxels(full > 0))
     padded = np.ones((tare.shape[0] + 2, tare.shape[1] + 2), bool)
     padded[1:-1, 1:-1] = loaded
     dead = still & ~loaded & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     if dead.sum() > limits.dead_taxels:
-        return Finding(Status.DEAD_TAXEL, _places(dead))
+        return Finding(Status.DEAD_TAXEL, _taxels(dead))
     return Finding(Status.OK)
 
 
 def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
-    """Eq. 10 of the paper over the last axis, in float64."""
+    """Probabilities of logits along the last axis, in float64 (paper, eq. 10)."""
     z = np.asarray(logits, np.float64)
     e = np.exp(z - z.max(axis=-1, keepdims=True))
     result: NDArray[np.float64] = e / e.sum(axis=-1, keepdims=True)
     return result
 
 
-def fuse(scores: list[NDArray[np.float64]], how: str) -> NDArray[np.float64]:
-    """Fuse the probabilities [K] of several sweeps of one object into one [K].
+def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
+    """Fuse the probabilities float64 [K] of several sweeps of one object into one array [K].
 
-    `product` (Bayes with independent sweeps; Tulbure and Baeuml 2018) is the default. `vote` is the paper's sec. V.D:
-    the most frequent label wins, of equally frequent ones the one seen first: two sweeps never differ from the first.
+    fusion: "product" (Bayes with independent sweeps; Tulbure and Baeuml 2018), or "vote" (paper, sec. V.D): the most
+    frequent label wins, of equally frequent ones the first, so that with two sweeps the first decides.
     """
-    if how == "product":
+    if fusion == "product":
         return softmax(np.log(np.maximum(scores, LEAST_PROBABILITY)).sum(axis=0))
     labels = [int(np.argmax(s)) for s in scores]
     votes = np.bincount(labels, minlength=len(scores[0])) / len(labels)
@@ -96,23 +97,24 @@ def fuse(scores: list[NDArray[np.float64]], how: str) -> NDArray[np.float64]:
 class Classifier:
     """Runs one bundle in one thread.
 
-    Sweeps with the same `object` number above 0 are fused: a robot that never says NEW OBJECT gets each by itself.
+    Sweeps with the same `object` number above 0 are fused; without NEW OBJECT each sweep is answered by itself.
     They are a sequential test: `unsure` asks for one more sweep of the object, until the probability is at least
-    `min_probability` (ok) or `max_sweeps` were fused (undecided: the answer is final). A robot that sweeps on all the same is answered
-    by the same rule, with all sweeps of the object in it: more evidence is never thrown away.
-    An unknown sweep takes no part in this. It has no probabilities that could be fused, and one touch beside the object
-    must not undo what the object's other sweeps said.
+    `min_probability` (ok) or `max_sweeps` were fused (undecided, the final answer). If the robot continues all the
+    same, the same rule applies to all sweeps of the object, since no evidence is discarded.
+    An unknown sweep is not fused: it has no probabilities, and one touch beside the object must not invalidate what its
+    other sweeps showed.
 
-    min_probability: 0 stands for the bundle's thresholds.unsure. max_sweeps: 0 for no limit.
-    Raises BundleError where onnxruntime refuses the model; bundle.load has compared its input and outputs with the manifest.
+    fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 takes the bundle's thresholds.unsure.
+    max_sweeps: 0 means no limit. Raises BundleError if onnxruntime refuses the model; its inputs and outputs were
+    compared with the manifest by `bundle.load`.
     """
 
     def __init__(
-        self, bundle: Bundle, clock: Clock, how: str = "product", min_probability: float = 0.0, max_sweeps: int = 0
+        self, bundle: Bundle, clock: Clock, fusion: str = "product", min_probability: float = 0.0, max_sweeps: int = 0
     ) -> None:
         self.bundle = bundle
         self.min_probability = min_probability or bundle.manifest.thresholds.unsure
-        self._clock, self._how, self._max_sweeps = clock, how, max_sweeps
+        self._clock, self._fusion, self._max_sweeps = clock, fusion, max_sweeps
         self._object = 0
         self._scores: list[NDArray[np.float64]] = []  # of the object's sweeps so far
         f = bundle.format
@@ -121,35 +123,37 @@ class Classifier:
         self._input: str = self._session.get_inputs()[0].name
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
-        # onnxruntime computes them all, but makes arrays only of those that are asked for
-        self._asked = ["logits"] * (not bundle.enrolled) + ["embedding"] * (self._means is not None)
+        # onnxruntime computes all outputs but creates arrays only for those that are requested
+        self._outputs = ["logits"] * (not bundle.enrolled) + ["embedding"] * (self._means is not None)
 
     @property
     def rule(self) -> dict[str, Any]:
-        """What the constructor was told, so that a recorded sweep is judged by it again."""
-        return {"how": self._how, "sure": self.min_probability, "most_sweeps": self._max_sweeps}
+        """The constructor's settings, for sidecars, so that a replay classifies a recorded sweep by the same rule."""
+        return {"how": self._fusion, "sure": self.min_probability, "most_sweeps": self._max_sweeps}
 
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
-        """Logits float32 [K] of one window [T, R, C] of digits."""
-        return self._look(taxels)[0]
+        """Logits float32 [K] of one window of raw counts [T, R, C]."""
+        return self._classify(taxels)[0]
 
     def early(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
-        """Logits float32 [D, K0] after each step of one window [T, R, C] of digits, of a model that has this output.
+        """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C]; the model must have this
+        output.
 
-        Frames that have not come yet may hold anything: the rows that need them mean nothing.
+        Frames that have not come yet may have any value: rows that depend on them are meaningless.
         """
         return self._run(["early"], taxels)[0]
 
     def embedding(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
-        """Embedding float32 [r] of one window [T, R, C] of digits, of a model that has this output."""
+        """Embedding float32 [r] of one window of raw counts [T, R, C]; the model must have this output."""
         return self._run(["embedding"], taxels)[0]
 
     def self_test(self) -> float:
-        """Run the golden sweeps; the largest difference of a probability. Raises BundleError where a label differs."""
-        have = softmax(np.stack([self.logits(g) for g in self.bundle.golden]))
-        want = softmax(self.bundle.golden_logits)
-        worst = float(np.abs(have - want).max())
-        wrong = np.flatnonzero(have.argmax(1) != want.argmax(1))
+        """Run the golden sweeps; returns the largest difference of a probability. Raises BundleError if a label differs
+        or the difference is above GOLDEN_TOLERANCE."""
+        computed = softmax(np.stack([self.logits(g) for g in self.bundle.golden]))
+        expected = softmax(self.bundle.golden_logits)
+        worst = float(np.abs(computed - expected).max())
+        wrong = np.flatnonzero(computed.argmax(1) != expected.argmax(1))
         if len(wrong) or not worst <= GOLDEN_TOLERANCE:
             raise BundleError(
                 f"golden sweeps {wrong.tolist()} get another label and probabilities differ by {worst:.3g} "
@@ -160,47 +164,48 @@ class Classifier:
         return worst
 
     def _test_means(self, means: Means) -> None:
-        """Raises BundleError where the class means are not of the model: they name a golden sweep otherwise than its own
-        logits, which know a little more of how materials vary."""
+        """Raises BundleError if the class means do not belong to the model: they give a golden sweep another label than
+        the model's own logits."""
         for golden in self.bundle.golden:
             logits, z = self._run(["logits", "embedding"], golden)
-            named, near = logits.argmax(), means.logits(means.distances(z))[: len(logits)].argmax()
-            if named != near:
+            by_logits, by_means = logits.argmax(), means.logits(means.distances(z))[: len(logits)].argmax()
+            if by_logits != by_means:
                 labels = self.bundle.manifest.labels
                 raise BundleError(
-                    f"{MEANS} and the model's own logits call a golden sweep {labels[near]!r} and {labels[named]!r}: they "
-                    "are not of one training; export the bundle again"
+                    f"{MEANS} and the model's own logits call a golden sweep {labels[by_means]!r} and "
+                    f"{labels[by_logits]!r}: they are not of one training; export the bundle again"
                 )
 
     def __call__(self, sweep: Sweep) -> Verdict:
-        """The verdict on one sweep. A sweep that the recorder refused keeps its status and is not classified."""
+        """The verdict on one sweep. A sweep whose status is not ok keeps it and is not classified."""
         finding = Finding(sweep.status)
         if sweep.status is Status.OK:
             finding = inspect(sweep.frames.taxels, self.tare, self.bundle.manifest.thresholds)
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
-        logits, strange = self._look(sweep.frames.taxels)
-        if strange:
-            return self._verdict(sweep, Finding(Status.UNKNOWN, strange))
+        logits, novelty = self._classify(sweep.frames.taxels)
+        if novelty:
+            return self._verdict(sweep, Finding(Status.UNKNOWN, novelty))
         return self.conclude(sweep, softmax(logits))
 
     def conclude(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict:
-        """The verdict on a sound sweep with the probabilities `scores` [K], fused with its object's other sweeps."""
-        if math.isnan(scores[0]):  # softmax leaves all or none; digits of a float skin can overflow the network
+        """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with its object's other
+        sweeps."""
+        if math.isnan(scores[0]):  # all are NaN or none; float32 counts can overflow the network
             return self._verdict(sweep, Finding(Status.UNKNOWN, "the model gives no number"))
-        if sweep.object == 0 or sweep.object != self._object or self._how == "none":
+        if sweep.object == 0 or sweep.object != self._object or self._fusion == "none":
             self._object, self._scores = sweep.object, []
         own, self._scores = scores, [*self._scores, scores]
         fused = len(self._scores)
         if fused > 1:
-            scores = fuse(self._scores, self._how)
+            scores = fuse(self._scores, self._fusion)
         status = Status.OK
         if scores.max() < self.min_probability:
             status = Status.UNDECIDED if 0 < self._max_sweeps <= fused else Status.UNSURE
         return self._verdict(sweep, Finding(status), scores, fused, own)
 
     def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
-        """As `conclude` where that gives ok; else None, and the sweep does not count: it goes on."""
+        """As `conclude` if that gives ok; otherwise None, and the sweep, which is still going on, is not counted."""
         before = self._object, self._scores
         verdict = self.conclude(sweep, scores)
         if verdict.status is Status.OK:
@@ -209,21 +214,21 @@ class Classifier:
         return None
 
     def _run(self, outputs: list[str], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
-        """These outputs of the graph for one window, without the leading 1."""
-        given = features.given(self.bundle.manifest.input, taxels, self.bundle.format.rate_hz)
-        return [out[0] for out in run(self._session, outputs, {self._input: given[None]})]
+        """These outputs of the graph for one window, without the leading axis of length 1."""
+        graph_input = features.given(self.bundle.manifest.input, taxels, self.bundle.format.rate_hz)
+        return [out[0] for out in run(self._session, outputs, {self._input: graph_input[None]})]
 
-    def _look(self, taxels: NDArray[Any]) -> tuple[NDArray[np.float32], str]:
-        """Logits [K] of one window, and how strange it is: "" where it looks like a material that is known."""
-        gives = self._run(self._asked, taxels)
+    def _classify(self, taxels: NDArray[Any]) -> tuple[NDArray[np.float32], str]:
+        """Logits [K] of one window, and its distance from known materials; "" if it is like one of them."""
+        values = self._run(self._outputs, taxels)
         if self._means is None:
-            return gives[0], ""
-        distances = self._means.distances(gives[-1])
-        logits = self._means.logits(distances) if len(self._asked) == 1 else gives[0]
-        return logits, self._means.strange(distances)
+            return values[0], ""
+        distances = self._means.distances(values[-1])
+        logits = self._means.logits(distances) if len(self._outputs) == 1 else values[0]
+        return logits, self._means.novelty(distances)
 
     def _moved(self, sweep: Sweep) -> str:
-        """How far the contact lies from where training had it."""
+        """Distance of the contact from its positions in training, "" if it is at one of them."""
         m = self.bundle.manifest
         return moved(sweep.frames.taxels, self.tare, m.thresholds.contact, m.place) if m.place else ""
 
@@ -234,7 +239,7 @@ class Classifier:
         label, best, second = "", 0.0, 0.0
         moved = self._moved(sweep) if len(own) or finding.status is Status.UNKNOWN else ""
         if len(scores):
-            order = np.argsort(-scores, kind="stable")  # of equals the first, as argmax has it
+            order = np.argsort(-scores, kind="stable")  # of equal ones the first, as argmax
             label, best, second = self.bundle.manifest.labels[order[0]], scores[order[0]], scores[order[1]]
         now = self._clock.now_ns()
         return Verdict(

@@ -1,6 +1,7 @@
-"""Deciding early: an answer while the finger still slides. In: a sweep so far. Out: a Verdict of status ok, or None.
+"""Early exit: an answer while the finger still slides. In: a sweep so far. Out: a Verdict of status ok, or None.
 
-The bundle's graph has a head for each tenth of the window; the manifest says from which probability on it may speak.
+The bundle's graph has a head for each tenth of the window; the manifest holds the probability from which each may
+answer.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ if TYPE_CHECKING:
 
 
 def decides(scores: NDArray[np.float64], rule: Early) -> bool:
-    """True where `scores` [d + 1, K], the probabilities of steps 0 to d, are enough to decide at step d.
+    """Whether `scores` float64 [d + 1, K], the probabilities of steps 0 to d, allow an answer at step d.
 
-    The last `rule.agree` steps name the same label, and its probability at d is at least `rule.least[d]`.
+    They do if the last `rule.agree` steps name the same label, with at least the probability `rule.least[d]` at step d.
     """
     labels = scores[-rule.agree :].argmax(axis=1)
     agreed = len(labels) == rule.agree and (labels == labels[-1]).all()
@@ -29,9 +30,9 @@ def decides(scores: NDArray[np.float64], rule: Early) -> bool:
 
 
 class Decider:
-    """Answers sweeps that still go on. steps: how often in a window it can be asked.
+    """Answers sweeps that are still going on. steps: number of times in a window at which it can answer.
 
-    Raises BundleError where the bundle cannot decide early.
+    Raises BundleError if the bundle has no early heads.
     """
 
     def __init__(self, classifier: Classifier) -> None:
@@ -45,10 +46,10 @@ class Decider:
         self.steps = len(self._rule.least)
 
     def __call__(self, sweep: Sweep) -> Verdict | None:
-        """The verdict on a sweep with share < 1, or None where the rest of it is needed: then nothing was counted.
+        """The verdict on a sweep with share < 1, or None if the rest of it is needed; then nothing was counted.
 
-        It looks at the frames as it would at a whole window: what is refused there is not decided here. The rest of
-        the window that the graph is given repeats the last frame; the heads up to this step do not see it.
+        The frames are checked like a whole window, and no answer is given to what would be refused. For the graph the
+        window is completed by repeating the last frame; the heads up to this step do not depend on these frames.
         """
         taxels = sweep.frames.taxels
         if inspect(taxels, self._classifier.tare, self._manifest.thresholds).status is not Status.OK:
@@ -57,7 +58,7 @@ class Decider:
         return self._classifier.conclude_if_ok(sweep, scores[-1]) if decides(scores, self._rule) else None
 
     def scores(self, sweep: Sweep) -> NDArray[np.float64]:
-        """Probabilities [d, K] at the steps up to that of a sweep with share < 1."""
+        """Probabilities float64 [d, K] at the steps up to that of a sweep with share < 1."""
         taxels = sweep.frames.taxels
         rest = self._manifest.format.window - len(taxels)
         step = round(sweep.share * (self.steps + 1))  # counted from 1

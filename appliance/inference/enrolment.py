@@ -1,7 +1,7 @@
-"""The room where the box learns a material by itself. In: a bundle, a label, one to ten sweeps. Out: a new bundle.
+"""Enrolment: the box learns a material without training. In: a bundle, a label, one to ten sweeps. Out: a new bundle.
 
-Nothing is trained. In the embedding every material's sweeps scatter around their mean with the same covariance, 1, so a
-further material is no more than a further mean: that of its sweeps. What was trained stays as it is.
+In the embedding the sweeps of every material have covariance 1 around their mean. A new material therefore needs only a
+mean, that of its sweeps; everything that was trained stays as it is.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from appliance.inference.novelty import Means
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
-    """A bundle with one label more: as it runs, and its files by name. warnings: what a person should know."""
+    """A bundle with one more label, and its files by name. warnings: for the person who enrols."""
 
     bundle: Bundle
     files: dict[str, bytes]
@@ -38,7 +38,7 @@ class Enrolment:
 
 
 def admit(old: Bundle, label: str) -> None:
-    """Raises BundleError where `label` cannot be enrolled into `old`."""
+    """Raises BundleError if `label` cannot be enrolled into `old`."""
     labels = old.manifest.labels
     if label in labels:
         raise BundleError(f"label {label!r} is taken: the bundle has {', '.join(labels)}; choose another name")
@@ -52,11 +52,11 @@ def admit(old: Bundle, label: str) -> None:
 
 
 def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
-    """`old` with `label` as its last, learned from the digits `sweeps` [n, T, R, C]; same arguments, same bytes.
+    """`old` with `label` as its last label, learned from `sweeps`: raw counts [n, T, R, C]. Deterministic.
 
-    The heads for early answers do not know the label, so early answers end; figures of `old` do not hold any more: they
-    go. What else may be wrong is in the warnings, and nothing is refused for it.
-    Raises BundleError as `admit`, FormatError where `sweeps` are not of the bundle's format or give no embedding.
+    The early heads do not know the label, so that the new bundle gives no early answers; the figures of `old` no longer
+    hold and are removed. Other problems are reported as warnings and do not prevent the enrolment.
+    Raises BundleError as `admit`, FormatError if `sweeps` do not have the bundle's format or give no embedding.
     """
     admit(old, label)
     m, f = old.manifest, old.format
@@ -70,21 +70,21 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     ):
         raise FormatError(f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}")
     run = Classifier(old, SystemClock())
-    z, golden = (np.stack([run.embedding(s) for s in some]).astype(np.float64) for some in (sweeps, old.golden))
+    z, golden = (np.stack([run.embedding(s) for s in of]).astype(np.float64) for of in (sweeps, old.golden))
     if not np.isfinite(z).all():
         raise FormatError("the model gives no number for some of the sweeps; look at the skin and take others")
     manifest = replace(
         m, labels=(*m.labels, label), version=f"{m.version}+{label}", early=None, figures={},
         made=m.made | {"enrolled": old.enrolled | {label: len(z)}},
     )  # fmt: skip
-    classes = joined(old.classes, z)
+    classes = extended(old.classes, z)
     means = Means(classes, m.known, manifest.labels)
     median = _median(softmax(means.logits(means.distances(z))))
     new = replace(
         old, manifest=manifest, classes=classes, golden=np.concatenate([old.golden, sweeps[median : median + 1]]),
         golden_logits=means.logits(means.distances(np.vstack([golden, z[median]]))),
     )  # fmt: skip
-    warnings = list(_doubts(Means(old.classes, m.known, m.labels), label, z))
+    warnings = list(_problems(Means(old.classes, m.known, m.labels), label, z))
     if m.early:
         warnings.append(
             f"early answers end with this bundle: their heads do not know {label!r}; set classifier.early = false"
@@ -92,12 +92,13 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     return _packed(new, tuple(warnings))
 
 
-def joined(classes: Classes, z: NDArray[np.float64]) -> Classes:
-    """`classes` with one label more, from the embeddings `z` [n, r] of its sweeps.
+def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
+    """`classes` with one more label, from the embeddings `z` float64 [n, r] of its sweeps.
 
-    Its mean m is theirs. Its bias is -|m|^2 / 2 + r / (2 n), since a mean of n sweeps is on average longer than the
-    true one, |m|^2 by r / n. Its spread is that of the sweeps and of one more at the distance r that those of trained labels
-    have on average, and not less than theirs: materials that training never saw scatter more.
+    Its mean m is that of the sweeps. Its bias is -|m|^2 / 2 + r / (2 n), since |m|^2 of a mean of n sweeps is on
+    average larger than that of the true mean, by r / n. Its spread is computed from the sweeps and one assumed sweep at
+    squared distance r, the average of trained labels, and is at least 1, that of trained labels: the embedding of
+    materials that were not in training scatters more.
     """
     n, r = z.shape
     mean = z.mean(axis=0)
@@ -111,16 +112,17 @@ def joined(classes: Classes, z: NDArray[np.float64]) -> Classes:
 
 
 def _median(scores: NDArray[np.float64]) -> int:
-    """Which of the sweeps with probabilities `scores` [n, K] to keep as golden: of those that get the last label, or of
-    all, the median of its probability. As at export: a fault shows on it, and rounding does not turn it.
+    """Index of the sweep to keep as golden, given probabilities `scores` float64 [n, K]: the one with the median
+    probability of the last label among those that get it, or among all. As at export: a fault changes its label, a
+    rounding error does not.
     """
-    called = np.flatnonzero(scores.argmax(axis=1) == scores.shape[1] - 1)
-    pick = called if len(called) else np.arange(len(scores))
+    correct = np.flatnonzero(scores.argmax(axis=1) == scores.shape[1] - 1)
+    pick = correct if len(correct) else np.arange(len(scores))
     return int(pick[np.argsort(scores[pick, -1], kind="stable")[len(pick) // 2]])
 
 
 def _packed(new: Bundle, warnings: tuple[str, ...]) -> Enrolment:
-    """`new` with its files, and with the manifest that names them."""
+    """`new` with its files and a manifest that names them."""
     assert new.classes
     files = {
         bundle.MODEL: new.model,
@@ -138,23 +140,24 @@ def _npz(**arrays: NDArray[Any]) -> bytes:
     return packed.getvalue()
 
 
-def _doubts(means: Means, label: str, z: NDArray[np.float64]) -> Iterator[str]:
-    """What may be wrong with sweeps whose embeddings are `z` [n, r], beside the labels of `means`. The measure is the
-    limit beyond which a sweep is of an unknown material.
+def _problems(means: Means, label: str, z: NDArray[np.float64]) -> Iterator[str]:
+    """Warnings about sweeps with the embeddings `z` [n, r], compared with each other and with the labels of `means`.
+
+    The threshold is the limit beyond which a sweep is of an unknown material.
     """
     n, r = z.shape
     mean = z.mean(axis=0)
     if n > 1:
         away = ((z - mean) ** 2).sum(axis=1)
         spread = away.sum() / (n - 1)
-        # of simulated materials that training had left out one five in eleven is warned of, and four in five of those
-        # fives with another material's sweep in them
+        # measured with five sweeps each of simulated materials that were left out of training: one set in eleven gets
+        # this warning, and four in five of the sets that contain a sweep of another material
         if spread > means.limit:
             yield (
                 f"the sweeps of {label!r} disagree: they lie {spread:.1f} from their mean (squared; those of a trained "
                 f"material {r}, limit {means.limit:.1f}), number {away.argmax() + 1} most of all; take others"
             )
-    to_old = means.distances(mean) - r / n  # less what the mean of n sweeps is off by itself
+    to_old = means.distances(mean) - r / n  # minus the expected squared error of a mean of n sweeps
     k = int(to_old.argmin())
     if to_old[k] < min(means.limit, means.closest_pair()):
         yield (
@@ -163,8 +166,8 @@ def _doubts(means: Means, label: str, z: NDArray[np.float64]) -> Iterator[str]:
         )
 
 
-class Taken(Observer):
-    """Takes the good sweeps of a running box, and logs each."""
+class SweepCollector(Observer):
+    """Collects `wanted` good sweeps of a running box, and logs each sweep."""
 
     def __init__(self, wanted: int) -> None:
         self._wanted = wanted
@@ -172,11 +175,11 @@ class Taken(Observer):
 
     @property
     def enough(self) -> bool:
-        """True once all that are wanted were taken."""
+        """True once the wanted number of sweeps was collected."""
         return len(self._windows) >= self._wanted
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Take the sweep's window where the box found nothing wrong with it."""
+        """Collect the sweep's window if the box found no fault in it."""
         if self.enough:
             return
         if verdict.status.classified or verdict.status is Status.UNKNOWN:
@@ -186,7 +189,7 @@ class Taken(Observer):
             log.info(f"sweep {sweep.id} not taken: {verdict.status} {verdict.detail}".rstrip())
 
     def windows(self) -> NDArray[Any]:
-        """The digits [n, T, R, C]. Raises ApplianceError where there are too few."""
+        """The raw counts [n, T, R, C]. Raises ApplianceError if there are too few."""
         if not self.enough:
             raise ApplianceError(
                 f"{len(self._windows)} of {self._wanted} good sweeps had come when it ended; nothing was written: "
@@ -195,10 +198,10 @@ class Taken(Observer):
         return np.stack(self._windows)
 
 
-def check_place(target: Path, swap: bool) -> None:
-    """Raises BundleError where no bundle may be written to `target`: better told before the robot has swept.
+def check_target(target: Path, swap: bool) -> None:
+    """Raises BundleError if no bundle may be written to `target`; called before the robot sweeps, too.
 
-    swap: a bundle that is there already may give way.
+    swap: a bundle that exists there may be replaced.
     """
     if target.exists() and not swap:
         raise BundleError(f"{target} is there already; name another folder with --out, or give --replace")
@@ -209,12 +212,12 @@ def check_place(target: Path, swap: bool) -> None:
 
 
 def write(files: Mapping[str, bytes], target: Path, swap: bool) -> None:
-    """Put a bundle at `target`, once it has run as the box will run it.
+    """Write the bundle of `files` to the folder `target`, after its self-test has passed.
 
-    At every moment, through a loss of power too, `target` is what it was or the whole new bundle: the files are synced
-    aside, then take the name, or swap names with the old bundle, in one step. Raises BundleError.
+    At every moment, also after a loss of power, `target` is the old or the complete new bundle (`storage.folder`).
+    Raises BundleError.
     """
-    check_place(target, swap)
+    check_target(target, swap)
     target = target.resolve()
     try:
         with storage.folder(target) as new:

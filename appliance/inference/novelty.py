@@ -1,8 +1,9 @@
-"""Where a sweep lies among the materials. In: a bundle's class means, an embedding. Out: how far each is, logits.
+"""Distances of a sweep to the known materials. In: a bundle's class means, an embedding. Out: distances, logits, and
+whether the material is unknown.
 
-The embedding is scaled such that the sweeps of each material scatter around its mean with covariance 1. So a squared
-distance there is a number of deviations squared (Mahalanobis), and materials are told apart by the nearest mean. An
-enrolled material is one mean more; nothing is trained for it.
+The embedding is scaled so that the sweeps of each material have covariance 1 around their mean. A squared distance in
+it is therefore a squared Mahalanobis distance, and the nearest mean names the material. An enrolled material is one
+more mean; nothing is trained for it.
 """
 
 from __future__ import annotations
@@ -20,33 +21,34 @@ Array = NDArray[np.float64]
 
 
 class Means:
-    """Class means at work; `labels` [K] are theirs."""
+    """Computes distances and logits from a bundle's class means. labels: those of the means, [K]."""
 
     def __init__(self, classes: Classes, known: Known, labels: Sequence[str]) -> None:
         self.labels, self.limit, self._temperature = labels, known.limit, known.temperature
         self._means = classes.means.astype(np.float64)
-        # what stays of the bias when -|m|^2 / 2 is in the distance already: distances do not cancel as products do
+        # the rest of the bias, since the squared distance already contains -|m|^2 / 2; computed from distances, logits
+        # do not suffer the cancellation of large products
         self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
         n = classes.sweeps
-        # a mean of n sweeps is itself 1 / n off in every direction: another sweep of the material lies 1 + 1 / n away
+        # a mean of n sweeps has variance 1 / n in every direction: another sweep has variance 1 + 1 / n around it
         self._share = np.where(n, n / (n + 1), 1.0) / classes.spread
 
     def distances(self, embedding: NDArray[Any]) -> Array:
-        """Squared distances [..., K] of embeddings [..., r] to the class means; no unit."""
+        """Squared distances float64 [..., K] from embeddings [..., r] to the class means; no unit."""
         away = embedding[..., None, :] - self._means
         result: Array = (away**2).sum(axis=-1)
         return result
 
     def logits(self, distances: Array) -> NDArray[np.float32]:
-        """Logits [..., K] from `distances`: those of means and bias, but for a term that is the same for all labels."""
+        """Logits [..., K] from `distances` [..., K], up to a term that is the same for all labels."""
         result: NDArray[np.float32] = ((self._extra - distances / 2) / self._temperature).astype(np.float32)
         return result
 
-    def strange(self, distances: Array) -> str:
-        """How far the nearest material is from one embedding where that is beyond the limit, else "".
+    def novelty(self, distances: Array) -> str:
+        """The distance to the nearest material if it is beyond the limit, as text; "" for a known material.
 
-        An enrolled label's distance counts n / (n + 1) / spread, so that about as many of its sweeps are kept as of a
-        trained one's: the embedding was not made to hold them together.
+        distances: [K], of one embedding. The distance to an enrolled label is multiplied by n / (n + 1) / spread, so
+        that about as many of its sweeps are accepted as of a trained label, for which the embedding was optimised.
         """
         scaled = distances * self._share
         k = int(scaled.argmin())
@@ -55,6 +57,6 @@ class Means:
         return f"squared distance {scaled[k]:.4g} from {self.labels[k]}, limit {self.limit:.4g}"
 
     def closest_pair(self) -> float:
-        """Squared distance of the two class means that lie closest together."""
+        """Squared distance between the two closest class means."""
         between = self.distances(self._means)
         return float(between[~np.eye(len(between), dtype=bool)].min())

@@ -1,5 +1,5 @@
-"""Runs onnxruntime as the box does. In: the bytes of a model that onnx_check has accepted; arrays. Out: a session; its
-outputs. Whatever onnxruntime raises comes out as a BundleError.
+"""Runs onnxruntime as the box does. In: the bytes of a model that onnx_check has accepted, and input arrays. Out: a
+session and its outputs. Errors of onnxruntime become BundleErrors.
 """
 
 from __future__ import annotations
@@ -12,7 +12,11 @@ from appliance.core.errors import BundleError
 
 
 def session(model: bytes) -> ort.InferenceSession:
-    """One thread, no spinning, errors only, telemetry off: a quiet session that leaves the core to the sensor."""
+    """A session with one thread, no spinning, logging of errors only and no telemetry, since the sensor shares its
+    core.
+
+    Raises BundleError if onnxruntime refuses the model.
+    """
     ort.disable_telemetry_events()
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -26,10 +30,10 @@ def session(model: bytes) -> ort.InferenceSession:
 
 
 def run(opened: ort.InferenceSession, outputs: list[str], given: dict[str, Any]) -> list[Any]:
-    """These outputs of the graph. Raises BundleError where onnxruntime cannot compute them."""
+    """The graph's `outputs` for the input arrays `given` by name. Raises BundleError if they cannot be computed."""
     try:
-        gives: list[Any] = opened.run(outputs, given)
+        values: list[Any] = opened.run(outputs, given)
     except Exception as e:  # as above
         why = str(e).strip()[:200]
         raise BundleError(f"onnxruntime {ort.__version__} cannot run the model: {why}; export the bundle again") from e
-    return gives
+    return values

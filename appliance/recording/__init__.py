@@ -1,1 +1,1 @@
-"""From frames and edges to sweeps, and sweeps to files."""
+"""From frames and edges to sweeps, and from sweeps to files: recordings, black box, captures."""

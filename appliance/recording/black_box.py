@@ -1,7 +1,7 @@
-"""The black box: the last sweeps in service, with their verdicts. In: sweeps, verdicts. Out: files that `replay` judges.
+"""The black box: the last sweeps in service with their verdicts. In: sweeps, verdicts. Out: files for `palpate replay`.
 
-Sweeps without a window are not kept: their sentence holds all there is, and a robot that goes on without a skin would
-drive out those that hold something.
+Sweeps without a window are not kept. Their sentence holds everything that is known, and a robot that continues without
+a skin would displace the sweeps that have a window.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from appliance.recording.recording import FULL, SweepFolder
 
 
 class BlackBox(Observer):
-    """Keeps the last `most` sweeps in `folder`, over restarts too.
+    """Keeps the last `most` sweeps in `folder`, also over restarts.
 
-    An old sweep goes once the new one is safe; on a full disk it goes before.
+    An old sweep is removed after the new one was written, on a full disk before.
     """
 
     def __init__(self, folder: Path, fmt: SweepFormat, most: int) -> None:
@@ -28,21 +28,21 @@ class BlackBox(Observer):
         self._log = TroubleLog(
             "black box: no sweep is kept", f"see to {folder}", end="black box: sweeps are kept again"
         )  # fmt: skip
-        self._with_folder(lambda folder: None)  # while there is time: it waits for the disk several times
+        self._with_folder(lambda folder: None)  # now, at the start, since it waits for the disk several times
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Write the sweep if it has a window, and remove what is one too many."""
+        """Write the sweep if it has a window, and remove the oldest if there are too many."""
         if len(sweep.frames):
             self._with_folder(lambda folder: self._put(folder, sweep, verdict, circumstances))
 
     def close(self) -> None:
-        """Give the folder back."""
+        """Release the folder."""
         if self._folder:
             self._folder.close()
 
     def _with_folder(self, act: Callable[[SweepFolder], None]) -> None:
         def attempt() -> None:
-            # a folder that cannot be used at the start may be usable later, and must not keep the box from its work
+            # a folder that cannot be used at the start may be usable later, and must not stop the box
             self._folder = self._folder or SweepFolder(self._path, self._format)
             act(self._folder)
 

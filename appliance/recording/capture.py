@@ -1,6 +1,7 @@
-"""Captures (transfers, states, edges, commands with their times, in one file) and kept sweeps. Out: the same, played.
+"""Captures: everything that the box receives, in one file. In: transfers, sensor states, edges and commands with their
+times. Out: a file; and `Playback`, which gives its content to the same modules again.
 
-A capture played through the same rooms gives the same verdicts bit for bit, since nothing else enters them.
+The verdicts of a capture are the same bit for bit, since they depend on nothing else.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _MOST_NS = 1 << 63
 
 
 class RecordKind(IntEnum):
-    """What a record holds."""
+    """Content of a record."""
 
     TRANSFER = 0
     STATE = 1
@@ -43,10 +44,10 @@ class RecordKind(IntEnum):
 
 
 class CaptureWriter(Observer):
-    """Writes a capture as it happens; what a power failure cuts off is at most what the system had not written yet.
+    """Writes a capture while the box runs; a power failure loses at most what the system had not written yet.
 
-    Where the file cannot be written any more the capture ends, since one with a hole would lie; classifying goes on.
-    Raises ConfigError where it cannot be opened.
+    If the file cannot be written any more the capture ends, since one with a gap would replay differently; classifying
+    goes on. Raises ConfigError if the file cannot be opened.
     """
 
     def __init__(self, path: Path, fmt: SweepFormat) -> None:
@@ -60,19 +61,19 @@ class CaptureWriter(Observer):
         self._put(lambda: self._file.write(MAGIC + len(head).to_bytes(4, "little") + head))
 
     def transfer(self, t_ns: int, data: bytes) -> None:
-        """Note a bulk transfer that ended at `t_ns`."""
+        """Write a bulk transfer that ended at `t_ns`."""
         self._write(RecordKind.TRANSFER, t_ns, data)
 
     def state(self, t_ns: int, state: str) -> None:
-        """Note the sensor's new state."""
+        """Write the sensor's new state."""
         self._write(RecordKind.STATE, t_ns, state.encode())
 
     def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
-        """Note edges that the trigger gave out at `t_ns`."""
+        """Write edges that the trigger returned at `t_ns`."""
         self._write(RecordKind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
 
     def command(self, t_ns: int, line: str) -> None:
-        """Note a command that was carried out, as it stands in a sentence."""
+        """Write a command that was executed, in the form of a sentence."""
         self._write(RecordKind.COMMAND, t_ns, line.encode())
 
     def close(self) -> None:
@@ -88,9 +89,9 @@ class CaptureWriter(Observer):
 
 
 class Playback:
-    """Sensor, trigger, clock and commands in one: gives what a capture holds to the rooms behind, each at its time.
+    """Sensor, trigger, clock and source of commands of a replayed capture: each record is returned at its time.
 
-    Raises FormatError where the file cannot be read or is no capture; a last record that was cut off is left out.
+    Raises FormatError if the file cannot be read or is no capture; an incomplete last record is left out.
     """
 
     def __init__(self, path: Path) -> None:
@@ -118,35 +119,35 @@ class Playback:
 
     @property
     def finished(self) -> bool:
-        """True when everything was played."""
+        """True when all records were played."""
         return not self._records
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """Sensor: how well the board's time is known."""
+        """Sensor: how well the board's time is known (DeviceClock.quality)."""
         return self._stream.clock
 
     def now_ns(self) -> int:
-        """Clock: the time of the record that was played last."""
+        """Clock: the time of the last record that was played."""
         return self._now_ns
 
     def sleep_until(self, t_ns: int) -> None:
-        """Clock: the records alone move time."""
+        """Clock: does nothing, since only records advance the time."""
 
     @property
     def blind(self) -> bool:
-        """Trigger: a capture holds what was told, so nothing is unknown."""
+        """Trigger: never; a capture holds the edges that the box was given."""
         return False
 
     def read(self) -> Frames:
-        """Sensor: the next transfer's frames, or none where the next record is something else."""
+        """Sensor: the next transfer's frames, or none if the next record is of another kind."""
         frames = Frames.empty(self.format)
         if self._records:
             kind, self._now_ns, data = self._records[0]
             if kind in (RecordKind.TRANSFER, RecordKind.STATE):
                 self._records.popleft()
             if kind == RecordKind.TRANSFER:
-                with suppress(SensorMismatch):  # what the sensor made of it then is the next record
+                with suppress(SensorMismatch):  # the state that followed is the next record
                     frames = self._stream.feed(data, self._now_ns)
             elif kind == RecordKind.STATE:
                 self.state = data.decode()
@@ -155,14 +156,14 @@ class Playback:
         return frames
 
     def edges(self, now_ns: int) -> list[Edge]:
-        """Trigger: the edges that the box was given at this moment."""
+        """Trigger: the edges that the box was given at this time."""
         edges = []
         while self._records and self._records[0][0] == RecordKind.EDGES and self._records[0][1] <= now_ns:
             edges += [Edge(_KINDS[k], t) for t, k in _EDGE.iter_unpack(self._records.popleft()[2])]
         return edges
 
     def commands(self) -> list[Command]:
-        """Port: the commands that were carried out at this moment."""
+        """Port: the commands that were executed at this time."""
         found = []
         while self._records and self._records[0][0] == RecordKind.COMMAND and self._records[0][1] <= self._now_ns:
             found.append(_command(self._records.popleft()[2]))
@@ -170,7 +171,7 @@ class Playback:
 
 
 def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int, bytes]]:
-    """(kind, host ns, content) one after another."""
+    """The records (kind, host ns, content) from byte `at` on. Raises FormatError for an unknown one."""
     while at + _RECORD.size <= len(data):
         kind, t_ns, size = _RECORD.unpack_from(data, at)
         body = data[at + _RECORD.size : at + _RECORD.size + size]
@@ -183,7 +184,7 @@ def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int
 
 
 def _written(kind: int, t_ns: int, body: bytes) -> bool:
-    """Whether a record is one that CaptureWriter writes."""
+    """Whether CaptureWriter can have written this record."""
     if kind == RecordKind.EDGES:
         return not len(body) % _EDGE.size and all(k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body))
     if kind == RecordKind.COMMAND:
@@ -192,6 +193,6 @@ def _written(kind: int, t_ns: int, body: bytes) -> bool:
 
 
 def _command(line: bytes) -> Command:
-    """The command that a record holds."""
+    """The command of a record."""
     name, comma, text = line.decode("ascii", "replace").partition(",")
     return command(name, text if comma else None)

@@ -1,4 +1,4 @@
-"""The room of recordings: sweeps on the disk, with the labels that a researcher gives while the robot works.
+"""Records sweeps to files, with labels that a researcher gives by commands while the robot works (`palpate record`).
 
 In: sweeps with their verdicts, commands. Out: sweep-NNNNNN.npy and .json in one folder, a REC sentence for each sweep.
 """
@@ -27,21 +27,22 @@ from appliance.core.types import Status, Sweep, SweepFormat, Verdict, save
 from appliance.io.robot_link import sentence
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""What a disk says that has no room."""
+"""Errnos of a full disk."""
 LEAST_FREE = 64 << 20, 20
-"""What is left to the system: so many bytes, or this part of a small disk. A card that is full to its end can stop more
-than a recording."""
+"""Space that is left free for the system: this many bytes, or on a small disk one part in this many. A card that is
+completely full can stop more than a recording."""
 MOST_CHANGES = 1024
-"""Changes of the labels that are remembered until the sweeps before them are answered; far more than a person makes."""
+"""Number of label changes that are kept until the sweeps before them are answered; far more than a person makes."""
 _KEPT = re.compile(rf"sweep-([0-9]+)\.(?:npy|json)({re.escape(storage.PART)})?")
 
 
 class SweepFolder:
-    """A folder of sweeps with their verdicts, numbered on over restarts: nothing is written over.
+    """A folder of sweeps with their verdicts. Numbers continue after a restart; no file is overwritten.
 
-    What a program that was killed had not finished is taken away. One program at a time has the folder; the lock goes
-    with it. numbers: of the sweeps that are there, in order. run: the number of this run's sweep 0; sidecars hold it,
-    since each run counts its sweeps and objects anew. Raises OSError where the folder cannot be made, read or had alone.
+    Unfinished files of a program that was killed are removed. One program at a time uses the folder; its lock ends with
+    the program. numbers: of the sweeps in the folder, in order. run: the number of this run's sweep 0; sidecars hold
+    it, since each run counts its sweeps and objects from 1. Raises OSError if the folder cannot be made, read or
+    locked.
     """
 
     def __init__(self, folder: Path, fmt: SweepFormat) -> None:
@@ -55,14 +56,14 @@ class SweepFolder:
             raise
 
     def put(self, sweep: Sweep, verdict: Verdict, about: Mapping[str, Any]) -> int:
-        """Write a sweep and what is to be told about it, whole or not at all; its number. Raises OSError."""
+        """Write a sweep with its verdict and `about`, completely or not at all; returns its number. Raises OSError."""
         number = self.run + sweep.id
         save(self.path(number), sweep, self._format, {**about, "run": self.run, "verdict": verdict.as_dict()})
         self.numbers.append(number)
         return number
 
     def remove(self, number: int) -> None:
-        """Take a sweep away, its .npy first: none is ever without its sidecar. Raises OSError."""
+        """Remove a sweep, its .npy first, so that none is ever without its sidecar. Raises OSError."""
         path = self.path(number)
         path.unlink(missing_ok=True)
         path.with_suffix(".json").unlink(missing_ok=True)
@@ -70,11 +71,11 @@ class SweepFolder:
         self.numbers.remove(number)
 
     def path(self, number: int) -> Path:
-        """Where the sweep of this number is."""
+        """Path of the sweep of this number."""
         return self.folder / f"sweep-{number:06d}.npy"
 
     def close(self) -> None:
-        """Give the folder back."""
+        """Release the folder."""
         os.close(self._lock)
 
     def _take(self) -> None:
@@ -82,25 +83,25 @@ class SweepFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as e:
             raise BlockingIOError(e.errno, "another program keeps sweeps there", str(self.folder)) from e
-        there = [name for path in self.folder.iterdir() if (name := _KEPT.fullmatch(path.name))]
-        for left in (name for name in there if name[2]):
-            (self.folder / left[0]).unlink()
-        self.numbers = sorted({int(name[1]) for name in there if not name[2]})
-        # a half sweep was never told as stored, but its number is not given twice
-        self.run = max((int(name[1]) for name in there), default=0)
+        names = [name for path in self.folder.iterdir() if (name := _KEPT.fullmatch(path.name))]
+        for unfinished in (name for name in names if name[2]):
+            (self.folder / unfinished[0]).unlink()
+        self.numbers = sorted({int(name[1]) for name in names if not name[2]})
+        # an unfinished sweep was never reported as stored, but its number is not used again
+        self.run = max((int(name[1]) for name in names), default=0)
 
 
 def _make(folder: Path) -> None:
-    """Have the folder, and those above it, on the disk."""
+    """Make the folder and those above it, and sync them to the disk."""
     folder.mkdir(parents=True, exist_ok=True)
-    for above in folder.resolve().parents:  # all: a run that was killed may have made them and not synced them
-        with suppress(PermissionError):  # not ours, so not made by us
+    for above in folder.resolve().parents:  # all: a run that was killed may have made folders without syncing them
+        with suppress(PermissionError):  # a folder that we may not open was not made by us
             storage.sync(above)
 
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """What is touched, where, and in which session; "" is not told. Raises ConfigError where a text cannot be sent."""
+    """Material, position on it, and session; "" is not known. Raises ConfigError for a text that cannot be sent."""
 
     material: str = ""
     position: str = ""
@@ -116,9 +117,9 @@ class Labels:
 
 
 class RecordingSession(Observer):
-    """Writes each sweep that has a window, with the labels that held at its start edge.
+    """Records each sweep that has a window, with the labels that applied at its start edge.
 
-    say: takes REC sentences. Raises ConfigError where the folder cannot be used.
+    say: takes REC sentences. Raises ConfigError if the folder cannot be used.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class RecordingSession(Observer):
         except OSError as e:
             raise ConfigError(f"--out {folder}: {e.strerror}; name a folder that can be written") from e
         self._clock, self._say = clock, say
-        # (since when, what): a command that comes while a sweep is open is not of that sweep
+        # (valid from, labels): a command that comes during a sweep does not apply to it
         self._labels = deque([(0, labels)], MOST_CHANGES)
         self._stored: list[int] = []
         self._log = TroubleLog("record")
@@ -140,45 +141,45 @@ class RecordingSession(Observer):
 
     @property
     def stored(self) -> int:
-        """How many sweeps of this run are on the disk."""
+        """Number of sweeps of this run on the disk."""
         return len(self._stored)
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Write the sweep if it has a window, and say what became of it."""
+        """Write the sweep if it has a window, and report the outcome in a REC sentence."""
         labels = next((labels for since_ns, labels in reversed(self._labels) if since_ns <= sweep.start_ns), Labels())
         sweep = replace(sweep, material=labels.material, position=labels.position, session=labels.session)
         outcome, detail = "skipped", f"{verdict.status}"
         if len(sweep.frames):
             outcome, detail = self._store(sweep, verdict, circumstances)
             trouble = "" if outcome == "stored" else outcome
-            self._log.update(trouble, _news(outcome, sweep.id, detail, self._folder.folder))
+            self._log.update(trouble, _report(outcome, sweep.id, detail, self._folder.folder))
         self._say(
             sentence("REC", sweep.id, outcome, self.stored, labels.material, labels.position, labels.session, detail)
         )
 
     def close(self) -> None:
-        """Give the folder back, and say what is in it."""
+        """Release the folder, and log how many sweeps were stored."""
         self._folder.close()
         log.info(f"record: sweeps of this run in {self._folder.folder}: {self.stored}")
 
     def _store(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> tuple[str, str]:
-        """What became of the sweep, and what a person should know about that."""
+        """The outcome ("stored", "full" or "failed") and details for a person."""
         try:
-            room = os.statvfs(self._folder.folder)
-            least = min(LEAST_FREE[0] // room.f_frsize, room.f_blocks // LEAST_FREE[1])
-            if room.f_bavail < least:
-                left, wanted = (n * room.f_frsize / 1e6 for n in (room.f_bavail, least))
+            disk = os.statvfs(self._folder.folder)
+            least = min(LEAST_FREE[0] // disk.f_frsize, disk.f_blocks // LEAST_FREE[1])
+            if disk.f_bavail < least:
+                left, wanted = (n * disk.f_frsize / 1e6 for n in (disk.f_bavail, least))
                 return "full", f"{left:.1f} MB left of {wanted:.1f} for the system"
             number = self._folder.put(sweep, verdict, circumstances)
         except OSError as e:
             return "full" if e.errno in FULL else "failed", str(e.strerror)
         self._stored.append(number)
-        # a material that the bundle does not know is what one records; what has no good window should be discarded
-        doubt = "" if verdict.status.classified or verdict.status is Status.UNKNOWN else f" {verdict.status}"
-        return "stored", self._folder.path(number).stem + doubt + " no material" * (not sweep.material)
+        # unknown materials are the purpose of a recording; a sweep with a faulty window should be discarded
+        fault = "" if verdict.status.classified or verdict.status is Status.UNKNOWN else f" {verdict.status}"
+        return "stored", self._folder.path(number).stem + fault + " no material" * (not sweep.material)
 
     def _change(self, name: str, text: str) -> list[object]:
-        """Sweeps that start from now on have this label; the labels that hold then."""
+        """Set a label for sweeps that start from now on; returns the labels that then apply."""
         labels = replace(self._labels[-1][1], **{name: text.strip()})
         self._labels.append((self._clock.now_ns(), labels))
         return [labels.material, labels.position, labels.session]
@@ -190,7 +191,7 @@ class RecordingSession(Observer):
         return self._change("position", str(int(position) + 1).zfill(len(position)))
 
     def _discard(self, _: str) -> list[object]:
-        """Take the last sweep of this run that is still there off the disk; its number, and how many are left."""
+        """Remove the last stored sweep of this run; returns its number, how many are left, and its file name."""
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
         number = self._stored[-1]
@@ -202,8 +203,8 @@ class RecordingSession(Observer):
         return [number - self._folder.run, self.stored, self._folder.path(number).stem]
 
 
-def _news(outcome: str, sweep: int, detail: str, folder: Path) -> str:
-    """A line of the log for what has changed."""
+def _report(outcome: str, sweep: int, detail: str, folder: Path) -> str:
+    """The line of the log for a changed outcome."""
     if outcome == "stored":
         return f"record: sweeps are stored again, from sweep {sweep} on"
     advice = f"make room in {folder}" if outcome == "full" else f"see that {folder} may be written"

@@ -1,8 +1,8 @@
-"""Ring of frames + trigger edges -> Sweep: one answer to each trigger, whatever becomes of it.
+"""Cuts the window of each sweep from the stream of frames. In: Frames of the sensor, edges of the trigger. Out: one
+Sweep per trigger, with a complete window or a status that says why there is none; the open sweep so far, for early
+answers.
 
-In: Frames from the sensor, edges from the trigger. Out: Sweeps, whole windows or a status that says why there is none,
-and the open sweep so far, for early answers. The window is the middle of the sweep (paper, sec. II.B), found by time
-and cut by sequence number.
+The window is the middle of the sweep (paper, sec. II.B): it is located by time and cut by sequence number.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from appliance.core.config import SweepConfig
 from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
 
 MAX_GAP = 2
-"""Missing frames in a row that are interpolated; more make the status `gap`."""
+"""Largest number of consecutive missing frames that are interpolated; with more the status is `gap`."""
 
 
 @dataclass(slots=True)
 class _Open:
-    """A sweep between its edges. answered: it has had its answer, only its stop edge is still awaited.
+    """A sweep between its edges. answered: it was answered already, and only its stop edge is still expected.
 
-    first: number of the first frame that counts for an early answer, once it is there. step: how often it was looked at.
+    first: number of the first frame for early answers, None until it has come. step: steps that `so_far` has returned.
     """
 
     id: int
@@ -37,20 +37,21 @@ class _Open:
 
 
 class SweepCutter:
-    """Holds the last `max_duration_s` (and a little more) of frames, and the sweeps that have not been answered yet."""
+    """Cuts windows: holds the frames of a little more than `max_duration_s`, and the sweeps that were not answered
+    yet."""
 
     def __init__(self, fmt: SweepFormat, config: SweepConfig) -> None:
         self._format = fmt
         self._max_duration_ns = round(config.max_duration_s * 1e9)
         self._late_ns, self._lead_ns = config.late_ms * 1_000_000, config.lead_ms * 1_000_000
         self._size = fmt.window + 2 * MAX_GAP + int((config.max_duration_s + config.late_ms / 1000 + 1) * fmt.rate_hz)
-        # slot = seq % size: a frame's place is known without searching, and what was not overwritten is not lost
+        # slot = seq % size: a frame is found without searching and stays available until it is overwritten
         self._seq = np.full(self._size, -1, np.int64)
         self._t_ns = np.zeros(self._size, np.int64)
         self._taxels = np.zeros((self._size, fmt.rows, fmt.cols), fmt.digits)
         self._newest = -1
         self._open: _Open | None = None
-        self._closing: list[tuple[_Open, int]] = []  # (sweep, stop) whose window may still lack frames
+        self._closing: list[tuple[_Open, int]] = []  # (sweep, stop ns) whose window may still lack frames
         self._done: list[Sweep] = []
         self._count = self._object = 0
 
@@ -60,7 +61,7 @@ class SweepCutter:
         return bool(self._closing) or (self._open is not None and not self._open.answered)
 
     def put(self, frames: Frames, now_ns: int) -> None:
-        """Take frames into the ring. Those of a new enumeration end the open sweep: its first half lies before it."""
+        """Put frames into the ring. Frames of a new enumeration end the open sweep, which began before it."""
         if not len(frames):
             return
         if self._newest >= 0 and frames.seq[-1] >> EPOCH_BITS != self._newest >> EPOCH_BITS:
@@ -74,7 +75,7 @@ class SweepCutter:
         self._newest = int(frames.seq[-1])
 
     def trigger(self, edges: Iterable[Edge], ready: bool, now_ns: int) -> None:
-        """Take trigger edges in their order; `ready` tells whether the box could take a sweep when they came."""
+        """Process trigger edges in their order. ready: whether the box could take a sweep when they came."""
         for edge in edges:
             if edge.kind is EdgeKind.START:
                 self._start(edge.t_ns, ready, now_ns)
@@ -86,11 +87,11 @@ class SweepCutter:
                 self._answer(self._begin(edge.t_ns), edge.t_ns, Status.EDGES_LOST, now_ns)
 
     def new_object(self) -> None:
-        """Sweeps that start from now on are of another object."""
+        """Sweeps that start from now on belong to another object."""
         self._object += 1
 
     def interrupt(self, status: Status, now_ns: int) -> bool:
-        """Answer every unanswered sweep with `status`; False where there was none. A stop edge to come stays silent."""
+        """Answer all unanswered sweeps with `status`; False if there was none. A later stop edge gives no answer."""
         had = self.sweeping
         if self._open and not self._open.answered:
             self._answer(self._open, now_ns, status, now_ns)
@@ -115,11 +116,11 @@ class SweepCutter:
         return sorted(done, key=lambda s: s.id)
 
     def so_far(self, steps: int, now_ns: int) -> Iterator[Sweep]:
-        """The open sweep at each of its steps that has come since the last call, until `settle` says it is answered.
+        """The open sweep at each step that was reached since the last call, until `settle` marks it as answered.
 
-        steps: D; step d = 1..D comes with frame ceil(d * window / (D + 1)) of the window that begins `lead_ms` after the
-        start edge, and gives a Sweep of just these frames. Which frames came together changes nothing. Beyond a gap that
-        cannot be filled there is no step.
+        steps: D; step d = 1..D is reached with frame ceil(d * window / (D + 1)) of the window that begins `lead_ms`
+        after the start edge, and gives a Sweep of exactly these frames, however they were grouped in transfers. After a
+        gap that cannot be filled no further steps are returned.
         """
         sweep = self._open
         while sweep and not sweep.answered and not self._closing and sweep.step < steps:
@@ -140,12 +141,12 @@ class SweepCutter:
                 )  # fmt: skip
 
     def settle(self) -> None:
-        """The open sweep has had an early answer: its stop edge will be silent."""
+        """Mark the open sweep as answered early; its stop edge then gives no answer."""
         if self._open:
             self._open.answered = True
 
     def latest(self, n: int) -> NDArray[Any] | None:
-        """The newest `n` frames [n, R, C], for a tare; None where they are not all there."""
+        """The newest `n` frames as raw counts [n, R, C], for a tare; None if some of them are missing."""
         window = np.arange(self._newest - n + 1, self._newest + 1)
         slots = window % self._size
         return self._taxels[slots] if self._newest >= 0 and (self._seq[slots] == window).all() else None
@@ -175,13 +176,13 @@ class SweepCutter:
                 self._closing.append((sweep, t_ns))
 
     def _answer(self, sweep: _Open, stop_ns: int, status: Status, now_ns: int) -> None:
-        """Put an answer without frames to the finished ones."""
+        """Finish a sweep with a status and without frames."""
         sweep.answered = True
         none = Frames.empty(self._format)
         self._done.append(Sweep(sweep.id, sweep.start_ns, stop_ns, status, none, 0, now_ns, sweep.object))
 
     def _cut(self, sweep: _Open, stop_ns: int, now_ns: int) -> Sweep | None:
-        """The sweep with its window, or None while its frames may still come."""
+        """The sweep with its window, or None while frames of it may still come."""
         window = self._format.window
         first = self._seq_at((sweep.start_ns + stop_ns) / 2) - window // 2
         late = now_ns > stop_ns + self._late_ns
@@ -192,7 +193,8 @@ class SweepCutter:
         return Sweep(sweep.id, sweep.start_ns, stop_ns, status, frames, lost, now_ns, sweep.object)
 
     def _window(self, first: int, n: int) -> tuple[Frames, int]:
-        """Frames `first` to `first + n` and how many of them are missing: filled, or no frames where a gap is too wide."""
+        """Frames `first` to `first + n`, missing ones interpolated, and their number; no frames if a gap is too
+        wide."""
         pad = MAX_GAP
         seq = np.arange(first - pad, first + n + pad)
         slots = seq % self._size
@@ -203,13 +205,16 @@ class SweepCutter:
         return Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut]), len(missing)
 
     def _seq_at(self, t_ns: float) -> int:
-        """Number of the frame taken nearest to `t_ns`, reckoned from the nearest frame that is there."""
+        """Number of the frame that was taken nearest to `t_ns`, computed from the nearest frame in the ring."""
         k = int(np.abs(self._t_ns - round(t_ns)).argmin())
         return int(self._seq[k]) + round((t_ns - int(self._t_ns[k])) / self._format.period_ns)
 
 
 def interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
-    """Fill `missing` rows of `frames` in place from their neighbours in `have`; False where a gap is too wide."""
+    """Interpolate the rows `missing` of `frames` in place from their neighbours in `have`; False if a gap is too wide.
+
+    have, missing: int64, sorted row indices.
+    """
     right = np.searchsorted(have, missing)
     if len(missing) and (right.min() == 0 or right.max() == len(have)):
         return False

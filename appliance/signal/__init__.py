@@ -1,1 +1,1 @@
-"""What is computed from the raw counts of a sweep: features of the paper, and where the contact lies."""
+"""Computed from the raw counts of a sweep: the paper's features, and the position of the contact."""

@@ -1,8 +1,10 @@
-"""The room of the skin's place: digits of a contact in, its centre and how far that is from where it was in training out.
+"""Position of the contact on the skin. In: raw counts of a contact. Out: its centre, and its distance from the trained
+one.
 
-Pure functions. `classifier` asks once a sweep whether the skin has moved, `place_live` many times a second for a person.
-The taxels see a contact only where they lie: of one that reaches over the skin's edge the centre comes out nearer to
-the skin's middle than it is. So far off a distance is told too small, never with the wrong sign: move, and look again.
+Pure functions. The classifier calls them once per sweep, to detect that the skin has moved; `alignment` many times per
+second, to show it to a person. Taxels measure a contact only where they are: if it extends beyond the skin's edge, its
+centre is computed too close to the skin's middle. The distance is then too small but never has the wrong sign, so that
+a person who follows it and measures again arrives.
 """
 
 from __future__ import annotations
@@ -16,9 +18,9 @@ from numpy.typing import NDArray
 from appliance.core.errors import BundleError
 
 MOST_POSITIONS, MOST_MM = 1000, 1e6
-"""A bundle may name so many positions, since each sweep is compared with all of them; and no length above a kilometre."""
+"""Largest number of positions in a bundle, since each sweep is compared with all of them; largest length, 1 km."""
 LEAST_PART = 0.25
-"""A direction whose share of the distance is smaller is not named: it changes the distance by under 3 %."""
+"""A direction with a smaller share of the distance is not named: it changes the distance by less than 3 %."""
 IN_PLACE = "in place"
 
 Point = tuple[float, float]
@@ -26,11 +28,11 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class ContactPositions:
-    """Where the contact's centre lay in training. Raises BundleError where a number makes no sense.
+    """Positions of the contact's centre in training. Raises BundleError for a number out of range.
 
-    pitch_mm: from taxel to taxel. rows_mm, cols_mm: one entry for each position, mm from the centre of taxel 1.1 (row
-    1, column 1) towards higher rows and columns. limit_mm: a sweep whose centre is farther than this from the nearest
-    of them is `moved`.
+    pitch_mm: distance between taxels. rows_mm, cols_mm: one entry per position, mm from the centre of taxel 1.1 (row 1,
+    column 1) towards higher rows and columns. limit_mm: a sweep whose centre is farther than this from the nearest
+    position counts as moved.
     """
 
     pitch_mm: float
@@ -49,19 +51,20 @@ class ContactPositions:
                 raise BundleError(f"place.{name} must be 1 to {MOST_POSITIONS} places in mm; export the bundle again")
         if len(self.rows_mm) != len(self.cols_mm):
             raise BundleError(
-                f"place has {len(self.rows_mm)} rows_mm and {len(self.cols_mm)} cols_mm, where each position has one of "
-                "both; export the bundle again"
+                f"place has {len(self.rows_mm)} rows_mm and {len(self.cols_mm)} cols_mm, where each position has one "
+                "of both; export the bundle again"
             )
 
     def offset(self, centre: Point) -> Point:
-        """From the nearest trained position to `centre` (taxels, as the function gives it): mm along rows and columns."""
+        """Vector from the nearest trained position to `centre` (in taxels, as from `centre()`): mm along rows,
+        columns."""
         rows = centre[0] * self.pitch_mm - np.array(self.rows_mm)
         cols = centre[1] * self.pitch_mm - np.array(self.cols_mm)
         nearest = np.hypot(rows, cols).argmin()
         return float(rows[nearest]), float(cols[nearest])
 
     def within(self, offset: Point) -> bool:
-        """Whether a contact this far (mm) from a trained position counts as in place."""
+        """Whether a contact at this offset (mm) from a trained position counts as in place."""
         return bool(np.hypot(*offset) <= self.limit_mm)
 
 
@@ -70,18 +73,18 @@ def _length(value: Any) -> bool:
 
 
 def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> Point | None:
-    """The contact's centre: row and column, counted in taxels from 0.0 at the centre of taxel 1.1; None without contact.
+    """The contact's centre (row, column) in taxels, 0.0 at the centre of taxel 1.1; None without contact.
 
-    taxels: digits [T, R, C] of a window or of the latest frames. tare: the unloaded skin [R, C]. contact: digits above
-    it from which a taxel is loaded (the bundle's threshold).
-    It is the mean place of the loaded taxels, weighted by their load over time: the centre of pressure of the part
-    that the skin sees. A fit of the contact's form would not be drawn to the skin's middle, but the gains of taxels
-    differ from one attachment to the next, and that throws a fit off by more.
-    A taxel at full scale counts as that.
+    taxels: raw counts [T, R, C] of a window or of the latest frames. tare: mean counts [R, C] of the unloaded skin.
+    contact: counts above the tare from which a taxel is loaded (the bundle's threshold).
+    The centre is the mean position of the loaded taxels, weighted by their mean load: the centre of pressure of the
+    part that the skin covers. A fit of the contact's shape would have no bias towards the skin's middle, but the gains
+    of taxels differ between attachments, and that causes larger errors in a fit. A saturated taxel counts at full
+    scale.
     """
-    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # twice as fast to reduce
+    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # contiguous: twice as fast to reduce
     load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
-    load = mended(np.where(np.isfinite(load) & (load >= contact), load, 0))
+    load = fill_dead_taxels(np.where(np.isfinite(load) & (load >= contact), load, 0))
     total = load.sum()
     if total <= 0:
         return None
@@ -89,9 +92,9 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
     return float(rows @ np.arange(len(rows)) / total), float(cols @ np.arange(len(cols)) / total)
 
 
-def mended(load: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`load` [R, C] (0 and less: not loaded) with dead taxels filled in: one that is silent between two loaded ones of its row
-    or column gets their mean. A contact has no hole, and one would push its centre away."""
+def fill_dead_taxels(load: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`load` [R, C] in counts (0 and less: not loaded) with dead taxels filled in: a silent one between two loaded ones
+    of its row or column gets their mean. A contact has no hole, and a hole would shift its centre."""
     padded = np.zeros((load.shape[0] + 2, load.shape[1] + 2))
     padded[1:-1, 1:-1] = load
     sides = np.stack([
@@ -104,8 +107,8 @@ def mended(load: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def advice(offset: Point, shape: tuple[int, int]) -> str:
-    """What is wrong with a contact this far (mm, rows and columns) from a trained position on a skin of `shape` taxels:
-    "2.1 mm too far towards row 4". The larger direction comes first, a slight one is left out."""
+    """Describes the offset (mm along rows, columns) from a trained position on a skin of `shape` taxels, for example
+    "2.1 mm too far towards row 4". The larger direction comes first; one below LEAST_PART is left out."""
     least = LEAST_PART * np.hypot(*offset)
     parts = [
         (abs(mm), f"{name} {n if mm > 0 else 1}")
@@ -116,10 +119,10 @@ def advice(offset: Point, shape: tuple[int, int]) -> str:
     return f"{most:.1f} mm too far towards {where}" + "".join(f" and {mm:.1f} mm towards {to}" for mm, to in others)
 
 
-def moved(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, place: ContactPositions) -> str:
-    """ "" where the contact of a sweep [T, R, C] lies where some lay in training, else "moved 2.1 mm too far towards
-    row 4". tare, contact: as for `centre`."""
+def moved(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, positions: ContactPositions) -> str:
+    """ "" if the contact of a sweep [T, R, C] is at a trained position, otherwise for example "moved 2.1 mm too far
+    towards row 4". tare, contact: as for `centre`."""
     found = centre(taxels, tare, contact)
-    if found is None or place.within(offset := place.offset(found)):
+    if found is None or positions.within(offset := positions.offset(found)):
         return ""
     return f"moved {advice(offset, tare.shape)}"

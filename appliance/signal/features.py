@@ -1,9 +1,9 @@
-"""The paper's equations 1 to 5: what its classical classifiers look at. In: digits of one sweep's window, frame rate.
-Out: taxel weights [M], L-features [3] and H-features [frames x bands]. Pure functions; numpy only; nothing is kept.
+"""Features of the paper's classical classifiers, its equations 1 to 5. In: raw counts of one window, frame rate. Out:
+taxel weights [M], L-features [3] and H-features [short windows x bands]. Pure functions of numpy arrays.
 
-Any grid, rate and digit type will do. Where the paper's formulas leave a choice, the reading stands at the function.
-Two rules hold for every rate. A band ends at the Nyquist frequency where that is lower than its upper edge. A band in
-which no bin of the spectrum lies keeps the first bin above its lower edge, or the highest there is.
+Any grid, rate and data type is possible. Where the paper's formulas leave a choice, the docstring says what was chosen.
+Two rules hold for every rate. A band ends at the Nyquist frequency if that is below its upper edge. A band without any
+bin of the spectrum gets the first bin above its lower edge, or the highest bin.
 """
 
 from __future__ import annotations
@@ -23,32 +23,33 @@ from appliance.signal.time_series import FLOOR
 Array = NDArray[np.float64]
 
 HIGH_HZ = (20.0, 375.0)
-"""Band of roughness and c1 (eq. 2, 3); at 750 Hz and 1500 frames bins 40 to 750."""
+"""Band of roughness and c1 (eq. 2, 3); bins 40 to 750 at 750 Hz and 1500 frames."""
 LOW_HZ = (2.0, 20.0)
 """Band of c2 (eq. 3); bins 4 to 40."""
 HOP_S, WINDOW_S = 0.05, 0.1
 """Step and length of the short windows (eq. 5)."""
 SILENT = 1e-12
-"""A short window of less power than this, in digits^2, is not normalised but left near zero."""
+"""A short window with less power than this (counts^2) is not normalised but left near zero."""
 
 
 def taxel_weights(taxels: NDArray[Any]) -> Array:
-    """Eq. 4: each taxel's share of the activation. taxels: digits [T, R, C]; gives [M] with M = R * C, summing to 1.
+    """Eq. 4: each taxel's share of the activation, [M] with M = R * C and sum 1. taxels: raw counts [T, R, C].
 
-    A taxel whose mean is negative (int16 after a tare) is untouched: its weight is 0, so that no weight is negative and
-    none grows without bound where means cancel. Where no mean is positive all weights are 1 / M. Raises FormatError for
-    an array that is no sweep.
+    A taxel with a negative mean (int16 after a tare) counts as not touched and gets weight 0, so that no weight is
+    negative or grows without bound where means cancel. If no mean is positive all weights are 1 / M.
+    Raises FormatError for an array that is no sweep.
     """
     return time_series.weights(time_series.of(taxels))
 
 
 def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
-    """Eq. 1 to 3: [roughness in log(digits^2), c1 in Hz, c2 in Hz]. taxels: digits [T, R, C]; rate_hz: frames a second.
+    """Eq. 1 to 3: [roughness in log(counts^2), c1 in Hz, c2 in Hz]. taxels: raw counts [T, R, C]; rate_hz: frames per
+    second.
 
-    A linear trend is removed from each taxel, so that drift does not leak into the low bands. A centroid is each
-    taxel's power-weighted mean frequency in its band, then weighted by eq. 4. The mean power divides by B - A, as
-    printed. Every bin's power is at least FLOOR: a silent skin gives about log(M * FLOOR) and the middle of each band.
-    One frame is enough for an answer. Raises FormatError for an array that is no sweep or a rate that is none.
+    A linear trend is removed from each taxel, so that drift does not leak into the low bands. A centroid is the
+    power-weighted mean frequency of each taxel in the band, averaged with the weights of eq. 4. The mean power divides
+    by B - A, as printed. Every bin's power is at least FLOOR, so that a silent skin gives about log(M * FLOOR) and the
+    middle of each band. One frame is enough. Raises FormatError for an array that is no sweep or an invalid rate.
     """
     x = time_series.of(taxels)
     time_series.check_rate(rate_hz)
@@ -62,25 +63,27 @@ def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
 
 
 def h_shape(frames: int, rate_hz: float) -> tuple[int, int]:
-    """How many H-features a window of `frames` at `rate_hz` gives: (short windows, bands); 1500 at 750 Hz: (40, 19).
+    """Shape (short windows, bands) of the H-features of `frames` frames at `rate_hz`; (40, 19) for 1500 at 750 Hz.
 
-    Short windows: floor(frames / (0.05 s * rate)), one for each whole step; the sweep's end cuts the last one off.
-    A short window is W = round(0.1 s * rate) frames, its bins rate / W (10 Hz) apart and used up to 375 Hz or Nyquist:
-    K = min(floor(W / 2), floor(375 Hz * W / rate)). Two neighbours make a band of 20 Hz, (0, 1), (2, 3) ...; bin 0 (DC)
-    counts as zero and the last band may hold one bin only: floor(K / 2) + 1 bands.
-    Raises FormatError where the sweep is shorter than one short window, or a step than a frame (below 20 Hz).
+    Short windows: floor(frames / (0.05 s * rate)), one for each whole step; the last one is cut off at the sweep's end.
+    A short window has W = round(0.1 s * rate) frames. Its bins are rate / W (10 Hz) apart and used up to 375 Hz or
+    Nyquist: K = min(floor(W / 2), floor(375 Hz * W / rate)). Two neighbouring bins make a band of 20 Hz, (0, 1), (2, 3)
+    and so on; bin 0 (DC) counts as zero and the last band may have one bin only: floor(K / 2) + 1 bands.
+    Raises FormatError if the sweep is shorter than one short window, or a step shorter than a frame (below 20 Hz).
     """
     _, top = _short_window(frames, rate_hz)
     return math.floor(_clean(frames / (HOP_S * rate_hz))), top // 2 + 1
 
 
 def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Array:
-    """Eq. 5: power over time and frequency, [l * q] with l the short window, as `h_shape` counts them. 0 to 1, no unit.
+    """Eq. 5: power over time and frequency, float64 [l * q] for l short windows and q bands (`h_shape`), 0 to 1, no
+    unit.
 
-    taxels: digits [T, R, C]; rate_hz: frames a second; window: "rect" is the paper's, "hann" leaks less.
-    Short window l starts with the first frame at or after l * 0.05 s. Its mean, of the frames there are, is taken off
-    before the window function. Taxels are added by eq. 4 and each l is divided by its sum over q: it sums to 1, or is 0
-    in a silence. Raises FormatError as `h_shape`, for an array that is no sweep, and for another window function.
+    taxels: raw counts [T, R, C]; rate_hz: frames per second; window: "rect" is the paper's, "hann" leaks less.
+    Short window l starts with the first frame at or after l * 0.05 s. The mean of its frames is subtracted before the
+    window function is applied. Taxels are added with the weights of eq. 4, and each short window is divided by its sum
+    over q: it sums to 1, or is 0 if silent. Raises FormatError as `h_shape`, for an array that is no sweep, and for an
+    unknown window function.
     """
     x = time_series.of(taxels)
     frames = x.shape[1]
@@ -98,35 +101,35 @@ def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Ar
 
 Kinds = Mapping[str, Callable[[NDArray[Any], float], Array]]
 KINDS: Kinds = MappingProxyType({"L": l_features, "H": h_features})
-"""Feature sets by the name that a bundle's manifest uses."""
+"""Feature sets by their names in a bundle's manifest."""
 
 
 def compute(kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS) -> NDArray[np.float32]:
-    """The feature set `kind` of `kinds` of raw counts [T, R, C] at `rate_hz`, as float32 [n]. Raises FormatError."""
+    """Feature set `kind` (of `kinds`) of raw counts [T, R, C] at `rate_hz`: float32 [n]. Raises FormatError."""
     if kind not in kinds:
         raise FormatError(f"feature set {kind!r} is unknown; use one of {', '.join(kinds)}")
     return kinds[kind](taxels, rate_hz).astype(np.float32)
 
 
 def given(kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS) -> NDArray[Any]:
-    """What a graph with the input `kind` is given of raw counts [T, R, C]: them where it is "raw", else `compute`."""
+    """Input of a graph of input `kind` for raw counts [T, R, C]: the counts if "raw", otherwise `compute`."""
     return taxels if kind == "raw" else compute(kind, taxels, rate_hz, kinds)
 
 
 def _clean(bins: float) -> float:
-    """`bins` as the whole number that it is but for rounding: 0.1 s at 30 Hz is 3 frames, not 3.0000000000000004."""
+    """`bins` without rounding errors next to a whole number: 0.1 s at 30 Hz is 3 frames, not 3.0000000000000004."""
     return float(round(bins)) if math.isclose(bins, round(bins), rel_tol=1e-9) else bins
 
 
 def _bins(band: tuple[float, float], frames: int, rate_hz: float) -> tuple[int, int]:
-    """First and last bin inside `band`, by the two rules of this room."""
+    """First and last bin inside `band`, by the two rules at the top of this module."""
     low, high = (_clean(min(edge * frames / rate_hz, frames / 2)) for edge in band)
     first = min(math.ceil(low), frames // 2)
     return first, max(first, math.floor(high))
 
 
 def _centroid(power: Array, weights: Array, band: tuple[float, float], frames: int, rate_hz: float) -> float:
-    """Eq. 3 as it is read: power [M, bins], weights [M] -> Hz."""
+    """Eq. 3, as described in `l_features`: power [M, bins], weights [M] -> Hz."""
     first, last = _bins(band, frames, rate_hz)
     inside = power[:, first : last + 1]
     hz = np.arange(first, last + 1) * (rate_hz / frames)
@@ -134,7 +137,7 @@ def _centroid(power: Array, weights: Array, band: tuple[float, float], frames: i
 
 
 def _short_window(frames: int, rate_hz: float) -> tuple[int, int]:
-    """(W, K): frames in a short window and its highest bin used."""
+    """(W, K): frames in a short window, and the highest of its bins that is used."""
     time_series.check_rate(rate_hz)
     width = round(WINDOW_S * rate_hz)
     if HOP_S * rate_hz < 1:
@@ -145,10 +148,9 @@ def _short_window(frames: int, rate_hz: float) -> tuple[int, int]:
 
 
 def _cuts(x: Array, count: int, width: int, hop: float) -> Array:
-    """`x` [M, T] as short windows [M, count, width], each less its own mean; what lies beyond the end is zero."""
-    starts = np.ceil(np.round(np.arange(count) * hop, 6)).astype(
-        np.int64
-    )  # rounded as in _clean: no 3.0000000000000004
+    """`x` [M, T] as short windows [M, count, width], each minus its own mean; zero beyond the end of `x`."""
+    # rounded, since 3.0000000000000004 would be taken for 4
+    starts = np.ceil(np.round(np.arange(count) * hop, 6)).astype(np.int64)
     at = starts[:, None] + np.arange(width)
     there = at < x.shape[1]
     cut = np.where(there, x[:, np.minimum(at, x.shape[1] - 1)], 0.0)

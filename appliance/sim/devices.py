@@ -1,4 +1,8 @@
-"""Puts the rig together: a world under the real drivers. In: what the robot does. Out: a SimDevices."""
+"""Simulated devices for the real drivers. In: what the robot does (Acts). Out: SimDevices.
+
+Simulated are the robot, its lines (a double of gpiod) and the readout board (a pyusb backend). The drivers are the real
+ones.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +22,14 @@ BITS = tuple(f"CLASS-{i}" for i in range(8))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimDevices(Devices):
-    """The rig: its own lines and its own skin, and a robot that knows what it did."""
+    """Simulated lines and skin, with the robot that acts on them. robot.played: what it did, for scoring."""
 
     gpio: gpio.SimGpio
     backend: usb.RigBackend
     robot: rig.Robot
 
     def wire(self, settings: Config) -> Config:
-        """The configuration with the rig's lines and skin."""
+        """The settings with the simulated lines and skin."""
         ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": ""}
         sensor = replace(settings.sensor, **ids, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
         trigger = replace(
@@ -38,7 +42,7 @@ class SimDevices(Devices):
         return replace(settings, sensor=sensor, trigger=trigger, output=output)
 
     def finished(self, answered: int) -> bool:
-        """True when the script has ended and everything in it was answered."""
+        """True when the script has ended and each of its sweeps was answered."""
         return self.robot.finished and answered >= self.robot.acts
 
 
@@ -46,9 +50,10 @@ def build(
     fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False, stops: bool = True,
     remember: bool = True,
 ) -> SimDevices:  # fmt: skip
-    """A world that plays `acts`: the same drivers above, nothing real below. stops: the robot heeds DECIDED.
+    """Devices on which a robot plays `acts`. source: the name of the source in sentences. acm: the board is a CDC-ACM
+    device. stops: the robot ends its slide after DECIDED.
 
-    remember: keep all acts and all that was driven, for who looks at them later; without it memory stays as it is.
+    remember: keep all acts and all output levels, to examine them later; without it memory does not grow.
     """
     outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
     lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember)

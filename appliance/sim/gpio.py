@@ -1,7 +1,7 @@
-"""GPIO without GPIO: a double of the module gpiod (libgpiod v2) on the rig's timeline, under the real trigger room.
+"""Simulated GPIO: a double of the module gpiod (libgpiod v2) below the real trigger and output drivers.
 
-In: levels of named inputs, each at its moment. Out: edge events as the kernel queues and drops them, and a list of what
-was written to outputs. Enums, settings, events and errors are gpiod's own.
+In: levels of named inputs, each with its time. Out: edge events as the kernel queues and drops them, and a list of what
+was written to outputs. Simulated are chips, lines and requests; enums, settings, events and errors are gpiod's.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from gpiod.line import Bias, Direction, Edge, Value
 
 from appliance.core.clock import Clock
 
-Kind = gpiod.EdgeEvent.Type
-Config = Mapping[Iterable[int], gpiod.LineSettings]  # offsets of a chip -> how to request them
+EventType = gpiod.EdgeEvent.Type
+RequestConfig = Mapping[Iterable[int], gpiod.LineSettings]  # offsets on a chip -> their settings
 
 
 class SimGpio:
-    """Stands where `import gpiod` would. chips: path (/dev/gpiochip0 and so on) -> its line names, '' for none.
+    """Replaces the module gpiod. chips: path (/dev/gpiochip0 and so on) -> its line names, '' for an unnamed line.
 
-    written: (t_ns, name, level) of everything that was driven, in order; nothing where not told to remember.
-    requests: the lines that are held now.
-    watchers: output line -> what is called with the time when the box raises it.
-    refuse: path -> errno with which a chip refuses from now on: 13 permission denied, 19 pulled out.
+    written: (t_ns, name, level) of each level that was written to an output, in order; empty without `remember`.
+    requests: the present line requests.
+    watchers: output line -> function that is called with the time when the box raises the line.
+    refuse: path -> errno that a chip raises from now on: 13 permission denied, 19 unplugged.
     """
 
     __version__ = "sim"
@@ -47,33 +47,35 @@ class SimGpio:
         self._plan, self._order = list[tuple[int, int, str, bool]](), count()
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
-        """Set the input line `name` to `level` at `t_ns`; seen from then on, by whoever looks, with that time stamp."""
+        """Schedule `level` of the input line `name` for `t_ns`, which is also the time stamp of the edge."""
         if not any(name in names for names in self._chips.values()):
             raise ValueError(f"no simulated gpio line is named {name!r}; add it to chips")
         heapq.heappush(self._plan, (t_ns, next(self._order), name, bool(level)))
 
     def forget(self, name: str, t_ns: int) -> None:
-        """Take back what `name` was to be set to at `t_ns` and later."""
+        """Cancel the levels scheduled for `name` at `t_ns` and later."""
         self._plan = [item for item in self._plan if item[2] != name or item[0] < t_ns]
         heapq.heapify(self._plan)
 
     def is_gpiochip_device(self, path: str) -> bool:
-        """As gpiod's."""
+        """As in gpiod."""
         return path in self._chips
 
     def Chip(self, path: str) -> nullcontext[SimpleNamespace]:
-        """As gpiod's, with what it takes to look for lines by name."""
+        """As in gpiod, with the methods that are needed to find lines by name."""
         self.check(path)
         names = self._chips[path]
         info = gpiod.ChipInfo(os.path.basename(path), "palpate-sim", len(names))
         lines = [SimpleNamespace(name=name) for name in names]
         return nullcontext(SimpleNamespace(get_info=lambda: info, get_line_info=lines.__getitem__))
 
-    def request_lines(self, path: str, config: Config, consumer: str = "", event_buffer_size: int = 0) -> SimRequest:
-        """As gpiod's; lines are given by their offsets."""
+    def request_lines(
+        self, path: str, config: RequestConfig, consumer: str = "", event_buffer_size: int = 0
+    ) -> SimRequest:
+        """As in gpiod; lines are given by their offsets."""
         self.now_ns()
         self.check(path)
-        settings = {offset: of_all for offsets, of_all in config.items() for offset in offsets}
+        settings = {offset: line_settings for offsets, line_settings in config.items() for offset in offsets}
         names = {offset: self._chips[path][offset] for offset in settings}
         if any(request.path == path and request.names.keys() & names.keys() for request in self.requests):
             raise OSError(16, os.strerror(16))
@@ -82,7 +84,7 @@ class SimGpio:
         return self.requests[-1]
 
     def now_ns(self) -> int:
-        """The time, when everything that was to happen until now has happened."""
+        """The present time, after all levels scheduled up to it were set."""
         now_ns = self._clock.now_ns()
         while self._plan and self._plan[0][0] <= now_ns:
             t_ns, _, name, level = heapq.heappop(self._plan)
@@ -92,52 +94,52 @@ class SimGpio:
         return now_ns
 
     def check(self, path: str) -> None:
-        """Raise OSError where the chip refuses."""
+        """Raise OSError if the chip is to refuse."""
         if path in self.refuse:
             raise OSError(self.refuse[path], os.strerror(self.refuse[path]), path)
 
 
 class SimRequest:
-    """As gpiod's LineRequest. queue: the kernel's, which drops its oldest event when it is full."""
+    """As gpiod's LineRequest. queue: the kernel's event queue, which drops its oldest event when full."""
 
     def __init__(
         self, gpio: SimGpio, path: str, names: dict[int, str], settings: dict[int, gpiod.LineSettings],
         levels: dict[int, bool], size: int,
     ) -> None:  # fmt: skip
         self.path, self.names, self.settings = path, names, settings
-        size = min(size or 16 * len(names), 1024)  # so much the kernel grants, and rounds it up to a power of two
+        size = min(size or 16 * len(names), 1024)  # the kernel's limit; it rounds up to a power of two
         self.queue: deque[gpiod.EdgeEvent] = deque(maxlen=1 << (size - 1).bit_length())
         self._gpio, self._levels = gpio, levels
         self._seqno, self._line_seqno = count(1), {offset: count(1) for offset in names}
 
     def notice(self, name: str, level: bool, t_ns: int) -> None:
-        """An input has been driven: an event, if that is an edge which was asked for."""
+        """An input has got a level: queue an event if that is an edge of the requested kind."""
         for offset in (o for o, n in self.names.items() if n == name and self._levels[o] != level):
             self._levels[offset] = level
             rise = level != self.settings[offset].active_low
             if self.settings[offset].edge_detection in (Edge.BOTH, Edge.RISING if rise else Edge.FALLING):
-                kind = Kind.RISING_EDGE if rise else Kind.FALLING_EDGE
+                event_type = EventType.RISING_EDGE if rise else EventType.FALLING_EDGE
                 numbers = next(self._seqno), next(self._line_seqno[offset])
-                self.queue.append(gpiod.EdgeEvent(kind.value, t_ns, offset, *numbers))
+                self.queue.append(gpiod.EdgeEvent(event_type.value, t_ns, offset, *numbers))
 
     def wait_edge_events(self, timeout: float) -> bool:
-        """As gpiod's with timeout 0: whether there is an event to read."""
+        """As in gpiod with timeout 0: whether there is an event to read."""
         self._now_ns()
         return bool(self.queue)
 
     def read_edge_events(self, max_events: int) -> list[gpiod.EdgeEvent]:
-        """As gpiod's, but says so where that would wait for ever."""
+        """As in gpiod, but raises RuntimeError instead of waiting for ever."""
         if not self.wait_edge_events(0):
             raise RuntimeError("reading from an empty queue blocks; ask wait_edge_events(0) before")
         return [self.queue.popleft() for _ in range(min(max_events, len(self.queue)))]
 
     def get_values(self, lines: Iterable[int]) -> list[Value]:
-        """As gpiod's."""
+        """As in gpiod."""
         self._now_ns()
         return [Value.ACTIVE if self._levels[o] != self.settings[o].active_low else Value.INACTIVE for o in lines]
 
     def set_values(self, values: Mapping[int, Value]) -> None:
-        """As gpiod's."""
+        """As in gpiod."""
         now_ns = self._now_ns()
         for offset, value in values.items():
             self._levels[offset] = (value is Value.ACTIVE) != self.settings[offset].active_low
@@ -146,7 +148,7 @@ class SimRequest:
                 self._gpio.watchers[self.names[offset]](now_ns)
 
     def release(self) -> None:
-        """As gpiod's; an output becomes an input, and its pull-down takes it low."""
+        """As in gpiod; an output becomes an input, and its pull-down sets it low."""
         self._gpio.requests.remove(self)
         for offset, name in self.names.items():
             if self.settings[offset].direction is Direction.OUTPUT and self._levels[offset]:

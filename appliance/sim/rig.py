@@ -1,7 +1,7 @@
-"""The rig: one timeline for a robot's script, the trigger edges and a readout board. Under it, clocks that can skip.
+"""The simulated robot and readout board on one timeline, and clocks that can skip time. In: Acts (the frames of one
+sweep and the positions of its edges). Out: packets as in PROTOCOL.md and edges, each at its time.
 
-In: Acts (frames of one sweep and where its edges lie). Out: packets of PROTOCOL.md and edges, each at its moment.
-`usb` puts the board under pyusb, `gpio` the edges under gpiod.
+`usb` presents the board to pyusb, `gpio` the edges to the drivers.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from appliance.io import packets
 PULSE_NS = 20_000_000
 """Length of the robot's pulses."""
 REACTION_NS = 20_000_000
-"""The finger slides on for so long after DECIDED has risen."""
+"""Time that the finger continues to slide after DECIDED has risen."""
 
 
 class VirtualClock:
-    """Time that passes only when somebody sleeps: minutes of world in a fraction of a second, always the same."""
+    """Time that passes only in `sleep_until`: minutes are simulated in a fraction of a second, reproducibly."""
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
 
     def now_ns(self) -> int:
-        """The world's time in nanoseconds."""
+        """The simulated time in nanoseconds."""
         return self._now_ns
 
     def sleep_until(self, t_ns: int) -> None:
@@ -42,7 +42,7 @@ class VirtualClock:
 
 
 class SkippingClock:
-    """Real time without the waiting: work takes the time it takes, sleep takes none. For measuring the box itself."""
+    """Real time without waiting: computing takes real time, sleeping none. For measuring the box's computing time."""
 
     def __init__(self) -> None:
         self._skipped_ns = 0
@@ -58,7 +58,8 @@ class SkippingClock:
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """One sweep of the robot: frames [n, R, C] of digits, and the frames at which its start and stop edges come."""
+    """One sweep of the robot. frames: raw counts [n, R, C]. start, stop: frames at which its edges come. label: the
+    material. new_object: NEW OBJECT comes with the first frame."""
 
     frames: NDArray[Any]
     start: int
@@ -68,22 +69,22 @@ class Act:
 
 
 class EdgeLines(Protocol):
-    """Where the robot's edges go."""
+    """Takes the robot's edges: SimGpio, or a test's list."""
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
         """Set the input line `name` to `level` at `t_ns`."""
         ...
 
     def forget(self, name: str, t_ns: int) -> None:
-        """Take back what `name` was to be set to at `t_ns` and later."""
+        """Cancel the levels scheduled for `name` at `t_ns` and later."""
         ...
 
 
 class Robot:
-    """Plays a script of acts: drives start, stop and NEW OBJECT at the right frames.
+    """The simulated robot: plays a script of acts and drives start, stop and NEW OBJECT at their frames.
 
-    acts: how many it has begun. played: what it did; the newest act alone where not told to remember.
-    skipped: numbers of the frames [from, to) that it did not slide, as it stopped early; the board leaves them out.
+    acts: number that it has begun. played: the acts as they were played; without `remember` only the newest.
+    skipped: frame numbers [from, to) that were omitted because it stopped early; the board leaves them out.
     """
 
     def __init__(
@@ -95,13 +96,13 @@ class Robot:
         self.finished = False
         self.skipped: tuple[int, int] | None = None
         self._script, self._lines = script, lines
-        self._playing: tuple[Act, int, Callable[[int], int]] | None = None  # as `next_act` got it, until it is stopped
+        self._playing: tuple[Act, int, Callable[[int], int]] | None = None
         self._start, self._stop, self._new_object = start, stop, new_object
 
     def next_act(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
-        """The next act, its edges scheduled; it begins with frame `first`, and `frame_ns` tells when a frame is taken.
+        """Begin the next act with frame `first`, schedule its edges and return it; None when the script has ended.
 
-        None when the script has ended.
+        frame_ns: gives the host time at which a frame is taken.
         """
         act = next(self._script, None)
         if act is None:
@@ -121,7 +122,7 @@ class Robot:
         return act
 
     def react(self, t_ns: int) -> None:
-        """DECIDED has risen at `t_ns`: end the slide REACTION_NS later, where it does not end before."""
+        """DECIDED has risen at `t_ns`: end the slide REACTION_NS later, unless it ends before."""
         if not self._playing:
             return
         act, first, frame_ns = self._playing
@@ -145,9 +146,10 @@ class Robot:
 
 
 class Board:
-    """A readout board that speaks PROTOCOL.md: samples the script at its own rate, has a FIFO, sends packets.
+    """The simulated readout board (PROTOCOL.md): samples the script at its own rate, has a FIFO, sends packets.
 
-    ppm: error of its crystal. latency: draws the nanoseconds from a packet's last frame to its arrival.
+    packet_frames, fifo_frames: frames per packet and in the FIFO. ppm: error of its crystal. latency: draws the time in
+    ns from a packet's last frame to its arrival. first_seq: number of its first frame.
     """
 
     def __init__(
@@ -163,8 +165,8 @@ class Board:
         self._period_ns = fmt.period_ns / self._rate
         self._origin_ns = clock.now_ns()
         self._first_seq = first_seq
-        self._next = 0  # frame that is sent next
-        self._arrival_ns: int | None = None  # of the packet that begins there, once drawn
+        self._next = 0  # number of the next frame to send
+        self._arrival_ns: int | None = None  # of the packet that begins with this frame, once drawn
         self._frames = np.zeros((0, fmt.rows, fmt.cols), fmt.digits)
         self._base = 0  # number of the first frame in _frames
 
@@ -173,7 +175,7 @@ class Board:
         return self._origin_ns + round((i + 1) * self._period_ns)
 
     def request(self, request: int) -> bytes | None:
-        """Answer a control request; None where it is unknown."""
+        """The reply to a control request; None if it is unknown."""
         now = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
         match request:
             case packets.Request.IDENTITY:
@@ -190,7 +192,7 @@ class Board:
         return None
 
     def due_ns(self) -> int | None:
-        """When the next packet will be on the bus; None while nothing is being sent."""
+        """Time at which the next packet will be on the bus; None while the board does not send."""
         if not self.running:
             return None
         if self._arrival_ns is None:
@@ -198,7 +200,7 @@ class Board:
         return self._arrival_ns
 
     def take(self) -> bytes:
-        """The packet that is due; the oldest frames are gone where the FIFO has overflowed."""
+        """The packet that is due; if the FIFO has overflowed, without the oldest frames."""
         n, fifo = self.skin.packet_frames, self.skin.fifo_frames
         taken = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
         late = max(0, taken - fifo - self._next)
@@ -209,7 +211,7 @@ class Board:
         return packets.pack(self._first_seq + first, device_us, self._block(first, n), flags)
 
     def _block(self, first: int, n: int) -> NDArray[Any]:
-        """Frames `first` to `first + n` of the script; after its end nothing touches the skin."""
+        """Frames `first` to `first + n` of the script [n, R, C]; after its end all counts are 0."""
         if self._robot.skipped:
             begin, end = (i - self._base for i in self._robot.skipped)
             self._frames, self._robot.skipped = np.delete(self._frames, slice(begin, end), axis=0), None

@@ -1,6 +1,5 @@
-"""Scripts for the robot of the rig: sweeps over simulated tubes, a finger at rest, or a recorded set. Out: Acts.
-
-A set is played so that the middle of each sweep is exactly the recorded window.
+"""Scripts for the simulated robot. In: the name after `--sim`. Out: Acts: sweeps over simulated tubes, a finger at
+rest, or the sweeps of a recorded set, whose windows are exactly the middle of the played sweeps.
 """
 
 from __future__ import annotations
@@ -19,23 +18,25 @@ from appliance.sim.rig import Act
 
 SETS = "replay:"
 PAUSE_S = 0.1, 0.14
-"""The finger is off the tube so long before and after it; drawn anew each time, so that edges meet packets anywhere."""
+"""Time that the finger is off the tube before and after a sweep; drawn for each one, so that edges fall anywhere within
+packets."""
 SLIDE_S, REST_S = 3.0, 0.1
-"""The slide (paper, sec. II.B), and the finger at rest on the tube before and after it."""
+"""Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after it."""
 LEAD_S = 0.5
-"""From an edge to a recorded window, as `sweep.lead_ms` has it; the window's first and last frames are held so long."""
+"""Time from an edge to a recorded window, equal to `sweep.lead_ms`; the window's first and last frame are repeated for
+this time."""
 RESTS_MM = (4.0, 3.0), (-2.5, 2.0), (1.5, -1.0), (0.0, 0.0)
-"""Where the skin sits while somebody places it, a little better each time: ahead along the finger, and aside."""
+"""Positions of the skin while somebody aligns it, each better than the last: (along the finger, across)."""
 RESTS_FOR_S, LIFTED_S = 3.0, 1.0
-"""How long the finger then rests on the tube, and how long it is off before."""
+"""Time that the finger then rests on the tube, and that it is lifted before."""
 MARGIN = 8
-"""Frames before and after the edges, so that these have room."""
+"""Frames before the start edge and after the stop edge."""
 
 
 def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
-    """The script that `--sim` names, and the source that its sentences name.
+    """The script with this name after `--sim`, and the name of the source in sentences.
 
-    Raises ConfigError for another name, FormatError where the bundle wants another skin.
+    Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
     """
     if name in ("skin", "rest"):
         if fmt != skin.FORMAT:
@@ -47,9 +48,10 @@ def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
 
 
 def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = ()) -> Iterator[Act]:
-    """Sweeps over the six tubes in random order, `sweeps` of them or without end; tubes are turned before each sweep.
+    """Sweeps over the six tubes in random order; each begins at another spot of its tube.
 
-    places: where the skin sits, the next one for each round of six tubes; by default one place drawn from `seed`.
+    sweeps: their number; None for no end. places: positions of the skin, the next one for each round of six tubes; by
+    default one that is drawn from `seed`.
     """
     rng = np.random.default_rng(seed)
     rate = skin.FORMAT.rate_hz
@@ -67,7 +69,7 @@ def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement]
 
 
 def rests(seed: int) -> Iterator[Act]:
-    """A finger that is lifted and put on the wooden tube again, without end; between the touches the skin is moved."""
+    """A finger that is lifted and put on the wooden tube again, without end; the skin is moved between the touches."""
     rng = np.random.default_rng(seed)
     world = skin.World()
     off = round(LIFTED_S * skin.FORMAT.rate_hz)
@@ -79,21 +81,22 @@ def rests(seed: int) -> Iterator[Act]:
 
 
 def replay(path: Path, fmt: SweepFormat) -> Iterator[Act]:
-    """The sweeps of a set in order; NEW OBJECT wherever a new recording begins. FormatError where it is not `fmt`."""
-    held = load_file(path, SweepSet)
-    if held.format != fmt:
+    """The sweeps of a set in order, with NEW OBJECT where a recording begins. Raises FormatError if it is not of
+    `fmt`."""
+    sweeps = load_file(path, SweepSet)
+    if sweeps.format != fmt:
         raise FormatError(
-            f"{path} holds {held.format}, the bundle wants {fmt}; name its bundle with --set classifier.bundle=DIR"
+            f"{path} holds {sweeps.format}, the bundle wants {fmt}; name its bundle with --set classifier.bundle=DIR"
         )
-    return _play(held)
+    return _play(sweeps)
 
 
-def _play(held: SweepSet) -> Iterator[Act]:
-    begins = np.ones(len(held), bool)
-    recording = held.groups.get("recording", np.zeros(len(held), int))
+def _play(sweeps: SweepSet) -> Iterator[Act]:
+    begins = np.ones(len(sweeps), bool)
+    recording = sweeps.groups.get("recording", np.zeros(len(sweeps), int))
     begins[1:] = recording[1:] != recording[:-1]
-    lead = round(LEAD_S * held.format.rate_hz)
-    stop = MARGIN + 2 * lead + held.format.window // 2 * 2  # even, so that a frame lies in the middle
-    for window, label, new in zip(held.samples, held.labels, begins & ("recording" in held.groups), strict=True):
+    lead = round(LEAD_S * sweeps.format.rate_hz)
+    stop = MARGIN + 2 * lead + sweeps.format.window // 2 * 2  # even, so that a frame lies in the middle
+    for window, label, new in zip(sweeps.samples, sweeps.labels, begins & ("recording" in sweeps.groups), strict=True):
         before, after = window[:1].repeat(MARGIN + lead, 0), window[-1:].repeat(MARGIN + lead, 0)
-        yield Act(np.concatenate([before, window, after]), MARGIN, stop, held.materials[label], bool(new))
+        yield Act(np.concatenate([before, window, after]), MARGIN, stop, sweeps.materials[label], bool(new))

@@ -1,9 +1,9 @@
-"""The room of the simulated world that stands in for the real skin: a soft finger slides along a tube.
+"""Simulated skin: a soft finger with a 4 x 4 tactile skin slides along a tube. In: the name of a material, the
+placement of the skin on the finger, a random generator. Out: raw counts uint8 [n, 4, 4] at 750 Hz.
 
-In: the name of a material, where the skin sits on the finger, a random generator. Out: digits uint8 [n, 4, 4], 750 Hz.
-The finger's pad is a bed of springs pressed on the tube. Whatever else a taxel sees is one small function named in
-`EFFECTS`; each draws from its own random stream, so that `World(off=...)` takes one away and leaves the others as they
-were. Rows lie along the direction of sliding (x), columns across the tube (y); row 3 leads.
+The finger's pad is a bed of springs that is pressed on the tube. Each further effect is one function, named in
+`EFFECTS`, with its own random stream, so that `World(off=...)` removes one and leaves the others unchanged. Rows are
+along the direction of sliding (x), columns across the tube (y); row 3 leads.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from appliance.core.types import SweepFormat
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
-Digits = NDArray[np.uint8]
+Counts = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
-SweepSet = tuple[Digits, Whole, Whole]
+LabelledWindows = tuple[Counts, Whole, Whole]
 SetName = Literal["T-LAB", "T-REAL", "T-HARD"]
 
 FORMAT = SweepFormat(4, 4, 750.0, 1500, "uint8")
 PITCH_MM, TAXEL_MM, TUBE_RADIUS_MM = 4.0, 2.5, 25.0
-STEP_MM = 30.0 / FORMAT.rate_hz  # slid from one frame to the next, at 3 cm/s
-FORCE_LIMIT = 0.2  # the controller's precision: no force is further off, as a share of the wanted one
-SETS = {"T-LAB": (1, 40), "T-REAL": (9, 10), "T-HARD": (1, 10)}  # positions, sweeps of a tube at each
+STEP_MM = 30.0 / FORMAT.rate_hz  # path from one frame to the next, at 3 cm/s
+FORCE_LIMIT = 0.2  # precision of the controller: largest error of the force, as a share of the desired one
+SETS = {"T-LAB": (1, 40), "T-REAL": (9, 10), "T-HARD": (1, 10)}  # positions, sweeps of each tube per position
 EFFECTS = ("position", "attachment", "drift", "spot", "texture", "vibration", "noise")
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """A tube. Pitch and vibration_hz are centres of bumps in the spectrum, `_octaves` their standard deviations."""
+    """A tube. pitch_mm and vibration_hz are centres of peaks in the spectrum, `_octaves` their standard deviations."""
 
     name: str
     softness_mm_per_kpa: float
@@ -60,36 +60,36 @@ MATERIALS = tuple(tube.name for tube in TUBES)
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """Everything of the scene that is neither the skin's place nor drawn at random. `off`: EFFECTS to leave out.
+    """Physical parameters of the simulation, without the skin's placement and random numbers. off: EFFECTS to omit.
 
-    A spread is a standard deviation, of the natural logarithm where nothing else is said. Fitted: docs/decisions/0003.
-    Raises ConfigError where `off` names an effect that does not exist.
+    A spread is a standard deviation, of the natural logarithm unless stated otherwise. They were fitted as described in
+    docs/decisions/0003. Raises ConfigError if `off` names an unknown effect.
     """
 
     off: frozenset[str] = frozenset()
     tubes: tuple[Material, ...] = TUBES
-    speed: float = 1.0  # of sliding, of 3 cm/s; what friction shakes keeps its rate
+    speed: float = 1.0  # of sliding, relative to 3 cm/s; friction vibrations keep their frequency
     force_n: float = 1.0
-    force_spread: float = 0.10  # share of the force; half of the precision that the paper states
+    force_spread: float = 0.10  # share of the force; half of the precision stated in the paper
     pad_kpa_per_mm: float = 4.0
-    pad_half_mm: float = 8.5  # along the tube; beyond it the pad bends away
-    digits_per_kpa: float = 15.0
-    noise_digits: float = 0.36
-    gain_spread: float = 0.17  # per attachment, once for all taxels and once for each
+    pad_half_mm: float = 8.5  # along the tube; further out the pad bends away
+    counts_per_kpa: float = 15.0
+    noise_counts: float = 0.36
+    gain_spread: float = 0.17  # per attachment, one draw for all taxels and one for each
     bedding_mm: float = 0.05  # spread of the height of tape and pad under a taxel, per attachment
-    colour_spread: float = 0.49  # of how tape and glove pass vibrations, per attachment and octave
-    damping_hz: float = 114.0  # above it the pad swallows vibrations,
-    damping_octaves_per_mm: float = -0.60  # and sooner, the further towards the finger's tip the skin sits;
+    colour_spread: float = 0.49  # of the transmission of vibrations by tape and glove, per attachment and octave
+    damping_hz: float = 114.0  # the pad damps vibrations above this frequency,
+    damping_octaves_per_mm: float = -0.60  # which is lower the closer the skin is to the fingertip;
     relief_per_mm: float = 0.12  # there it follows the relief more, as the logarithm of the height
     spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
-    spot_octaves: float = 0.125  # spread of pitch and rate likewise
+    spot_octaves: float = 0.125  # spread of pitch and vibration frequency likewise
 
     def __post_init__(self) -> None:
         if unknown := self.off - set(EFFECTS):
             raise ConfigError(f"effect {min(unknown)!r} cannot be switched off; use some of {', '.join(EFFECTS)}")
 
     def tube(self, name: str) -> Material:
-        """The tube of that name. Raises ConfigError where there is none."""
+        """The tube of this name. Raises ConfigError for an unknown name."""
         known = {tube.name: tube for tube in self.tubes}
         if name not in known:
             raise ConfigError(f"material {name!r} is unknown; use one of {', '.join(known)}")
@@ -101,7 +101,7 @@ WORLD = World()
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where the skin's centre sits on the pad, along sliding and across, and its turn. `seed` draws its attachment."""
+    """Position of the skin's centre on the pad, along sliding and across, and its rotation. seed: of its attachment."""
 
     dx_mm: float = 0.0
     dy_mm: float = 0.0
@@ -112,9 +112,10 @@ class Placement:
 def band(
     n: int, tracks: int, centre: float, octaves: float, rate: float, rng: Generator, passed: Array | float = 1.0
 ) -> Array:
-    """Noise [tracks, n]: its amplitude spectrum is a bump on a logarithmic axis, its rms 1 before the gain `passed`.
+    """Noise [tracks, n] whose amplitude spectrum is a Gaussian over log frequency, with rms 1 before the gain `passed`.
 
-    centre and rate (samples) are both per second or both per mm; passed [n // 2 + 1] over rfft's bins.
+    centre, rate (sampling): both per second or both per mm. octaves: standard deviation. passed: gain [n // 2 + 1] of
+    the bins of rfft.
     """
     amplitude = np.exp(-0.5 * (np.log2(np.fft.rfftfreq(n, 1 / rate)[1:] / centre) / octaves) ** 2)
     amplitude *= n / 2 / np.sqrt(np.sum(amplitude**2))
@@ -124,7 +125,7 @@ def band(
 
 
 def position(placement: Placement, world: World) -> tuple[Array, Array]:
-    """Effect: where the taxels' centres lie on the pad, x and y [4, 4] in mm; without it the skin is centred."""
+    """Effect: positions of the taxels' centres on the pad, x and y [4, 4] in mm; without it the skin is centred."""
     sits = Placement() if "position" in world.off else placement
     step = (np.arange(4) - 1.5) * PITCH_MM
     place = complex(sits.dx_mm, sits.dy_mm) + (step[:, None] + 1j * step) * np.exp(1j * np.deg2rad(sits.turn_deg))
@@ -132,9 +133,9 @@ def position(placement: Placement, world: World) -> tuple[Array, Array]:
 
 
 def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]:
-    """Effect: what attaching the skin has changed: gains [4, 4], bedding [4, 4] in mm, colour of vibrations [7].
+    """Effect: influence of the attachment: gains [4, 4], bedding height [4, 4] in mm, colour of vibrations [7].
 
-    The colour is the logarithm of a gain at 6 Hz and each octave above it, up to 375 Hz.
+    The colour is the logarithm of the gain at 6 Hz and at each octave above it, up to 375 Hz.
     """
     if "attachment" in world.off:
         return np.ones((4, 4)), np.zeros((4, 4)), np.zeros(7)
@@ -144,7 +145,7 @@ def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]
 
 
 def drift(n: int, rng: Generator, world: World) -> Array:
-    """Effect: contact force [n] in N; half of the controller's error stays for the sweep, half wanders at .5 Hz."""
+    """Effect: contact force [n] in N; half of the controller's error is constant in a sweep, half varies at 0.5 Hz."""
     if "drift" in world.off:
         return np.full(n, world.force_n)
     wander = band(max(n, FORMAT.window), 1, 0.5, 1.0, FORMAT.rate_hz, rng)[0, :n]
@@ -153,7 +154,7 @@ def drift(n: int, rng: Generator, world: World) -> Array:
 
 
 def spot(tube: Material, rng: Generator, world: World) -> Material:
-    """Effect: the tube was turned, and here it is a little rougher, finer or squeaks otherwise than elsewhere."""
+    """Effect: the tube was turned, and its texture and vibrations differ a little from one spot to another."""
     if "spot" in world.off:
         return tube
     height, squeak = np.exp(world.spot_spread * rng.standard_normal(2))
@@ -168,15 +169,15 @@ def spot(tube: Material, rng: Generator, world: World) -> Material:
 
 
 def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World) -> Array:
-    """Effect: height [n, 4, 4] in mm under the taxels, averaged over their length. `slid` [n]: frames slid so far.
+    """Effect: height [n, 4, 4] in mm under the taxels, averaged over their length. slid: int64 [n], path in frames.
 
-    Each column runs over a track of its own, on which the rows follow one another at the speed of sliding. A sheet
-    that reaches over the pad's end is not held down there: the further ahead it sits, the freer it follows the relief.
+    Each column moves over its own track, on which the rows follow one another at the speed of sliding. A skin that
+    extends beyond the pad is not pressed down there: the further forward it is, the more it follows the relief.
     """
     if "texture" in world.off:
         return np.zeros((1, 4, 4))
     lead = np.rint((x - x.min()) / STEP_MM).astype(np.int64)
-    n = 500 * int(np.ceil((slid[-1] + lead.max() + 1) / 500))  # a length that the FFT likes
+    n = 500 * int(np.ceil((slid[-1] + lead.max() + 1) / 500))  # a length for which the FFT is fast
     blur = np.sinc(np.fft.rfftfreq(n, STEP_MM) * TAXEL_MM)
     track = tube.texture_mm * band(n, 4, 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM, rng, blur)
     height: Array = np.exp(world.relief_per_mm * x.mean()) * track[np.arange(4), slid[:, None, None] + lead]
@@ -184,7 +185,7 @@ def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World)
 
 
 def vibration(tube: Material, x: Array, colour: Array, moving: Flags, rng: Generator, world: World) -> Array:
-    """Effect: friction shakes all that touches in time, [n, 1, 1] as a share of the pressure, while `moving` [n]."""
+    """Effect: friction vibrations of all taxels in phase, [n, 1, 1] as a share of the pressure, while `moving` [n]."""
     if "vibration" in world.off:
         return np.zeros((1, 1, 1))
     n = len(moving)
@@ -197,17 +198,18 @@ def vibration(tube: Material, x: Array, colour: Array, moving: Flags, rng: Gener
 
 
 def noise(n: int, rng: Generator, world: World) -> Array:
-    """Effect: white noise of the readout, [n, 4, 4] digits."""
-    return rng.standard_normal((n, 4, 4)) * (0.0 if "noise" in world.off else world.noise_digits)
+    """Effect: white noise of the readout, [n, 4, 4] in counts."""
+    return rng.standard_normal((n, 4, 4)) * (0.0 if "noise" in world.off else world.noise_counts)
 
 
 def gap(x: Array, y: Array | float, world: World) -> Array:
-    """Distance in mm of the unloaded pad from a tube that it just touches: the tube falls off, then the pad ends."""
+    """Distance in mm between the unloaded pad and a tube that it just touches: the tube's curvature across, the pad's
+    end along."""
     return np.square(y) / (2 * TUBE_RADIUS_MM) + (x / world.pad_half_mm) ** 6
 
 
 def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
-    """How deep [n] in mm the pad is pressed in by `force_n` [n]: the springs of the whole patch carry the force."""
+    """Indentation [n] in mm of the pad by `force_n` [n] in N, which the springs of the whole contact area carry."""
     x = np.linspace(-1.5, 1.5, 61) * world.pad_half_mm
     depth = np.linspace(0, 8, 161)
     pressed = np.maximum(depth[:, None] - gap(x, 0.0, world), 0)
@@ -216,13 +218,13 @@ def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
     return np.interp(force_n, newton, depth)
 
 
-def digitize(signal: Array) -> Digits:
-    """The converter: digits 0..255."""
+def digitize(signal: Array) -> Counts:
+    """The analogue-to-digital converter: raw counts 0 to 255."""
     return np.clip(np.rint(signal), 0, 255).astype(np.uint8)
 
 
-def _touch(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Digits:
-    """Digits [n, 4, 4] of a finger in contact that has slid `slid` [n] frames along the tube."""
+def _touch(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Counts:
+    """Raw counts [n, 4, 4] of a finger in contact. slid: path along the tube in frames [n]. moving: [n]."""
     of_drift, of_spot, of_texture, of_vibration, of_noise = rng.spawn(5)
     x, y = position(placement, world)
     gain, bedding, colour = attachment(placement, world)
@@ -232,7 +234,7 @@ def _touch(tube: Material, placement: Placement, rng: Generator, world: World, s
     height = bedding + texture(tube, x, np.rint(world.speed * slid).astype(np.int64), of_texture, world)
     pressure_kpa = kpa_per_mm * np.maximum(depth - gap(x, y, world) + height, 0)
     pressure_kpa *= 1 + vibration(tube, x, colour, moving, of_vibration, world)
-    return digitize(world.digits_per_kpa * gain * pressure_kpa + noise(len(slid), of_noise, world))
+    return digitize(world.counts_per_kpa * gain * pressure_kpa + noise(len(slid), of_noise, world))
 
 
 def sweep(
@@ -244,8 +246,8 @@ def sweep(
     rest_s: float = 0.3,
     slide_s: float = 3.0,
     after_s: float = 0.3,
-) -> Digits:
-    """Digits uint8 [n, 4, 4] of a finger that rests on the tube, slides along it and rests again.
+) -> Counts:
+    """Raw counts uint8 [n, 4, 4] of a finger that rests on the tube, slides along it and rests again.
 
     The slide is in frames [rest_s * 750, (rest_s + slide_s) * 750). Raises ConfigError for an unknown material.
     """
@@ -254,41 +256,42 @@ def sweep(
     return _touch(world.tube(material), placement, rng, world, frame.clip(0, slide), (frame >= 0) & (frame < slide))
 
 
-def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Digits:
-    """The middle two seconds of a slide, uint8 [1500, 4, 4]. Raises ConfigError for an unknown material."""
+def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Counts:
+    """The middle two seconds of a slide, raw counts uint8 [1500, 4, 4]. Raises ConfigError for an unknown material."""
     return _touch(world.tube(material), placement, rng, world, np.arange(FORMAT.window), np.ones(FORMAT.window, bool))
 
 
-def idle(n: int, rng: Generator, world: World = WORLD) -> Digits:
-    """Digits uint8 [n, 4, 4] of a skin that touches nothing."""
+def idle(n: int, rng: Generator, world: World = WORLD) -> Counts:
+    """Raw counts uint8 [n, 4, 4] of a skin without contact."""
     return digitize(noise(n, rng, world))
 
 
 def _set_rng(name: SetName, seed: int) -> Generator:
-    """The random stream of a set; sets of one seed share nothing. Raises ConfigError for an unknown set."""
+    """Random generator of a set; sets with the same seed are independent. Raises ConfigError for an unknown set."""
     if name not in SETS:
         raise ConfigError(f"sweep set {name!r} is unknown; use one of {', '.join(SETS)}")
     return np.random.default_rng([seed, *name.encode()])
 
 
 def placements(name: SetName, seed: int) -> list[Placement]:
-    """Where the skin sits in a set: within 1 mm of the middle, in T-HARD a row (4 mm) ahead; turned by 2 degrees rms.
+    """Placements of a set: within 1 mm of the middle, in T-HARD one row (4 mm) forward; rotated by 2 degrees rms.
 
     Raises ConfigError for an unknown set.
     """
     rng = _set_rng(name, seed)
     places = []
     for _ in range(SETS[name][0]):
-        aside = np.sqrt(rng.random()) * np.exp(2j * np.pi * rng.random())  # evenly over a disc of 1 mm
+        aside = np.sqrt(rng.random()) * np.exp(2j * np.pi * rng.random())  # uniform on a disc of 1 mm radius
         dx_mm = PITCH_MM if name == "T-HARD" else float(aside.real)
         places.append(Placement(dx_mm, float(aside.imag), 2 * rng.standard_normal(), int(rng.integers(2**32))))
     return places
 
 
-def sweep_set(name: SetName, seed: int, per_material: int | None = None, world: World = WORLD) -> SweepSet:
+def sweep_set(name: SetName, seed: int, per_material: int | None = None, world: World = WORLD) -> LabelledWindows:
     """A set of the paper: windows uint8 [N, 1500, 4, 4], labels int64 [N] into MATERIALS, positions int64 [N].
 
-    per_material: windows of each tube at each position (default: the paper's). Raises ConfigError for an unknown set.
+    per_material: windows of each tube at each position (default: as in the paper). Raises ConfigError for an unknown
+    set.
     """
     places = placements(name, seed)
     each = SETS[name][1] if per_material is None else per_material

@@ -182,7 +182,7 @@ def test_features_go_through_the_same_runtime():
     from appliance.signal import features
 
     weights = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
-    made = bundle.made(of_features(weights), "here")
+    made = bundle.from_files(of_features(weights), "here")
     want = features.compute("L", made.golden[0], 750.0) @ weights
     assert Classifier(made, VirtualClock()).logits(made.golden[0]) == pytest.approx(want, rel=1e-5)
 
@@ -190,7 +190,7 @@ def test_features_go_through_the_same_runtime():
 def test_as_many_features_as_the_manifest_computes():
     """A model of four features, where input L has three."""
     with pytest.raises(BundleError, match=r"takes float32 \[1, 4\], the manifest has float32 \[1, 3\]"):
-        bundle.made(of_features(np.ones((4, 6))), "here")
+        bundle.from_files(of_features(np.ones((4, 6))), "here")
 
 
 def copy(tmp_path: Path) -> Path:

@@ -131,7 +131,7 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
             np.vstack([toy_bundle.MEANS + 100, mean]), np.zeros(4), np.array([0, 0, 0, n]), np.ones(4)
         )
         means = Means(classes, known, ("a", "b", "c", "felt"))
-        kept += [not means.strange(means.distances(z)) for z in rng.normal(size=(40, 2))]
+        kept += [not means.novelty(means.distances(z)) for z in rng.normal(size=(40, 2))]
     assert np.mean(kept) == pytest.approx(1 - np.exp(-2), abs=0.025)
 
 
@@ -361,13 +361,13 @@ def test_too_few_sweeps_write_nothing(rig, tmp_path: Path, capsys: pytest.Captur
 
 def test_sigterm_ends_an_enrolment(rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """As it ends a run; nothing is written."""
-    keep = enrolment.Taken.sweep
+    keep = enrolment.SweepCollector.sweep
 
-    def kept(self: enrolment.Taken, *what) -> None:
+    def kept(self: enrolment.SweepCollector, *what) -> None:
         keep(self, *what)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(enrolment.Taken, "sweep", kept)
+    monkeypatch.setattr(enrolment.SweepCollector, "sweep", kept)
     assert rig(digits(*FELT)) == 1
     assert not (tmp_path / "new").exists()
 
@@ -443,7 +443,7 @@ def test_lines_that_cannot_tell_the_new_label(rig, monkeypatch: pytest.MonkeyPat
 
 def test_taken_takes_what_it_wants(old: Bundle, logged: list[str]):
     """No more than it was told, though one turn of the box may answer several; nothing is made of too few."""
-    taken, it = enrolment.Taken(2), Classifier(old, VirtualClock())
+    taken, it = enrolment.SweepCollector(2), Classifier(old, VirtualClock())
     with pytest.raises(ApplianceError, match="0 of 2 good sweeps"):
         taken.windows()
     for i, z in enumerate(FELT[:3]):

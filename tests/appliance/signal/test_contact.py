@@ -15,7 +15,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Status, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.io.robot_link import MAX_LINE, result
-from appliance.signal.contact import ContactPositions, advice, centre, mended, moved
+from appliance.signal.contact import ContactPositions, advice, centre, fill_dead_taxels, moved
 from appliance.sim import skin
 from train.data import sets
 from train.data.sets import Dataset
@@ -110,7 +110,7 @@ def test_the_rim_of_a_contact_is_not_filled_in():
     load = np.zeros((4, 4))
     load[1:3, 0:3] = 50
     load[1, 2] = 0
-    assert (mended(load) == load).all()
+    assert (fill_dead_taxels(load) == load).all()
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_a_switch_reaches_its_own_effect_only(effect: str, call) -> None:
 @pytest.mark.parametrize("effect", ["drift", "spot", "texture", "vibration"])
 def test_an_effect_taken_away_leaves_the_draws_of_the_others(effect: str) -> None:
     """The readout's noise, seen as what it adds to the rest, is the same with and without another effect."""
-    loud = World(noise_digits=2.0)
+    loud = World(noise_counts=2.0)
     noisy, clean = (replace(loud, off=frozenset(off)) for off in ({effect}, {effect, "noise"}))
     added = [skin.window("metal", PLACE, rng(), w).astype(float) for w in (noisy, clean)]
     drawn = [
@@ -120,13 +120,13 @@ def test_an_effect_taken_away_leaves_the_draws_of_the_others(effect: str) -> Non
 def test_noise_alone_is_white_and_as_loud_as_said() -> None:
     """Noise differs between taxels and has the standard deviation of the world, plus that of rounding."""
     taxels = skin.window("metal", PLACE, rng(), only("noise")).reshape(-1, 16).astype(float)
-    assert taxels.std(0).mean() == pytest.approx(np.hypot(World().noise_digits, 12**-0.5), rel=0.05)
+    assert taxels.std(0).mean() == pytest.approx(np.hypot(World().noise_counts, 12**-0.5), rel=0.05)
     assert abs(np.corrcoef(taxels.T) - np.eye(16)).max() < 0.15
 
 
 def test_vibration_alone_shakes_all_taxels_together_by_their_pressure() -> None:
     """What friction adds is one signal for all taxels, in proportion to what each carries."""
-    loud = replace(only("vibration"), digits_per_kpa=25.0)
+    loud = replace(only("vibration"), counts_per_kpa=25.0)
     taxels = skin.window("plastic rough", PLACE, rng(), loud).reshape(-1, 16).astype(float)
     assert np.corrcoef(taxels.T).min() > 0.95
     share = taxels.std(0) / taxels.mean(0)
