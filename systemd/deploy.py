@@ -56,7 +56,7 @@ def main(argv: list[str] | None = None) -> int:
 def checked(folder: Path, signers: Path | None) -> BundleArchive:
     """The bundle in `folder`, once it has passed its checks and golden sweeps here. Raises ApplianceError where it does not."""
     files = bundle.files(folder)
-    loaded = bundle.made(files, str(folder))
+    loaded = bundle.from_files(files, str(folder))
     Classifier(loaded, SystemClock()).self_test()
     if bundle.SIGNATURE not in files:
         raise BundleError(f"{folder} is not signed; sign it with palpate-train sign")

@@ -17,7 +17,7 @@ from appliance.sim import rig, skin
 from tests.factories import emulated_machines
 from tests.rig import image, notes
 from tests.rig.lines import HOLD_NS, GuestLines
-from tests.rig.usbredir import BULK, CANCEL, HELLO, Peer
+from tests.rig.usbredir import BULK, CANCEL, HELLO, UsbRedirPeer
 
 
 def test_an_image_is_named_by_what_goes_in(monkeypatch: pytest.MonkeyPatch):
@@ -99,7 +99,7 @@ class Guest:
     def __init__(self) -> None:
         self._socket, far = socket.socketpair()
         self._socket.settimeout(10)
-        self.peer = Peer(far)
+        self.peer = UsbRedirPeer(far)
         assert self.hear(12)[0] == HELLO
         self._socket.sendall(struct.pack("<III", HELLO, 68, 0) + bytes(64) + struct.pack("<I", 1 << 5 | 1 << 6))
 
