@@ -1,4 +1,4 @@
-"""What a machine can check of the architecture: who imports whom, what a wheel holds, how modules look."""
+"""What a machine can check of the architecture: imports, the content of the wheel, the form of modules, tests and texts."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def imports(path: Path) -> set[str]:
 
 def test_packages_import_downwards_only():
     """The contracts of pyproject.toml, as `make lint` checks them."""
-    said = run(Path(sys.executable).with_name("lint-imports"), cwd=ROOT)
-    assert "0 broken" in said
+    output = run(Path(sys.executable).with_name("lint-imports"), cwd=ROOT)
+    assert "0 broken" in output
 
 
 @pytest.mark.parametrize("path", BOX, ids=lambda p: str(p.relative_to(ROOT)))
@@ -115,12 +115,42 @@ def test_no_wall_clock_no_pickle_no_bare_except(path: Path):
         assert "time.sleep" not in text
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: p.name)
+@pytest.mark.parametrize("path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: str(p.relative_to(ROOT)))
 def test_every_test_says_what_it_holds(path: Path):
     """Each test has a docstring."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
             assert ast.get_docstring(node), node.name
+
+
+def asserts(test: ast.FunctionDef) -> bool:
+    """Whether a test can fail by a judgement: assert, pytest.raises, fail or warns, or a helper named after checking."""
+    if any(isinstance(node, ast.Assert) for node in ast.walk(test)):
+        return True
+    calls = [node.func for node in ast.walk(test) if isinstance(node, ast.Call)]
+    names = {f.attr if isinstance(f, ast.Attribute) else f.id for f in calls if isinstance(f, ast.Attribute | ast.Name)}
+    return any(re.fullmatch(r"raises|fail|warns|_?check|_?(check|assert|expect)_\w+", name) for name in names)
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_test_asserts(path: Path):
+    """Each test holds an assertion, or calls a helper whose name begins with check_, assert_ or expect_."""
+    tests = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
+    assert not [test.name for test in tests if test.name.startswith("test_") and not asserts(test)]
+
+
+BANNED = (
+    "taping", "underside", "yardstick", "what ends the program without being the bundle's doing",
+)  # fmt: skip
+"""Words that the project does not use, each of one meaning that has a standard word: module, attachment, backend, reference."""
+
+
+@pytest.mark.parametrize("path", [*SOURCES, *TESTS], ids=lambda p: str(p.relative_to(ROOT)))
+def test_banned_words_do_not_come_back(path: Path):
+    """Standard English: none of BANNED, in code, comments and messages."""
+    if path != Path(__file__):
+        text = path.read_text().lower()
+        assert not [word for word in BANNED if re.search(rf"\b{word.lower()}", text)]
 
 
 @pytest.fixture(scope="module")

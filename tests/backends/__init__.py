@@ -1,6 +1,6 @@
-"""The room of backends: what can lie below the box's drivers. In: PALPATE_BACKEND. Out: a Backend, or Missing.
+"""Backends: what can lie below the drivers of the box. In: PALPATE_BACKEND. Out: a Backend, or BackendMissing.
 
-tests/test_contract.py says once what Sensor, Trigger, Lines and SerialSink hold, and runs over any of them.
+tests/appliance/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink; it runs over any of them.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ NAMES = {
 ALL = frozenset(
     ("skin", "numbered", "plug", "garble", "silence", "hold", "deny", "lines", "overrun", "serial", "stall", "pull")
 )
-"""What a backend can at most; `Backend` says what each is."""
+"""All that a backend may be able to do; `Backend` explains each."""
 
 
 class BackendMissing(Exception):
-    """What a backend needs is not here; the message says how to get it."""
+    """What a backend needs is not installed; the message says how to get it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +49,12 @@ class Skin:
 
 
 class Backend(Protocol):
-    """The world below the drivers: what they are given, and what a test can do out there.
+    """What lies below the drivers: what they are given, and what a test can do to it from outside.
 
-    can: "skin": one is there. "numbered": its digits are known (`skins.digits`). "plug": it is unplugged, plugged in and
+    can: "skin": one is there. "numbered": its raw counts are known (`skins.counts`). "plug": it is unplugged, plugged in and
     swapped. "garble", "silence", "hold" (another program has it), "deny" (this user may not open it).
-    "lines": inputs are driven, outputs seen. "overrun": a storm brings each edge to the kernel. "serial": the far end speaks and listens. "stall": what it does not read
-    holds the line up. "pull": the port goes and comes back.
+    "lines": inputs are driven, outputs seen. "overrun": a storm brings each edge to the kernel. "serial": the far end sends
+    and receives. "stall": what it does not read blocks the line. "pull": the port goes and comes back.
 
     slack_s: how much later than asked this machine may be before a wait counts as endless. pulse_s: how long a level is
     held so that the kernel sees it for certain. Controls act at once.
@@ -78,7 +78,7 @@ class Backend(Protocol):
         ...
 
     def wait(self, seconds: float) -> None:
-        """Let the world's time pass."""
+        """Let time pass."""
         ...
 
     def after(self, seconds: float, control: Callable[[], None]) -> None:

@@ -187,7 +187,7 @@ class Socket:
         self._bench.attach(self.name, device.answer)
 
     def unplug(self) -> None:
-        """Pull it out: what is asked of it fails from now on, the kernel tells, and its node goes."""
+        """Pull it out: requests fail from now on, the kernel sends a uevent, and its node goes."""
         if not self.device:
             return
         self.device.gone, self.device = True, None

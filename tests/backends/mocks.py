@@ -1,6 +1,6 @@
 """umockdev for backends: devices that open, read and ioctl of this process meet, answered by handlers in one thread.
 
-In: `umockdev-wrapper` around the process, and Debian's python3-gi. Out: a Bench with a testbed and its thread.
+In: `umockdev-wrapper` around the process, and Debian's python3-gi. Out: MockedDevices with a testbed and its thread.
 """
 
 from __future__ import annotations

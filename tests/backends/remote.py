@@ -1,7 +1,7 @@
-"""The virtual box as a backend: the drivers run in the guest, over its kernel; what is outside is asked for by wire.
+"""The virtual box as a backend: the drivers run in the guest, over its kernel; the devices outside are controlled by requests.
 
 In: the guest's own settings, and JSON lines over a character device: one request, one reply. Outside, `serve` answers
-them with a bench, which has the controls of a Backend that are in CONTROLS; `able` gives what it can, as in `can`, and
+them with an object that has the controls of a Backend that are in CONTROLS; `able` gives what it can, as in `can`, and
 `reset` leaves the cable alone.
 """
 
@@ -41,7 +41,7 @@ ANSWER_S = 60
 
 
 def serve(stream: IO[bytes], bench: Any) -> None:
-    """Do what comes in over `stream`, until it ends. bench: what is asked; what goes wrong there is told as text."""
+    """Do what comes in over `stream`, until it ends. bench: who does it; its errors are sent back as text."""
     for line in stream:
         asked = json.loads(line)
         try:

@@ -95,6 +95,6 @@ class Simulated:
 
 @contextmanager
 def opened() -> Iterator[Simulated]:
-    """A simulated world."""
+    """Simulated devices."""
     with ExitStack() as stack:
         yield Simulated(stack)

@@ -1,4 +1,4 @@
-"""The skins that tests plug in. In: a Skin. Out: a board of the rig that numbers its frames, and what each must hold."""
+"""The skins that tests plug in. In: a Skin. Out: a board of the rig that numbers its frames, and the raw counts of each frame."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def board(what: Skin, clock: Clock) -> rig.Board:
     return made
 
 
-def digits(seq: NDArray[np.int64], fmt: SweepFormat) -> NDArray[Any]:
-    """What frames of these unwrapped numbers [n] must hold: [n, R, C]."""
+def counts(seq: NDArray[np.int64], fmt: SweepFormat) -> NDArray[Any]:
+    """Raw counts that frames of these unwrapped numbers [n] must hold: [n, R, C]."""
     return numbered(_PERIOD, fmt)[(seq & ((1 << EPOCH_BITS) - 1)) % _PERIOD]
 
 

@@ -1,4 +1,4 @@
-"""Altered bundles, all of them. In: a signed bundle. Out: how many of its alterations a box has accepted: none, or it fails.
+"""Alters a signed bundle in every way. In: a signed bundle. Out: how many alterations a box accepted; any is a failure.
 
 `python -m tests.campaigns.flips --out build/flips.json` flips every bit of a manifest, random bits of the other files,
 swaps each file with that of another signed bundle, and tries bundles that are unsigned, wrongly signed, cut or older.
@@ -78,8 +78,8 @@ def others(files: Files, box: Delivery) -> Iterator[Case]:
     """Unsigned, wrongly signed, cut, older."""
     text = files[bundle.MANIFEST]
     yield "not signed", "", {name: data for name, data in files.items() if name != bundle.SIGNATURE}
-    strange = deliveries.key(box.folder / "strange")
-    yield "signed by a stranger", "", files | {bundle.SIGNATURE: signature.sign(text, strange)}
+    unknown = deliveries.key(box.folder / "unknown")
+    yield "signed by an unknown key", "", files | {bundle.SIGNATURE: signature.sign(text, unknown)}
     for space in ("file", "git", "palpate", "palpate-bundle2", " "):
         yield "signed for another use", space, files | {bundle.SIGNATURE: _signed_for(space, text, box.key)}
     for name, data in sorted(files.items()):

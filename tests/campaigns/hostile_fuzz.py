@@ -2,7 +2,7 @@
 
 `python -m tests.campaigns.hostile_fuzz --count 10000 --seed 1 --out FILE.json` (make it `nice`; a stopped one goes
 on where it was). Each model is opened in a child that may take 256 MB more than it had and ten seconds; what matters is
-how many hung it, killed it, or went beyond that memory. Seed and number name a model for ever.
+how many hung it, killed it, or went beyond that memory. Seed and number identify a model.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class Fuzz:
             size = memory("VmSize") * 1024 + MOST_MORE
             resource.setrlimit(resource.RLIMIT_AS, (size, size))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # onnxruntime tells what it refuses
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # onnxruntime prints what it refuses
             for number in numbers:
                 result = {"number": number} | tried(*self.model(number))
                 os.write(out, json.dumps(result).encode() + b"\n")

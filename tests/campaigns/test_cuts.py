@@ -142,7 +142,7 @@ def test_what_cannot_be_followed_is_told(play: Makes, does: str):
 
 
 def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
-    """The power is cut at every moment of two runs, and some kills: all that was told as stored is there."""
+    """The power is cut at every moment of two runs, and some kills: all that was reported as stored is there."""
     played = ScenePlay(recording.scene(), work)
     points = [played.power(moment) for moment in played.moments()]
     points += [played.kill(moment) for moment in list(played.moments())[8:60:10]]

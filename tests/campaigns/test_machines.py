@@ -1,7 +1,7 @@
-"""The room of other processors: the same bundle gives the same labels on x86 with and without VNNI, and on arm64.
+"""Other processors: the same bundle gives the same labels on x86 with and without VNNI, and on arm64.
 
 Emulated by qemu, which computes what the processor would, instruction by instruction. PALPATE_MACHINES=1 gets what this
-needs (see machines.py) and insists on it; without, what is not there is skipped.
+needs (see tests/factories/emulated_machines.py) and fails without it; else what is missing is skipped.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SHOWN_SWEEPS = 8
 
 @pytest.fixture(scope="session")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The default bundle with simulated sweeps, one freshly trained for each digit type, and a network that overflows."""
+    """The default bundle with simulated sweeps, one freshly trained for each type of raw counts, and a network that overflows."""
     if os.environ.get("PALPATE_MACHINES") == "1":
         emulated_machines.set_up()
     folder = tmp_path_factory.mktemp("given")
@@ -90,7 +90,7 @@ def overflowing(folder: Path) -> None:
 @pytest.fixture(scope="session")
 def here(given: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
     """What this machine says."""
-    results_file = tmp_path_factory.mktemp("here") / "told.npz"
+    results_file = tmp_path_factory.mktemp("here") / "results.npz"
     emulated_machines.work(given, results_file)
     with np.load(results_file) as z:
         return dict(z)
@@ -102,7 +102,7 @@ def there(
 ) -> tuple[str, dict[str, np.ndarray]]:
     """A machine's name, and what it says."""
     insist = os.environ.get("PALPATE_MACHINES") == "1"
-    results_file = tmp_path_factory.mktemp("there") / "told.npz"
+    results_file = tmp_path_factory.mktemp("there") / "results.npz"
     try:
         if insist:
             emulated_machines.set_up()
@@ -117,7 +117,7 @@ def there(
 
 
 def test_a_bundle_says_the_same_on_every_machine(here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]):
-    """Golden sweeps and others: the same labels, and probabilities within what the box's own test allows."""
+    """Golden sweeps and others: the same labels, and probabilities within the tolerance of the box's self test."""
     name, there_result = there
     assert there_result.keys() == here.keys()
     for what in here:

@@ -97,7 +97,7 @@ class FakeBox:
     def stop(self) -> list[tuple[float, str]]:
         """The open sweep is aborted."""
         due, self.said = self.edges(self.now_s)[0], self.said + 1
-        assert due == self.said, "stopped where it is in doubt whether a sweep has begun"
+        assert due == self.said, "stopped where it is not certain that a sweep has begun"
         aborted = sentence("RES", due, 1, "aborted", "", 0, 0, 0, 0, 0.1, "b", "sim", "1.00", "")
         return self.changed(self.now_s, aborted)
 
@@ -141,7 +141,7 @@ def clean() -> soak_judge.SoakRun:
 
 
 def test_a_box_without_fault_reaches_every_target(clean):
-    """All sweeps answered, the last one as aborted; nothing lost, nothing noted; memory of three minutes is not told."""
+    """All sweeps answered, the last one as aborted; nothing lost, nothing noted; memory of three minutes is not judged."""
     result = sums(clean)
     assert result["due"] == result["answers"] > 40
     assert (result["cut"], result["unanswered"], result["faults"], result["unaccounted"], result["differs"]) == (
@@ -284,7 +284,7 @@ def test_the_interval_knows_that_neighbours_are_alike():
 
 
 def test_runs_have_a_level_each_and_one_slope():
-    """A process that was started anew on another level is no growth; two that grow are; two samples tell nothing."""
+    """A process that was started anew on another level is no growth; two that grow are; two samples decide nothing."""
     flat = [samples(np.full(120, 70_000.0)), samples(np.full(120, 75_000.0), 1200)]
     grown = [samples(70_000 + np.arange(120)), samples(60_000 + np.arange(120), 1200)]
     assert soak_judge.slope(flat) | {"kib_h": 0.0, "low": 0.0, "high": 0.0} == soak_judge.slope(flat)
@@ -444,7 +444,7 @@ def test_the_page_needs_nothing_else_and_tells_all(result):
     assert {e.tag.rpartition("}")[2] for e in ET.fromstring(svg).iter()} >= {"svg", "title", "path", "text"}
     assert not re.search(r"<script|<link|<img|@import|url\((?!#)|href=\"(?!#)", html)
     for text in ("this machine", "virtual box", "third box; it was not there", "answer 7 came again", "not reached",
-                 "growth of memory", "too short to tell", "abc"):  # fmt: skip
+                 "growth of memory", "too short to judge", "abc"):  # fmt: skip
         assert text in html, text
     assert svg in html
     assert len(svg) < 60_000

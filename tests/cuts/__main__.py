@@ -1,7 +1,7 @@
-"""Cuts every scene at every moment: `python -m tests.cuts [SCENE ...]`. In: scenes by name. Out: a line for each command, and in
-build/cuts.jsonl one for each point, with the machine and the commit.
+"""Cuts every scene at every crash point: `python -m tests.cuts [SCENE ...]`. In: scenes by name. Out: a line for each command,
+and in build/cuts.jsonl one for each crash point, with the machine and the commit.
 
-It goes on where it was broken off, as long as neither the box nor the scenes have changed. 1 where anything is wrong.
+An interrupted run is continued as long as neither the box nor the scenes have changed. Exit code 1 if anything is wrong.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def _head() -> dict[str, str]:
     """What was cut: the commit, a digest of what is really there, the machine."""
     git = ("git", "-C", str(ROOT), "describe", "--always", "--dirty")
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
-    sources = (tree.read(ROOT / room) for room in ("appliance", "tests/cuts"))
+    sources = (tree.read(ROOT / folder) for folder in ("appliance", "tests/cuts"))
     digests = [tree.digest({name: held for name, held in s.items() if "__pycache__" not in name}) for s in sources]
     return {
         "commit": commit, "source": "".join(d[:16] for d in digests), "kernel": platform.platform(),

@@ -86,7 +86,7 @@ class Shop:
         command = [sys.executable, "-S", "-c", COPY, self.at(name)]
         return SceneStep(f"copy {name}", lambda folder: [*command, folder / INCOMING / name])
 
-    def story(self) -> Iterator[tuple[str, SceneStep]]:
+    def steps(self) -> Iterator[tuple[str, SceneStep]]:
         """What happens to a box; before each command, which bundles may run if that is cut short."""
         do = self.palpate
         yield "packaged", self.copy("first")
@@ -115,8 +115,8 @@ class Shop:
         yield "fifth", do("commit it by hand", "commit")
 
     def scene(self) -> CutScene:
-        """The story, each command of which is cut short."""
-        return self._scene(_bare, list(self.story()))
+        """All steps, each command of which is cut short."""
+        return self._scene(_bare, list(self.steps()))
 
     def alone(self, way: str) -> CutScene:
         """Nothing but an install, in one of WAYS, on a box that runs the first bundle."""
@@ -179,9 +179,9 @@ def _end(output: str) -> str:
 
 
 def _apart(words: list[str]) -> tuple[int, str]:
-    """Run a command of the box in a child that has its libraries already; exit code, and all that it said."""
-    reported = os.memfd_create("told")
-    sys.stdout.flush()  # or the child says it, too
+    """Run a command of the box in a child that has its libraries already; exit code and output."""
+    reported = os.memfd_create("output")
+    sys.stdout.flush()  # or the child prints it, too
     child = os.fork()
     if not child:
         signal.alarm(DEADLINE_S)

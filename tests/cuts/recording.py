@@ -1,4 +1,4 @@
-"""Recording, cut short. In: programs that record sweeps, the box's own and some that are wrong on purpose. Out: scenes,
+"""Recording, cut short. In: programs that record sweeps, that of the box and some that are wrong on purpose. Out: scenes,
 whose judge finds what is lost beyond the sweep in progress.
 
 `python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it goes on in the folder, says what a robot would hear,

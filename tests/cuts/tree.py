@@ -1,4 +1,4 @@
-"""A folder as a value. In: a folder. Out: all that is in it, which can be compared, told by a digest, and written again."""
+"""A folder as a value. In: a folder. Out: all that is in it, which can be compared, hashed, and written again."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""The room of other processors. In: folders with bundles and sweeps. Out: what the box's classifier says of them there.
+"""Runs the classifier of the box on other processors. In: folders with bundles and sweeps. Out: its outputs there.
 
-`python -m tests.factories.emulated_machines` gets what an arm64 userland needs, once, into ~/.cache/palpate/machines: Debian's packages
-unpacked, the wheels of appliance/requirements.lock beside them. qemu's user mode runs it, and x86 processors older than
-this one; nothing needs root, and nothing outside that folder is changed. `python -m tests.factories.emulated_machines FROM TO` is what
-then runs on each machine, this one too.
+`python -m tests.factories.emulated_machines` gets an arm64 userland, once, into ~/.cache/palpate/machines: Debian's
+packages unpacked, the wheels of appliance/requirements.lock beside them. qemu's user mode runs it, and x86 processors
+older than this one; nothing needs root, and nothing outside that folder is changed. With two arguments, FROM TO, the
+module is the program that runs on each machine, this one too.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ CPUINFO = (
 
 
 class Missing(Exception):
-    """What another machine needs is not to be had here."""
+    """What another machine needs is not available here."""
 
 
 def folder() -> Path:
@@ -108,7 +108,7 @@ def whole(target: Path, make: Callable[[Path], None]) -> Path:
 
 
 def set_up() -> Path:
-    """The folder of the arm64 userland, made where it is not there. Raises Missing where apt or pip cannot."""
+    """The folder of the arm64 userland, made if it is not there. Raises Missing if apt or pip fail."""
     return whole(folder(), _make)
 
 

@@ -1,6 +1,6 @@
-"""Models that nobody would write: random operators on random tensors, as far as the box's own rules let them grow.
+"""Random models: random operators on random tensors, as far as the rules of the box's check allow.
 
-In: a generator. Out: a model that the check takes, so that onnxruntime is what is tested.
+In: a generator. Out: a model that the check accepts, so that onnxruntime itself is tested.
 """
 
 from __future__ import annotations

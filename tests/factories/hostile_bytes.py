@@ -1,7 +1,7 @@
-"""Models that are wrong in their form: no protobuf, two things to two readers, types and ends that no bundle has.
+"""Models of a wrong form: no protobuf, ambiguous to two readers, types and outputs that no bundle has.
 
-In: nothing. Out: (name, model, the words that its refusal must hold as a regular expression). What hostile.py makes its
-models with stands here, too.
+In: nothing. Out: (name, model, regular expression that its refusal must match). The tools of hostile_models.py are here,
+too.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Models that mean harm. In: nothing. Out: each by name, as bytes, with the words that its refusal must hold.
+"""Harmful models. In: nothing. Out: each by name, as bytes, with a regular expression that its refusal must match.
 
-They ask for memory or time without end, for files beside the model, for other code, or are no model at all
-(hostile_forms.py). Some are made with onnx, some byte by byte, since onnx would not write them. All say that they take the
-sweep of `grown.FORM`.
+They ask for unlimited memory or time, for files beside the model, for other code, or are no model at all
+(hostile_bytes.py). Some are made with onnx, some byte by byte, since onnx would not write them. All declare the sweep of
+`grown_models.FORM` as their input.
 """
 
 from __future__ import annotations

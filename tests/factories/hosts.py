@@ -1,7 +1,7 @@
-"""The room of real hosts: Debians in containers, each in its own network namespace, with an sshd and a bare user.
+"""Real hosts: Debians in containers, each in its own network namespace, with an sshd and a bare user.
 
 In: nothing but this machine, as root. Out: hosts that `make install` and `make deploy` are tried on, and with
-`python -m hosts figures` how long both take. Their Debian is made once, in ~/.cache/palpate/hosts: bare, with the packages
+`python -m tests.factories.hosts figures` how long both take. Their Debian is made once, in ~/.cache/palpate/hosts: bare, with the packages
 that an install wants in apt's cache as from a mirror; and ready, with these installed. What happens on a host is gone
 with it. The skin is simulated there, by a drop-in for the unit.
 """
@@ -256,7 +256,7 @@ def _machine() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser("python -m hosts")
+    parser = argparse.ArgumentParser("python -m tests.factories.hosts")
     commands = parser.add_subparsers(required=True, dest="command")
     commands.add_parser("set-up", help="make the Debians")
     measure = commands.add_parser("figures", help="how long an install and a deploy take")

@@ -1,4 +1,4 @@
-"""Models of our own, and what becomes of them at random. In: nothing, or bytes and a generator. Out: bytes.
+"""Our own models, and random changes of them. In: nothing, or bytes and a generator. Out: bytes.
 
 Two kinds of change: of bytes, which mostly break the file, and of fields, which leave a file that can be read and reach
 the rules of the operators.

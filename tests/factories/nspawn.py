@@ -1,6 +1,6 @@
-"""The room of the real systemd: a Debian in a container, with systemd as PID 1 and the box installed as on a board.
+"""A real systemd: a Debian in a container, with systemd as PID 1 and the box installed as on a board.
 
-`python tests/nspawn.py` makes the Debian, once, in ~/.cache/palpate/nspawn: packages from Debian, a virtual environment
+`python -m tests.factories.nspawn` makes the Debian, once, in ~/.cache/palpate/nspawn: packages from Debian, a virtual environment
 with the wheels of appliance/requirements.lock. `Machine` boots it in half a second; what is changed in it lies in
 memory and is gone at the end. It has no devices, and its limits of memory and processor are not enforced. Needs root.
 """

@@ -21,13 +21,13 @@ SETTLE_S = 0.02
 
 
 def numbered(n: int, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
-    """Frames [n, R, C] whose digits name the frame and the taxel."""
+    """Frames [n, R, C] whose raw counts identify the frame and the taxel."""
     grid = np.arange(fmt.rows * fmt.cols).reshape(fmt.rows, fmt.cols)
     return ((np.arange(first, first + n) % 97)[:, None, None] + grid).astype(fmt.digits)
 
 
 def idle_world(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -> devices.SimDevices:
-    """A world whose skin sends numbered frames and whose robot does nothing."""
+    """Devices whose skin sends numbered frames and whose robot does nothing."""
     n = min(round(seconds * fmt.rate_hz), 60_000)
     acts = [rig.Act(numbered(n, fmt), 10**9, 10**9 + 1, "")]
     world = devices.build(fmt, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
@@ -59,7 +59,7 @@ class Rigged:
     rest: bytes = b""
 
     def until(self, done: Callable[[], bool], *, limit_s: float = 60) -> list[Verdict]:
-        """Step until `done()`; fails after `limit_s` of the world's time."""
+        """Step until `done()`; fails after `limit_s` of simulated time."""
         verdicts = []
         end_ns = self.world.clock.now_ns() + limit_s * SECOND
         while not done():
@@ -70,7 +70,7 @@ class Rigged:
         return verdicts
 
     def seconds(self, s: float) -> list[Verdict]:
-        """Step for `s` seconds of the world's time."""
+        """Step for `s` seconds of simulated time."""
         end_ns = self.world.clock.now_ns() + round(s * SECOND)
         return self.until(lambda: self.world.clock.now_ns() >= end_ns)
 

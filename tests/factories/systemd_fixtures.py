@@ -1,7 +1,7 @@
 """The fixtures of the tests under a real systemd: the machine, the box installed on it, its service. In: nothing. Out: these.
 
-A test file has them with pytest_plugins = ["tests.factories.systemd_fixtures"]. The skin is simulated, in real time. PALPATE_SYSTEMD=1 makes what
-this needs (see nspawn.py) and insists on it; without, what is not there is skipped.
+A test file has them with pytest_plugins = ["tests.factories.systemd_fixtures"]. The skin is simulated, in real time.
+PALPATE_SYSTEMD=1 makes what this needs (see nspawn.py) and fails without it; else what is missing is skipped.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[nspawn.Machine
         nspawn.check()
         if not insist and not nspawn.folder().exists():
             raise Missing(
-                "no Debian for a container here; run python tests/nspawn.py (90 s, 370 MB in ~/.cache/palpate)"
+                "no Debian for a container here; run python -m tests.factories.nspawn (90 s, 370 MB in ~/.cache/palpate)"
             )
         nspawn.pack(parcel, tmp_path_factory.mktemp("source"))
         booted = nspawn.Machine(nspawn.set_up(), parcel, folder / "nspawn.log")

@@ -25,7 +25,7 @@ OUTPUTS = ("logits", "embedding")
 
 
 def window(z1: float, z2: float, fmt: SweepFormat = FORMAT) -> np.ndarray:
-    """Digits [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves."""
+    """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves."""
     level = np.array([[100 + 10 * z1, 100 + 10 * z2], [100, 100]])
     ripple = np.where(np.arange(fmt.window) % 2, 1, -1)[:, None, None]
     return np.rint(level + ripple).astype(fmt.digits)

@@ -1,5 +1,5 @@
 """Runs the fuzzing: `python -m tests.fuzz [TARGET ...] --minutes N`. In: targets, CPU minutes for each, a seed. Out: a line
-of figures for each target, the smallest corpus that covers as much, and in crashes/ whatever broke a promise.
+of figures for each target, the smallest corpus that covers as much, and in crashes/ each input that broke a promise.
 
 What it learns lies in build/fuzz/ and is taken up again by the next run, also by one after an interruption.
 """
@@ -29,7 +29,7 @@ OPTIONS = (f"-max_len={LONGEST_INPUT}", "-timeout=10", "-print_final_stats=1", "
 
 @dataclass(frozen=True, slots=True)
 class FuzzRun:
-    """What one run of libFuzzer said. coverage: places of the instrumented code. features: places with their counts."""
+    """Figures of one run of libFuzzer. coverage: places of the instrumented code. features: places with their counts."""
 
     executions: int
     coverage: int

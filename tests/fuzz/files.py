@@ -101,7 +101,7 @@ def manifest(data: bytes, folder: Path) -> None:
 
 
 def _usable(read: bundle.Manifest) -> None:
-    """What the rooms behind do with a manifest cannot fail."""
+    """What other modules do with a manifest cannot fail."""
     f = read.format
     for value in (f.rows, f.cols, f.window, read.schema, read.thresholds.dead_taxels):
         assert type(value) is int, f"{value!r} is no whole number"

@@ -1,7 +1,7 @@
-"""`python -m tests.rig build|show|shell`: makes the virtual box, shows it at work, or opens a shell in it.
+"""`python -m tests.rig build|show|shell`: builds the virtual box, shows it at work, or opens a shell in it.
 
-`ground` makes the part of it that is the same for every commit, `lacking` tells which Debian packages all that takes,
-`table` what became of the faults that the tests have made.
+`ground` builds the part that is the same for every commit, `lacking` lists the Debian packages that are missing here, and
+`table` prints what the box did at each fault that the tests have injected.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tests.rig.machine import Guest
 
 
 def show(cell: Cell, sweeps: int) -> None:
-    """Let the robot sweep, and print what it touched, what the box said, and what its lines showed."""
+    """Let the robot sweep; print what it touched, what the box answered, and the levels of its lines."""
     begun = time.monotonic()
     cell.plug()
     cell.until_ready()
@@ -37,7 +37,7 @@ def show(cell: Cell, sweeps: int) -> None:
 
 
 def shell(cell: Cell) -> None:
-    """Run lines of the keyboard in the guest, as root, while the skin streams; `sweep` makes the robot sweep."""
+    """Run lines from the keyboard in the guest, as root, while the skin streams; `sweep` makes the robot sweep."""
     cell.plug()
     print("a shell in the virtual box; `sweep` sweeps, `unplug` and `plug` do that, an empty line ends")
     while line := input("box# ").strip():
@@ -50,7 +50,7 @@ def shell(cell: Cell) -> None:
 
 
 def main() -> int:
-    """Read the arguments and do it; the exit code."""
+    """Run the command of the arguments; its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.rig", description=__doc__)
     parser.add_argument("what", choices=["build", "show", "shell", "ground", "lacking", "table"])
     parser.add_argument("--sweeps", type=int, default=6)

@@ -1,4 +1,4 @@
-"""Runs a command where arm64 programs run too. In: a command. Out: its exit code; outside nothing has changed.
+"""Runs a command in a namespace where arm64 programs run, too. In: a command. Out: its exit code; nothing else changes.
 
 The kernel hands foreign programs to an emulator that is registered in a binfmt_misc of its own: one that lives in a
 private user and mount namespace, in which all ids are mapped. Needs root, Linux 6.7 and qemu-aarch64-static.
@@ -21,24 +21,24 @@ def main(command: list[str]) -> int:
     emulator = shutil.which("qemu-aarch64-static")
     if not emulator:
         sys.exit("no qemu-aarch64-static here; apt-get install qemu-user-static")
-    ready, told = os.pipe()
-    mapped, tell = os.pipe()
+    ready_read, ready_write = os.pipe()
+    mapped_read, mapped_write = os.pipe()
     child = os.fork()
     if child == 0:
-        _inside(command, emulator.encode(), told, mapped)
-    os.read(ready, 1)
+        _inside(command, emulator.encode(), ready_write, mapped_read)
+    os.read(ready_read, 1)
     for ids in ("uid_map", "gid_map"):
         with open(f"/proc/{child}/{ids}", "w") as f:
             f.write("0 0 65536")
-    os.write(tell, b".")
+    os.write(mapped_write, b".")
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def _inside(command: list[str], emulator: bytes, told: int, mapped: int) -> None:
+def _inside(command: list[str], emulator: bytes, ready: int, mapped: int) -> None:
     """The child: into its namespaces, register the emulator, become the command."""
     libc = ctypes.CDLL(None, use_errno=True)
     _check(libc.unshare(NEW_NAMESPACES), "make namespaces")
-    os.write(told, b".")
+    os.write(ready, b".")
     os.read(mapped, 1)
     os.setresgid(0, 0, 0)
     os.setresuid(0, 0, 0)

@@ -1,5 +1,6 @@
-"""The robot cell around a guest: a robot that sweeps when it is told to, and reads sentences and lines as a controller
-would. In: a Machine. Out: answers, beside what was really touched and when.
+"""The robot cell around a guest: a robot that sweeps on request, and reads sentences and lines as a controller does.
+
+In: a Guest. Out: answers, with what was really touched and when.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ class Cell:
         self.packet_frames = 6
 
     def board(self, **arguments: Any) -> rig.Board:
-        """A board in the robot's hand: how are the arguments of sim.rig.Board (ppm, latency, serial, …)."""
+        """A board in the robot's hand; arguments: those of sim.rig.Board (ppm, latency, serial and others)."""
         usual = {"fifo_frames": FIFO, "packet_frames": self.packet_frames}
         return rig.Board(skin.FORMAT, self.hand, self.clock, **usual | arguments)
 
@@ -119,7 +120,7 @@ class Cell:
         return touch
 
     def sweep(self, timeout_s: float = ANSWER_S) -> tuple[Touch, Answer]:
-        """A whole sweep; what was done, and how the box answered it. Raises AssertionError where no answer comes."""
+        """A whole sweep; the touch and the answer of the box. Raises AssertionError if no answer comes."""
         since = len(self.serial.heard)
         touch = self.touch()
         if not touch.played.wait(BEGUN_S):
@@ -147,7 +148,7 @@ class Cell:
         return self.machine.run(f"journalctl -u palpate -n {lines} -o cat --no-pager").out
 
     def restore(self) -> None:
-        """Make the world sound again: lines low, cable and port in order, a sound skin; wait until the box is READY."""
+        """Put everything in order: lines low, cable and port working, a sound skin; wait until the box is READY."""
         for name in ("START", "STOP"):
             self.lines.set(name, False)
         self.cable.mangle, self.cable.slow_s = bytes, 0.0
@@ -157,5 +158,5 @@ class Cell:
         self.until_ready()
 
     def wait(self, seconds: float) -> None:
-        """Let the world go on."""
+        """Let time pass."""
         time.sleep(seconds)

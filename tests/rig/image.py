@@ -1,7 +1,7 @@
-"""The room that makes the virtual box. In: Debian's and Python's packages, this checkout. Out: disks, kept by their hash.
+"""Builds the virtual box. In: Debian's and Python's packages, this checkout. Out: disks, cached under their hash.
 
 Two steps. A *ground*: Debian for arm64 with its stock kernel and a virtual environment with the box's locked
-dependencies; minutes, and the same for every commit. On it a *box*: the wheel, units, rules and settings of this
+dependencies; it takes minutes and is the same for every commit. On it a *box*: the wheel, units, rules and settings of this
 checkout, installed in the running guest as a person would, and a snapshot of the guest when its service has started.
 """
 
@@ -39,7 +39,7 @@ LINES = ("START", "STOP", "READY", "FAULT", "RESULT-VALID", "CLASS-0", "CLASS-1"
 """What the kernel of the guest calls the eight lines of its PL061, by offset."""
 DISK = "2G"
 MACHINE = ("-machine", "virt,gic-version=3", "-cpu", "cortex-a72", "-smp", "2", "-m", "512", "-nic", "none")
-"""The guest's hardware as far as its device tree tells it."""
+"""The guest's hardware, as far as its device tree describes it."""
 TOOLS = {
     "qemu-system-aarch64": "qemu-system-arm", "qemu-img": "qemu-utils", "qemu-aarch64-static": "qemu-user-static",
     "mmdebstrap": "mmdebstrap", "arch-test": "arch-test", "fdtput": "device-tree-compiler", "mke2fs": "e2fsprogs",
@@ -49,7 +49,7 @@ TOOLS = {
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """Where a box lies: kernel, ramdisk and device tree, and a disk with the snapshot `ready` in it."""
+    """The files of a box: kernel, ramdisk and device tree, and a disk with the snapshot `ready` in it."""
 
     ground: Path
     disk: Path
@@ -61,18 +61,18 @@ class Image:
 
 
 def image(log: Callable[[str], None] = print) -> Image:
-    """The box of this checkout, made where it is not there. Raises Missing where that is not possible here."""
+    """The box of this checkout, built if it is not cached. Raises Missing if that is not possible here."""
     return box(ground(log), log)
 
 
 def built() -> Image | None:
-    """The box of this checkout where it has been made, else None."""
+    """The box of this checkout if it has been built, else None."""
     folder = CACHE / _box_name()
     return Image(CACHE / _ground_name(), folder / "disk.qcow2") if folder.exists() else None
 
 
 def ground(log: Callable[[str], None] = print) -> Path:
-    """Folder with vmlinuz, ramdisk, tree.dtb and disk.img, made where it is not there. Raises Missing."""
+    """Folder with vmlinuz, ramdisk, tree.dtb and disk.img, built if it is not cached. Raises Missing."""
     target = CACHE / _ground_name()
     if not target.exists():
         _need(TOOLS)
@@ -84,7 +84,7 @@ def ground(log: Callable[[str], None] = print) -> Path:
 
 
 def box(on: Path, log: Callable[[str], None] = print) -> Image:
-    """This checkout installed on a ground, made where it is not there. Raises Missing."""
+    """This checkout installed on a ground, built if it is not cached. Raises Missing."""
     target = CACHE / _box_name()
     made = Image(on, target / "disk.qcow2")
     if not target.exists():
@@ -95,7 +95,7 @@ def box(on: Path, log: Callable[[str], None] = print) -> Image:
 
 
 def lacking(tools: Iterable[str] = TOOLS) -> list[str]:
-    """Debian packages of those tools that are not here."""
+    """Debian packages of those tools that are not installed."""
     path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
     return sorted({TOOLS[name] for name in tools if not shutil.which(name, path=path)})
 

@@ -1,5 +1,5 @@
-"""What a box owes that is killed while it keeps its sweeps. In: the sentences a robot heard, the files that were found.
-Out: what is missing. And the ledger of a campaign of kills, which goes on where it was broken off.
+"""Which sweeps a box must have stored when it is killed. In: the sentences a robot heard, the files that were found.
+Out: what is missing. Also the log of a campaign of kills, which a later run continues.
 
 A kept sweep is written after its answer, in the same turn of the loop, and state sentences come after that. So one whose
 answer was heard, and after it a state sentence of the same run, must be there whole. One sweep a run may be missing:
@@ -73,7 +73,7 @@ def whole(line: str) -> list[str]:
 
 
 def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
-    """What must be there, and what may be missing; `heard` has (host ns, line) of one boot."""
+    """Answers whose sweep must be stored, and those whose sweep may be missing; heard: (host ns, line) of one boot."""
     must: list[Heard] = []
     may: list[Heard] = []
     last: Heard | None = None
@@ -89,7 +89,7 @@ def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
 
 
 def lost(heard: Iterable[tuple[int, str]], kept: list[Sweep]) -> dict[str, int]:
-    """Counts: answers with a window, how many had to be there, how many of these are not, how many others are not."""
+    """Counts: answers with a window, sweeps that must be stored, how many of these are missing, how many others are."""
     must, may = owed(heard)
     gone = [h for h in must if not any(h.fits(k) for k in kept)]
     unfinished = [h for h in may if not any(h.fits(k) for k in kept)]
@@ -97,7 +97,7 @@ def lost(heard: Iterable[tuple[int, str]], kept: list[Sweep]) -> dict[str, int]:
 
 
 class CampaignLog:
-    """build/rig/NAME.jsonl: one line an event of a campaign on this box."""
+    """build/rig/NAME.jsonl: one line for each event of a campaign on this box."""
 
     def __init__(self, name: str, box: Path) -> None:
         self._path, self._box = ROOT / "build" / "rig" / f"{name}.jsonl", box.parent.name
@@ -107,7 +107,7 @@ class CampaignLog:
             self.lines = [line for line in events if line["box"] == self._box]
 
     def add(self, **what: Any) -> None:
-        """Write an event down."""
+        """Append an event."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self.lines.append({"box": self._box} | what)
         with self._path.open("a") as f:

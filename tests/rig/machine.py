@@ -32,7 +32,7 @@ class GuestFailed(AssertionError):
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """How a shell line ended: its exit code, and what it wrote. rc 124: the time was up."""
+    """How a shell line ended: its exit code and its output. rc 124: it ran out of time."""
 
     rc: int
     out: str
@@ -163,7 +163,7 @@ class Guest:
                     raise GuestFailed(f"the guest has left during: {line}")
                 self._rest += more
         except TimeoutError as e:
-            raise GuestFailed(f"the guest said nothing for {timeout_s + START_S:.0f} s to: {line}") from e
+            raise GuestFailed(f"the guest sent nothing for {timeout_s + START_S:.0f} s to: {line}") from e
         answer, _, self._rest = self._rest.partition(b"\n")
         reply = json.loads(answer)
         done = Done(reply["rc"], base64.b64decode(reply["out"]).decode(errors="replace"))
@@ -197,7 +197,7 @@ class Guest:
         return (self._folder / "console").read_text(errors="replace")
 
     def cut(self) -> None:
-        """Cut the power: the guest does not get to say anything."""
+        """Cut the power: the guest cannot shut down."""
         self._process.kill()
         self._process.wait()
         for part in ("serial", "lines", "skin"):

@@ -1,7 +1,7 @@
-"""`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and everything they say is judged. In: hours, a seed.
-Out: one record for each box, a page with four charts, and 1 where a target was not reached.
+"""`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and each sentence is judged. In: hours, a seed.
+Out: one record for each box, a page with four charts, and exit code 1 if a target was missed.
 
-Each box has a process of its own that records it. A soak that was interrupted goes on where it was.
+Each box is recorded by a process of its own. An interrupted soak is continued by the next run.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
 Clock = Callable[[], float]
 WAIT_S, SAMPLE_S, MINUTE_S = 0.2, 10.0, 60.0
 SILENT_S = 60.0
-"""A box that says nothing for so long has gone; one that is well says its state each second."""
+"""A box that sends nothing for this long is gone; a working one sends its state each second."""
 GRACE_S = 5.0
 """While a soak goes on, an answer may take so long after its stop edge; at the end, all are awaited."""
 MARGIN_S = 0.5
-"""A box is stopped so far inside a sweep, so that there is no doubt whether this sweep had begun."""
+"""A box is stopped this far inside a sweep, so that it is certain that the sweep had begun."""
 NOTED = 200
 """Faults of a run that are written out; what goes on failing would fill the disk."""
 
 
 class Recorder:
-    """Writes the record of a run from what a box says and from looks at its process. clock: tells seconds, monotonic."""
+    """Writes the record of a run from the sentences of a box and samples of its process. clock: monotonic seconds."""
 
     def __init__(self, box: BoxUnderTest, run: SoakRun, sweeps: Script, clock: Clock) -> None:
         self.run = run
@@ -67,14 +67,14 @@ class Recorder:
             for line in self._box.heard(WAIT_S):
                 self.hear(*line)
             if now_s - self._heard_s > SILENT_S:
-                raise Gone(f"the box has said nothing for {now_s - self._heard_s:.0f} s")
+                raise Gone(f"the box has sent nothing for {now_s - self._heard_s:.0f} s")
             if now_s - self._looked_s >= SAMPLE_S:
                 self._looked_s += SAMPLE_S
                 self._look(now_s)
             self.run.length_s = round(self._clock() - self._begun_s, 1)
 
     def sweeping(self) -> bool:
-        """Whether a sweep is under way, beyond doubt."""
+        """Whether a sweep is certainly under way."""
         now_s = self._clock()
         (_, stops), (starts, _) = self._box.edges(now_s + MARGIN_S), self._box.edges(now_s - MARGIN_S)
         return starts > stops
@@ -241,7 +241,7 @@ def draw(work: Path, out: Path) -> bool:
         for what, wanted, came, met in soak_judge.targets(box["sums"]):
             mark = {True: "ok  ", False: "FAIL", None: "    "}[met]
             print(
-                f"{mark} {name:<13} {what}: {came} (wanted {wanted}){'' if met is not None else ', too short to tell'}"
+                f"{mark} {name:<13} {what}: {came} (wanted {wanted}){'' if met is not None else ', too short to judge'}"
             )
             reached &= met is not False
     return reached and bool(records)

@@ -1,5 +1,5 @@
-"""The room of boxes under test. In: a script of sweeps. Out: a box at work in real time: what it says, what was done to it,
-what its process takes.
+"""Boxes under test. In: a script of sweeps. Out: a box at work in real time: its sentences, the edges that it was given, and
+the resources of its process.
 
 One is the installed command on this machine with the simulated skin, its serial line a pseudo-terminal; the other the
 virtual box, with its skin, lines and serial port on real buses of the guest.
@@ -35,13 +35,13 @@ from appliance.tools.score import Answer
 from tests.rig.soak_judge import short_answer
 
 STOP_S = 30
-"""Longest wait for a box to end after it was told to."""
+"""Longest wait for a box to end after SIGTERM."""
 TICKS = os.sysconf("SC_CLK_TCK")
 SMAPS = re.compile(r"^(Rss|Pss): +(\d+) kB", re.M)
 
 
 class Gone(AssertionError):
-    """The box has ended though nobody told it to."""
+    """The box has ended by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class BoxUnderTest(Protocol):
         ...
 
     def stop(self) -> list[tuple[float, str]]:
-        """Tell it to end, and wait for that; the last lines. Raises Gone where it does not end well."""
+        """End it and wait for that; the last lines. Raises Gone if it does not end with 0."""
         ...
 
     def close(self) -> None:
@@ -126,7 +126,7 @@ class BoxUnderTest(Protocol):
 
 
 def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, int]:
-    """A process from the texts of /proc/PID/smaps_rollup and /proc/PID/stat, as `BoxUnderTest.process` tells it."""
+    """A process from the texts of /proc/PID/smaps_rollup and /proc/PID/stat, as `BoxUnderTest.process` returns it."""
     kib = dict(SMAPS.findall(smaps))
     fields = stat.rpartition(")")[2].split()
     cpu_s = (int(fields[11]) + int(fields[12])) / TICKS
@@ -218,7 +218,7 @@ class ThisMachine:
             smaps, stat = ((place / name).read_text() for name in ("smaps_rollup", "stat"))
             return process(smaps, stat, len(os.listdir(place / "fd")))
         except (OSError, KeyError) as e:
-            raise Gone(f"the box cannot be looked at: {e}; it said {self._log_text()!r}") from e
+            raise Gone(f"the process of the box cannot be read: {e}; its log ends {self._log_text()!r}") from e
 
     def about(self) -> Mapping[str, Any]:
         """As BoxUnderTest."""
@@ -234,7 +234,7 @@ class ThisMachine:
         self._box.terminate()
         lines = list(self._until_ended())
         if self._box.poll() != 0:
-            raise Gone(f"the box was told to end, and ended with {self._box.poll()}: {self._log_text()}")
+            raise Gone(f"the box ended after SIGTERM with {self._box.poll()}: {self._log_text()}")
         return lines
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The virtual box under test. In: a script of sweeps. Out: what the guest says, what was done to it, what its process takes.
+"""The virtual box under test. In: a script of sweeps. Out: sentences of the guest, edges given to it, resources of its process.
 
 The skin hangs on the guest's USB port, the robot drives its lines, and sentences come over its serial port: the way of a
 real box. Only what it takes of memory is asked for inside.
@@ -163,7 +163,7 @@ class VirtualBox:
         try:
             self._guest.run("systemctl stop palpate", timeout_s=60, check=True)
         except (GuestFailed, OSError) as e:
-            raise Gone(f"the box was told to end: {e}") from e
+            raise Gone(f"the box did not end in order: {e}") from e
         return self.heard(1.0)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The room that judges a soak. In: what a recorder wrote of one box. Out: sums with intervals, and which targets they meet.
+"""Judges a soak. In: the record of one box. Out: sums with intervals, and which targets they meet.
 
 Pure: nothing is read, started or timed here, so that a made-up record is judged like a real one.
 """
@@ -32,7 +32,7 @@ IN_FLIGHT = 12
 LOOKS = 6
 """Samples, a minute of them, of which the least `behind` counts: a box that is late for a while has lost nothing."""
 SECURE_MIN = 10
-"""Minutes that the second half must have before growth or flatness is told."""
+"""Minutes that the second half must have before growth or flatness is judged."""
 
 
 @dataclass(slots=True)
@@ -78,7 +78,7 @@ def kind(status: str, label: str, touched: str) -> str:
 
 
 def short_answer(status: str, label: str) -> str:
-    """An answer in a word: the label where it is sure, else the status."""
+    """An answer in a word: the label if the status is ok, else the status."""
     return label if status == Status.OK else status
 
 

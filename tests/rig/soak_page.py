@@ -1,4 +1,4 @@
-"""The room that draws a soak. In: records with their sums. Out: a page and its picture of four charts over time.
+"""Draws a soak. In: records with their sums. Out: a page and its picture of four charts over time.
 
 Nothing is computed here but what a chart needs; every sentence with a number takes it from the sums.
 """
@@ -34,7 +34,7 @@ LOOKS = {"color": ACCENT, "linewidth": 1.8}, {"color": INK, "linewidth": 1.4, "l
 """Of the boxes; where both do the same, one shows through the other."""
 DOTS = 1500
 """Dots of a chart; of more sweeps the slowest of each few is drawn."""
-MARKS = {True: "reached", False: "not reached", None: "too short to tell"}
+MARKS = {True: "reached", False: "not reached", None: "too short to judge"}
 
 
 def tell(results: Json) -> tuple[str, str]:
@@ -68,7 +68,7 @@ def drawn(results: Json, picture: str) -> str:
     names = " and ".join(f"{_the(name)} {'dashed' if i else 'in blue'}" for i, name in enumerate(results["boxes"]))
     return html.heading("Over time") + html.figure(
         picture,
-        f"{names[:1].upper()}{names[1:]}. Memory is resident memory, latency the box's own figure for each sweep, loss all "
+        f"{names[:1].upper()}{names[1:]}. Memory is resident memory, latency the figure that the box reports for each sweep, loss all "
         "frames of a minute that never came, and the band is where the count of wrong verdicts lies in 95 % of cases if the box "
         "errs as often as its network by itself does on the same sweeps.",
     )
@@ -86,7 +86,7 @@ def figures(results: Json) -> str:
         *((f"answered {name}", lambda s, n=name: f"{s['statuses'].get(n, 0):,}") for name in statuses),
         ("other than the network by itself", lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}"),
         ("frames received", lambda s: f"{s['received']:,}"),
-        ("frames lost, told by the box", lambda s: f"{s['lost']:,}"),
+        ("frames lost, reported by the box", lambda s: f"{s['lost']:,}"),
         ("not accounted for", lambda s: f"{s['unaccounted']:,}"),
         ("bytes of no packet", lambda s: f"{s['garbage']:,}"),
         ("enumerations", lambda s: f"{s['enumerations']}"),
@@ -103,7 +103,7 @@ def figures(results: Json) -> str:
     return html.heading("Sums") + html.table(["", *results["boxes"]], rows, texts=(0,)) + html.text(
         "Shares with 95 % Wilson intervals. Refused are all answers without a label, such as unknown, and count neither as right "
         f"nor as wrong. Memory is flat where the 95 % interval of its slope ends below {GROWTH_KIB_H:g} KiB an hour, a bound set "
-        f"before the first run, and told only of second halves of {SECURE_MIN} minutes or more. Frames that the board "
+        f"before the first run, and judged only on second halves of {SECURE_MIN} minutes or more. Frames that the board "
         f"took and the box counted neither as received nor as lost are not accounted for; {IN_FLIGHT} may be on their way.",
     )  # fmt: skip
 

@@ -1,6 +1,6 @@
-"""What a robot checks around a fault: that the box came back by itself, and that no answer names what was not touched.
+"""What a robot checks around a fault: the box recovers by itself, and no answer names a material that was not touched.
 
-In: a cell. Out: right sweeps, state fields, or AssertionError with what the box says.
+In: a cell. Out: right sweeps, state fields, or AssertionError with the journal of the box.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def not_wrong(touch: Touch, answer: Answer) -> str:
     return answer.status
 
 
-def comes_back(cell: Cell) -> None:
+def check_recovers(cell: Cell) -> None:
     """READY by itself, then a right sweep. Raises AssertionError where that does not come."""
     received = []
     for _ in range(TRIES):

@@ -15,7 +15,7 @@ import pytest
 from appliance.sim import script
 from appliance.tools.score import Answer
 from tests.rig.cell import Cell, Touch
-from tests.rig.sound import comes_back, known, let_go, not_wrong, until
+from tests.rig.sound import check_recovers, known, let_go, not_wrong, until
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]
@@ -52,7 +52,7 @@ WIDTHS_S = (0.0005, 0.001, 0.002, 0.005)
 
 @pytest.fixture(scope="module", autouse=True)
 def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: what is asked here is not how fast it goes."""
+    """Sweeps whose answer is known, and large packets: speed does not matter here."""
     shared.acts, shared.packet_frames = known(script.tubes(3)), 18
 
 
@@ -182,7 +182,7 @@ def test_stop_is_stuck(cell: Cell, count: Count, note: Note) -> None:
         assert statuses(cell, since, level + 1)[level:] == ["long"]
         assert cell.lines.wait("READY", True, 5)
         cell.lines.set("STOP", False)
-        comes_back(cell)
+        check_recovers(cell)
     note("STOP stuck, low and high", "long, then right", len(levels))
 
 
@@ -196,13 +196,13 @@ def test_storm(cell: Cell, note: Note) -> None:
     cell.serial.wait_for("$PPLP,STA,", 5, len(cell.serial.heard))
     seen = Counter(answer.status for answer in cell.answers(since))
     assert seen.keys() <= {"no-stop", "short", "no-start", "edges-lost", "not-ready"}, seen
-    comes_back(cell)
+    check_recovers(cell)
     results = ", ".join(f"{n} {status}" for status, n in seen.most_common())
     note("storm of 10,000 edges", f"{results or 'nothing'}; then a right verdict", 1)
 
 
 def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
-    """Start and stop in one turn are told in order; of more than the kernel holds, `edges-lost`; then all is well."""
+    """Start and stop in one turn are answered in order; of more than the kernel holds, `edges-lost`; then all is well."""
     since = len(cell.serial.heard)
     with halted(cell):
         pulse(cell, "START")
@@ -219,7 +219,7 @@ def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
     cell.state()
     outcomes = [answer.status for answer in cell.answers(since)]
     assert outcomes in (["edges-lost"], ["not-ready", "edges-lost"])
-    comes_back(cell)
+    check_recovers(cell)
     note("event queue overrun", f"{', '.join(outcomes)}; then a right verdict", 1)
 
 

@@ -32,7 +32,7 @@ HOLD = "import fcntl, sys, termios, time; f = open(sys.argv[1]); fcntl.ioctl(f, 
 
 @pytest.fixture(scope="module", autouse=True)
 def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: what is asked here is not how fast it goes."""
+    """Sweeps whose answer is known, and large packets: speed does not matter here."""
     shared.acts, shared.packet_frames = known(script.tubes(4)), 18
 
 
@@ -155,7 +155,7 @@ def test_another_program_and_an_adapter(cell: Cell, tmp_path: Path, count: Count
     assert far.heard == []
     cell.machine.run("kill $(cat /run/holder)", check=True)
     far.wait_for("$PPLP,STA,", 10)
-    note("port held by another program", "told, taken when it is free; it is refused to others", 1)
+    note("port held by another program", "reported, taken when it is free; it is refused to others", 1)
     assert "busy" in tries(cell, ADAPTER)
     times = count(2, 30)
     for i in range(times):

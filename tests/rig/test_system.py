@@ -1,5 +1,5 @@
 """The system around the box fails: disk, clock, processor, memory, settings, bundle, permissions. In: a guest whose
-service keeps its sweeps on small file systems. Out: answers as ever, what is lacking told once, recovery by itself.
+service keeps its sweeps on small file systems. Out: answers as before, what is missing logged once, recovery without help.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def keeping(shared: Cell) -> Cell:
 
 @pytest.fixture
 def box(keeping: Cell, cell: Cell) -> Cell:
-    """That guest, READY, with room for a few sweeps."""
+    """That guest, READY, with space for a few sweeps."""
     cell.machine.run(ROOM.format("1m", 1000, KEPT), check=True)
     return cell
 
@@ -93,7 +93,7 @@ def until_logged(cell: Cell, text: str, since: int = 0, timeout_s: float = START
     """Wait until more than `since` lines hold it."""
     end = time.monotonic() + timeout_s
     while journal_count(cell, text) <= since:
-        assert time.monotonic() < end, f"the box has not said {text!r}, but: {cell.journal()}"
+        assert time.monotonic() < end, f"the box has not logged {text!r}, but: {cell.journal()}"
         time.sleep(1)
 
 
@@ -109,7 +109,7 @@ def used_k(cell: Cell) -> int:
 
 
 def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
-    """Room for n pages, or for no file: every sweep is answered, the first is told, nothing stays but what was whole."""
+    """Space for n pages, or for no file: every sweep is answered, the first failure is logged, and only whole files stay."""
     empty = used_k(box)
     sound(box)
     before, used = files(box), used_k(box)
@@ -125,11 +125,15 @@ def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
     box.machine.run(ROOM.format("1m", 1000, KEPT), check=True)
     sound(box)
     assert files(box).items() > before.items()
-    note("disk full while a sweep is kept (ENOSPC at each page, no inode)", "answered; told; nothing half", len(limits))
+    note(
+        "disk full while a sweep is kept (ENOSPC at each page, no inode)",
+        "answered; logged; no partial file",
+        len(limits),
+    )
 
 
 def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., None]):
-    """The capture's disk is full: told once, it ends, sweeps go on, and what it holds can be played."""
+    """The capture's disk is full: logged once, it ends, sweeps go on, and what it holds can be played."""
     until_logged(box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here")
     sound(box)
     assert journal_count(box, "capture:") == journal_count(box, "it ends here") == 1
@@ -141,12 +145,12 @@ def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., N
         play.edges(play.now_ns())
         play.commands()
     assert frames > 750
-    note("disk full while a capture is written", "ends there, told once; what was written plays", 1)
+    note("disk full while a capture is written", "ends there, logged once; what was written plays", 1)
 
 
 @needs_time
 def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
-    """No room for the journal nor anywhere else: sweeps and plugs go on; it is written again when there is room."""
+    """No space for the journal nor anywhere else: sweeps and plugs go on; it is written again when there is space."""
     fill = "fallocate -l $(df --output=avail -B1 {0} | tail -1) {0}/fill; dd if=/dev/zero of={0}/fill2 2>/dev/null;"
     try:
         box.machine.run(fill.format("/run") + fill.format("/var"), timeout_s=200)
@@ -162,7 +166,7 @@ def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
     until_logged(box, "skin: ", logged)
     box.plug()
     box.until_ready()
-    note("no room on any disk, journal included", "answered; replugged skin taken; journal goes on", 1)
+    note("no space on any disk, journal included", "answered; replugged skin taken; journal goes on", 1)
 
 
 def test_clock_set(box: Cell, note: Callable[..., None]):
@@ -249,7 +253,7 @@ def test_permission_lost(box: Cell, note: Callable[..., None]):
     guest.run(f"chown palpate {KEPT}", check=True)
     sound(box)
     assert files(box).items() > before.items()
-    note("permission lost: device node, folder", "denied and not-ready, or told; used again when given back", 3)
+    note("permission lost: device node, folder", "denied and not-ready, or logged; used again when given back", 3)
 
 
 @needs_time

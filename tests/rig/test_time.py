@@ -35,14 +35,14 @@ seconds, which looks as if the board's clock drifted.
 SLOPE_PPM, SPAN_S = 200, 20
 """What appliance.core.clock.DeviceClock takes for possible, and how far it looks back."""
 LONGEST_WAY_NS = 5_000_000
-"""From a frame to the program by the shortest way, in an emulator: the box cannot tell it from the clock's offset."""
+"""From a frame to the program by the shortest way, in an emulator: the box cannot separate it from the clock's offset."""
 CASES = {
     "80 ppm fast, latency spikes": 80,
     "80 ppm slow, latency spikes": -80,
     "500 ppm fast, latency spikes": 500,
     "500 ppm slow, latency spikes": -500,
 }
-TELL = """
+REPORT_TIME = """
 import os, struct, time
 port = os.open("/dev/virtio-ports/palpate.bench", os.O_RDWR)
 while True:
@@ -66,8 +66,8 @@ class GuestClock:
     """Asks the guest for its time. Each trip's answer was read between its two ends, so the offset lies in all of them."""
 
     def __init__(self, machine: Guest) -> None:
-        machine.put("/run/tell.py", TELL.encode())
-        machine.run("python3 /run/tell.py < /dev/null > /dev/null 2>&1 &", check=True)
+        machine.put("/run/report_time.py", REPORT_TIME.encode())
+        machine.run("python3 /run/report_time.py < /dev/null > /dev/null 2>&1 &", check=True)
         self._port = machine.bench()
         self._port.settimeout(60)
 

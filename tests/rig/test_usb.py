@@ -17,7 +17,7 @@ import pytest
 from appliance.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
-from tests.rig.sound import begin, comes_back, known, let_go, not_wrong, only_answer, state, until, until_state
+from tests.rig.sound import begin, check_recovers, known, let_go, not_wrong, only_answer, state, until, until_state
 from tests.rig.usbredir import UsbRedirPeer
 
 Count = Callable[[int, int], int]
@@ -34,7 +34,7 @@ RESETS = {
 
 @pytest.fixture(scope="module", autouse=True)
 def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: what is asked here is not how fast it goes."""
+    """Sweeps whose answer is known, and large packets: speed does not matter here."""
     shared.acts, shared.packet_frames = known(script.tubes(2)), 18
 
 
@@ -83,12 +83,12 @@ def test_pulled_and_put_back(cell: Cell, count: Count, note: Note, when: Callabl
         cell.until_ready()
         assert int(state(cell)["enumerations"]) > had
         if i % 5 == 4:
-            comes_back(cell)
+            check_recovers(cell)
     note(f"skin unplugged and replugged {when.__name__} a sweep", f"{dict(outcomes)}; back each time", n)
 
 
 def test_other_boards(cell: Cell, count: Count, note: Note):
-    """Another serial number streams and is told by ID; another format or protocol is refused, until a fitting one comes."""
+    """Another serial number streams and is reported by ID; another format or protocol is refused, until a fitting one comes."""
     cell.plug(cell.board(serial="SIM0002"))
     cell.until_ready()
     assert " SIM0002 " in cell.serial.ask("$PPLP,ID")
@@ -110,8 +110,8 @@ def test_other_boards(cell: Cell, count: Count, note: Note):
         assert cell.lines.levels["FAULT"]
         assert hint in cell.journal(2)
     cell.plug()
-    comes_back(cell)
-    note("skin of another serial number", "streams, ID tells it", 1)
+    check_recovers(cell)
+    note("skin of another serial number", "streams, reported by ID", 1)
     note(
         "skin of another format or protocol version", "mismatch; the next fitting one is taken up", count(2, len(unfit))
     )
@@ -130,7 +130,7 @@ def test_resets(cell: Cell, count: Count, note: Note, what: str):
         until(touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
         outcomes[status] += 1
-        comes_back(cell)
+        check_recovers(cell)
     note(what, f"{dict(outcomes)}; back each time", n)
 
 
@@ -156,7 +156,7 @@ def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[UsbRedirPeer]:
 def test_behind_a_hub(cell: Cell, behind_a_hub: UsbRedirPeer, count: Count, note: Note):
     """The hub that the skin hangs on is reset, or pulled out with it, in mid sweep: the sweep is lost, no more than that."""
     behind_a_hub.plug(cell.board())
-    comes_back(cell)
+    check_recovers(cell)
     n = count(1, 3)
     for _ in range(n):
         touch, since = begin(cell)
@@ -172,5 +172,5 @@ def test_behind_a_hub(cell: Cell, behind_a_hub: UsbRedirPeer, count: Count, note
     let_go(cell)
     assert cell.lines.wait("FAULT", True, 20)
     cell.cable.plug(cell.board())
-    comes_back(cell)
+    check_recovers(cell)
     note("hub pulled out, skin plugged in elsewhere", "sensor-lost; taken up at the other port", 1)

@@ -17,7 +17,7 @@ from appliance.io import packets
 from appliance.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
-from tests.rig.sound import begin, comes_back, known, not_wrong, only_answer, state, until, until_state
+from tests.rig.sound import begin, check_recovers, known, not_wrong, only_answer, state, until, until_state
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]
@@ -43,7 +43,7 @@ class Fault:
 
 
 def changed(change: Callable[[packets.Packet], tuple[int, int]]) -> Callable[[], Mangle]:
-    """Transfers whose packets have another number and another time, as `how` says; all else is right, the CRC too."""
+    """Transfers whose packets have another number and another time, as `change` gives them; all else is right, the CRC too."""
 
     def mangle(data: bytes) -> bytes:
         packet = packets.unpack(data).packets[0]
@@ -130,7 +130,7 @@ class Cable:
 
 @pytest.fixture(scope="module", autouse=True)
 def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: what is asked here is not how fast it goes."""
+    """Sweeps whose answer is known, and large packets: speed does not matter here."""
     shared.acts, shared.packet_frames = known(script.tubes(2)), 18
 
 
@@ -154,7 +154,7 @@ def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: s
             assert int(state(cell)[fault.counter]) > had
         cell.until_ready()
     if HOW == "full":
-        comes_back(cell)
+        check_recovers(cell)
     note(what, f"{dict(outcomes)}; back each time", n)
 
 
@@ -170,7 +170,7 @@ def test_a_skin_that_stops_sending(cell: Cell, count: Count, note: Note, what: s
         cell.cable.silent = False
         until(touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
-        comes_back(cell)
+        check_recovers(cell)
         assert not cell.cable.halted
     note(f"skin {what} while streaming", "sensor-lost; started again by itself", n)
 
@@ -203,5 +203,5 @@ def test_a_skin_that_answers_slowly(cell: Cell, count: Count, note: Note):
     cell.unplug()
     cell.cable.slow_s = count(1, 25) / 100
     cell.plug()
-    comes_back(cell)
+    check_recovers(cell)
     note(f"skin answers after {cell.cable.slow_s} s", "taken up", 1)

@@ -15,7 +15,7 @@ import pytest
 from appliance.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
-from tests.rig.sound import comes_back, known, state, until_state
+from tests.rig.sound import check_recovers, known, state, until_state
 from tests.rig.usbredir import Descriptors
 
 Note = Callable[[str, str, int], None]
@@ -89,7 +89,7 @@ QUIET_S, LOOK_S = 1.0, 30
 
 @pytest.fixture(scope="module", autouse=True)
 def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: what is asked here is not how fast it goes."""
+    """Sweeps whose answer is known, and large packets: speed does not matter here."""
     shared.acts, shared.packet_frames = known(script.tubes(2)), 18
 
 
@@ -122,6 +122,6 @@ def test_hostile_descriptors(cell: Cell, note: Note):
         assert "streaming" not in seen or what in HARMLESS, seen
         note(f"descriptor with {what}", " or ".join(sorted(seen)), 1)
     cell.plug()
-    comes_back(cell)
+    check_recovers(cell)
     assert service(cell) == running
     assert "Traceback" not in cell.journal(400)

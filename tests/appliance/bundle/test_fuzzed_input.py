@@ -61,7 +61,7 @@ BROKE = {
 }
 
 
-def replay(target: str, folder: Path) -> None:
+def check_inputs(target: str, folder: Path) -> None:
     """All known inputs of a target."""
     for data in INPUTS[target]:
         targets.TARGETS[target](data, folder)
@@ -70,7 +70,7 @@ def replay(target: str, folder: Path) -> None:
 @pytest.mark.parametrize("target", TARGETS)
 def test_what_was_found_still_holds(target: str, tmp_path: Path) -> None:
     """Seeds, saved corpus and former crashes keep every promise."""
-    replay(target, tmp_path)
+    check_inputs(target, tmp_path)
 
 
 def test_each_crash_is_explained() -> None:
@@ -133,7 +133,7 @@ def taken(target: str, data: bytes, folder: Path) -> bool:
 @pytest.mark.parametrize("target", TARGETS)
 def test_the_corpus_reaches_what_lies_behind_the_checks(target: str, tmp_path: Path) -> None:
     """Several inputs are taken and several refused: a corpus of nothing but broken files would prove little."""
-    replay(target, tmp_path)  # puts beside a manifest what belongs there
+    check_inputs(target, tmp_path)  # puts beside a manifest what belongs there
     count = sum(taken(target, data, tmp_path) for data in INPUTS[target])
     assert 2 <= count < len(INPUTS[target]) - 2
 
@@ -252,7 +252,7 @@ def test_each_promise_can_be_seen_broken(
     """A room that is broken on purpose is found by the known inputs."""
     monkeypatch.setattr(room, name, broken)
     with pytest.raises((AssertionError, ApplianceError)):
-        replay(target, tmp_path)
+        check_inputs(target, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -270,7 +270,7 @@ def test_another_error_is_not_kept_back(
 
     monkeypatch.setattr(room, name, broken)
     with pytest.raises(ZeroDivisionError, match="broken"):
-        replay(target, tmp_path)
+        check_inputs(target, tmp_path)
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -284,5 +284,5 @@ def test_changes_keep_the_form(target: str, tmp_path: Path) -> None:
     made = [MUTATORS[target](data, Random(seed), plain) for seed in range(100)]
     assert made == [MUTATORS[target](data, Random(seed), plain) for seed in range(100)]
     assert len(set(made)) > 2
-    replay(target, tmp_path)
+    check_inputs(target, tmp_path)
     assert sum(taken(target, data, tmp_path) for data in made) > 25

@@ -132,7 +132,7 @@ class Reader:
 def check_content(u: Backend, frames: Frames) -> None:
     """Each frame holds what the skin has taken under that number."""
     if "numbered" in u.can:
-        assert (frames.taxels == skins.digits(frames.seq, u.format)).all()
+        assert (frames.taxels == skins.counts(frames.seq, u.format)).all()
 
 
 def test_streams_without_a_gap(need: Need):

@@ -126,10 +126,12 @@ def test_text_of_a_device_is_no_message(socket_end: ManagerSocket):
 
 def test_without_a_socket_nothing_is_sent(monkeypatch: pytest.MonkeyPatch):
     """Started by hand: no socket is even made."""
-    monkeypatch.delattr(socket, "socket")
+    made: list[object] = []
+    monkeypatch.setattr(socket, "socket", lambda *args: made.append(args))
     sender = Notifier(rig.VirtualClock(), WATCHDOG)
     sender.turn(state(True, "fine"))
     sender.stopping()
+    assert made == []
 
 
 def test_a_socket_that_is_gone_costs_nothing(socket_end: ManagerSocket, tmp_path: Path):

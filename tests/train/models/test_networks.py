@@ -49,7 +49,7 @@ def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> neura
     return method(name, effort).train(s, s.samples, seed)
 
 
-def agrees(model: neural_methods.NetworkModel, samples: np.ndarray) -> None:
+def check_agrees(model: neural_methods.NetworkModel, samples: np.ndarray) -> None:
     """The graph in the box's session gives the logits of the model, which are finite."""
     want = model.logits(samples)
     assert want.dtype == np.float32
@@ -139,8 +139,8 @@ def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str
     s = made(shape, dtype, classes)
     model = train(name, s)
     assert model.logits(s.samples[:5]).shape == (5, classes)
-    agrees(model, s.samples[:3])
-    agrees(model, np.zeros_like(s.samples[:1]))
+    check_agrees(model, s.samples[:3])
+    check_agrees(model, np.zeros_like(s.samples[:1]))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -157,7 +157,7 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
         torch.manual_seed(0)
         form, plain = skin.FORMAT, network.Compact(skin.FORMAT, 6, 0.1, norm=False)
         net = build(form, 6, digits) if build else plain
-    agrees(neural_methods.NetworkModel(net.eval(), ""), digits)
+    check_agrees(neural_methods.NetworkModel(net.eval(), ""), digits)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -199,17 +199,17 @@ def test_a_material_that_never_came_is_never_given(name: str):
     assert z.shape == (len(s), 3)
     assert softmax(z)[:, 1].max() < 1e-12
     np.testing.assert_allclose(z[:, [0, 2]].sum(1), 0, atol=1e-4)
-    agrees(model, s.samples[:2])
+    check_agrees(model, s.samples[:2])
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_small_sets_are_trained_whole(name: str):
     """Two recordings of one sweep each cannot be parted; one position alone does not forbid parting by recording."""
     tiny = easy(2)
-    agrees(train(name, tiny), tiny.samples)
+    check_agrees(train(name, tiny), tiny.samples)
     one = easy(6)
     one.groups["position"] = np.zeros(len(one), int)
-    agrees(train(name, one), one.samples[:2])
+    check_agrees(train(name, one), one.samples[:2])
     with pytest.raises(FormatError, match="only one class, 'low'"):
         train(name, easy(4).take(np.arange(4)))
 
@@ -220,7 +220,7 @@ def test_one_sweep_of_each_is_too_little_for_a_discriminant():
     with pytest.raises(FormatError, match="3 sweeps of as many materials are too few for a linear discriminant"):
         closed_form_head(one, labels, one, labels)
     for name in ("compact", "recurrent"):
-        agrees(train(name, easy(1)), easy(1).samples)
+        check_agrees(train(name, easy(1)), easy(1).samples)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -232,7 +232,7 @@ def test_silence_is_no_trouble(name: str):
     z = model.logits(dumb.samples)
     assert np.isfinite(z).all()
     assert np.ptp(z, axis=0).max() == 0
-    agrees(model, s.samples[:2])
+    check_agrees(model, s.samples[:2])
 
 
 def test_probabilities_come_from_what_was_held_out():
@@ -264,7 +264,7 @@ def test_a_window_too_short_is_named():
     with pytest.raises(FormatError, match="a window of 7 frames is too short"):
         train("compact", s)
     for name in NETS:
-        agrees(train(name, s), s.samples[:1])
+        check_agrees(train(name, s), s.samples[:1])
 
 
 def test_bfloat16_is_used_where_it_is_asked_for_and_there():
