@@ -82,9 +82,9 @@ machines: $(DESKTOP) ## the same bundles on older x86 and on arm64 (emulated; ge
 types: $(DESKTOP) ## mypy --strict
 	$(BIN)/mypy
 
-bench: $(DESKTOP) ## measure this machine; the figures go to build/bench.json
-	@mkdir -p build
-	$(BIN)/palpate bench --json build/bench.json
+bench: $(DESKTOP) ## measure this machine: docs/bench.json, and the tables of README and manual
+	$(BIN)/palpate bench --json docs/bench.json
+	$(BIN)/palpate-train bench-table docs/bench.json README.md docs/manual.md
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build

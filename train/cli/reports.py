@@ -1,4 +1,4 @@
-"""The commands that write pages and pictures: paper, chart, matrix, overview."""
+"""The commands that write pages and pictures: paper, chart, matrix, overview, bench-table."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.cli import options
 from train.cli.options import Add
-from train.reports import chart_report, overview_plot, paper_experiment, plots
+from train.reports import bench_table, chart_report, overview_plot, paper_experiment, plots
 
 
 def register(add: Add) -> None:
-    """paper, chart, matrix, overview."""
+    """paper, chart, matrix, overview, bench-table."""
     one = add("paper", run_paper, "run the paper's experiment on the simulated skin and tell it as a page")
     one.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
     one.add_argument(
@@ -44,6 +44,9 @@ def register(add: Add) -> None:
         "--out", type=Path, default=Path("docs/overview.svg"), metavar="FILE.svg", help="(docs/overview.svg)"
     )
     four.add_argument("--material", default="wood", metavar="NAME", help="of the tube (wood)")
+    five = add("bench-table", run_bench_table, "write the figures of make bench into the tables of documents")
+    five.add_argument("figures", type=Path, metavar="FILE", help="of palpate bench --json")
+    five.add_argument("documents", type=Path, nargs="+", metavar="FILE.md", help="each with <!-- bench --> markers")
 
 
 def run_paper(args: argparse.Namespace) -> None:
@@ -84,3 +87,10 @@ def run_overview(args: argparse.Namespace) -> None:
     """The picture's name."""
     put(args.out, overview_plot.draw(args.material).encode(), parents=True)
     print(args.out)
+
+
+def run_bench_table(args: argparse.Namespace) -> None:
+    """The table is printed, and stands in each document."""
+    figures = bench_table.read(args.figures)
+    bench_table.write(figures, args.documents)
+    print(bench_table.table(figures))

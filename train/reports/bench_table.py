@@ -1,0 +1,103 @@
+"""The table of the box's figures in README and manual. In: docs/bench.json, which `palpate bench --json` wrote. Out: the
+table in Markdown, and documents with it between the markers BEGIN and END.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+
+Json = dict[str, Any]
+BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
+
+
+def read(path: Path) -> Json:
+    """The figures in `path`. Raises FormatError where these are not those of a whole bench."""
+    try:
+        figures: Json = json.loads(path.read_bytes())
+        table(figures)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
+        raise FormatError(f"{path} does not hold the figures of a bench: {e!r}; run `make bench`") from e
+    return figures
+
+
+def table(figures: Json) -> str:
+    """The figures as a table with a caption, in Markdown. Raises KeyError where one is missing."""
+    rows = [f"| {what} | {value} |" for what, value in _rows(figures)]
+    return "\n".join([_caption(figures), "", "| what | measured |", "|---|---|", *rows])
+
+
+def insert(text: str, figures: Json, name: str) -> str:
+    """`text` with the table between its markers. Raises FormatError, naming the document, where they are not there once."""
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end or BEGIN in after:
+        raise FormatError(f"{name} has not one pair of markers {BEGIN} and {END}; put them where the table belongs")
+    return f"{before}{BEGIN}\n{table(figures)}\n{END}{after}"
+
+
+def write(figures: Json, documents: list[Path]) -> None:
+    """Write the table into each document."""
+    for path in documents:
+        put(path, insert(path.read_text(encoding="utf-8"), figures, str(path)).encode())
+
+
+def _caption(figures: Json) -> str:
+    machine, load = figures["machine"], figures["load_average"]
+    return (
+        f"Measured by `make bench` with the simulated skin, on {machine['cores']} cores of {machine['processor'] or 'a machine'} "
+        f"({machine['arch']}, {machine['system']}, Python {machine['python']}, onnxruntime {machine['onnxruntime']}), one "
+        f"thread; {figures['date']}, commit {figures['commit']}, seed {figures['seed']}, bundle {figures['bundle']}. Load "
+        f"average of the machine, which other work shares: {load['before'][0]:.1f} before, {load['after'][0]:.1f} after."
+    )
+
+
+def _rows(figures: Json) -> Iterator[tuple[str, str]]:
+    """What was measured, and its figure."""
+    accuracy, inference, memory = figures["accuracy"], figures["inference_ms"], figures["rss_mb"]
+    right, n = accuracy["right"], accuracy["total"]
+    low, high = (100 * value for value in accuracy["interval"])
+    growth = round(memory["growth_next_900"], 1) + 0.0  # 0 has no sign
+    yield (
+        f"simulated sweeps named rightly (not the skin's accuracy), n = {n}, with 95 % interval; `unknown` counts as wrong",
+        f"{right} of {n}: {100 * right / n:.1f} % [{low:.1f}, {high:.1f}]",
+    )
+    yield "frames lost in these sweeps", str(figures["frames_lost"])
+    yield (
+        "from reading the last frame of the window to the sentence at the port",
+        _times(figures["edge_to_sentence_ms"]),
+    )
+    yield (
+        "from the STOP edge to its being in hand, with the last frame (glitch filter, rest of a USB packet)",
+        _times(figures["edge_seen_ms"]),
+    )
+    yield (
+        "inference of the packaged bundle (int8)",
+        _times(inference["int8"]),
+    )
+    yield "for comparison, inference of the same network in float32", _times(inference["fp32"])
+    yield "for comparison, inference of the paper's network (CNN) in int8", _times(inference["paper_int8"])
+    yield (
+        "resident memory after 1,000 sweeps, with the simulated readout board in it",
+        f"{memory['after_1000']:.1f} MiB; {growth:+.1f} MiB in the next 900",
+    )
+    yield (
+        "share of one core while the skin streams, without the simulated readout board",
+        f"{100 * figures['cpu_share_streaming']:.1f} %",
+    )
+    yield (
+        "start of the process to READY with a streaming skin",
+        f"median {figures['cold_start_s']:.2f} s, longest {figures['cold_start_worst_s']:.2f} s",
+    )
+    size = figures["bundle_kb"]
+    yield "size of the packaged bundle on the disk", f"{size['all']:.1f} kB, of it the network {size['model']:.1f} kB"
+
+
+def _times(ms: Json) -> str:
+    """Median and 99th percentile of n times."""
+    return f"median {ms['p50']:.2f} ms, 99 % within {ms['p99']:.2f} ms (n = {ms['n']})"
