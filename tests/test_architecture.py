@@ -43,6 +43,41 @@ def imports(path: Path) -> set[str]:
     return found
 
 
+def module_imports(*packages: str) -> dict[str, set[str]]:
+    """For each module of the packages those of them that it imports, also under TYPE_CHECKING and in functions."""
+    paths = [path for name in packages for path in ROOT.glob(f"{name}/**/*.py")]
+    dotted = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
+    found: dict[str, set[str]] = {name: set() for name in dotted}
+    for name, path in dotted.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found[name] |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):  # `from package import module` names the module
+                full = {f"{node.module}.{alias.name}" for alias in node.names}
+                found[name] |= {one if one in dotted else str(node.module) for one in full}
+    return {name: imported & dotted.keys() - {name} for name, imported in found.items()}
+
+
+def circles(graph: dict[str, set[str]]) -> list[str]:
+    """The modules that can be reached from themselves, with the imports that lead on to such modules."""
+    left = graph
+    while True:  # what imports nothing of the rest, or is imported by nothing of it, is in no circle
+        imported = set().union(*left.values())
+        kept = {name: names & left.keys() for name, names in left.items() if names & left.keys() and name in imported}
+        if kept == left:
+            return [f"{name} -> {', '.join(sorted(names))}" for name, names in sorted(kept.items())]
+        left = kept
+
+
+def test_no_module_imports_itself_through_others():
+    """No circle between modules, type hints and imports in functions included; one that is there would be found."""
+    graph = module_imports("appliance", "train")
+    assert "appliance.core.errors" in graph["appliance.deployment.store"]
+    assert circles(graph) == []
+    back = graph | {"appliance.core.errors": {"appliance.deployment.store"}}
+    assert "appliance.core.errors -> appliance.deployment.store" in circles(back)
+
+
 def test_packages_import_downwards_only():
     """The contracts of pyproject.toml, as `make lint` checks them."""
     output = run(Path(sys.executable).with_name("lint-imports"), cwd=ROOT)
