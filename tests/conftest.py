@@ -28,24 +28,24 @@ def default_bundle() -> bundle.Bundle:
 
 @pytest.fixture
 def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
-    """Builds boxes on worlds; takes them apart after the test."""
+    """Builds boxes on simulated devices; closes them after the test."""
     with ExitStack() as stack:
 
         def make(
-            world: devices.SimDevices | None = None,
+            simulated: devices.SimDevices | None = None,
             sets: tuple[str, ...] = (),
             model=default_bundle,
             observers=(),
             **more,
         ) -> Rigged:
-            world = world or devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
+            simulated = simulated or devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
             settings = config.load(None, sets, site=NO_SITE)
             far_end, name = stack.enter_context(pseudo_terminal.pair())
-            port = SerialSink(replace(settings.serial, port=name), world.clock, world.source)
+            port = SerialSink(replace(settings.serial, port=name), simulated.clock, simulated.source)
             kept: list[Sweep] = []
             watching = [OnSweep(lambda sweep, verdict: kept.append(sweep)), *observers]
-            box = assembly.box(settings, model, world, port, stack, observers=watching, **more)
-            return Rigged(box, world, far_end, port, kept=kept)
+            box = assembly.box(settings, model, simulated, port, stack, observers=watching, **more)
+            return Rigged(box, simulated, far_end, port, kept=kept)
 
         yield make
 

@@ -26,13 +26,13 @@ def numbered(n: int, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarr
     return ((np.arange(first, first + n) % 97)[:, None, None] + grid).astype(fmt.digits)
 
 
-def idle_world(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -> devices.SimDevices:
-    """Devices whose skin sends numbered frames and whose robot does nothing."""
+def idle_devices(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -> devices.SimDevices:
+    """Simulated devices whose skin sends numbered frames and whose robot does nothing."""
     n = min(round(seconds * fmt.rate_hz), 60_000)
     acts = [rig.Act(numbered(n, fmt), 10**9, 10**9 + 1, "")]
-    world = devices.build(fmt, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
-    world.backend.board = rig.Board(fmt, world.robot, world.clock, **{"packet_frames": 4} | board)
-    return world
+    simulated = devices.build(fmt, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
+    simulated.backend.board = rig.Board(fmt, simulated.robot, simulated.clock, **{"packet_frames": 4} | board)
+    return simulated
 
 
 class OnSweep(Observer):
@@ -51,7 +51,7 @@ class Rigged:
     """A box on the rig, and the robot's end of its serial line."""
 
     box: Box
-    world: devices.SimDevices
+    simulated: devices.SimDevices
     far_end: int
     port: SerialSink
     heard: list[str] = field(default_factory=list)
@@ -61,9 +61,9 @@ class Rigged:
     def until(self, done: Callable[[], bool], *, limit_s: float = 60) -> list[Verdict]:
         """Step until `done()`; fails after `limit_s` of simulated time."""
         verdicts = []
-        end_ns = self.world.clock.now_ns() + limit_s * SECOND
+        end_ns = self.simulated.clock.now_ns() + limit_s * SECOND
         while not done():
-            assert self.world.clock.now_ns() < end_ns, "nothing happened"
+            assert self.simulated.clock.now_ns() < end_ns, "nothing happened"
             verdicts += self.box.step()
             self.listen()
         self.listen(SETTLE_S)
@@ -71,8 +71,8 @@ class Rigged:
 
     def seconds(self, s: float) -> list[Verdict]:
         """Step for `s` seconds of simulated time."""
-        end_ns = self.world.clock.now_ns() + round(s * SECOND)
-        return self.until(lambda: self.world.clock.now_ns() >= end_ns)
+        end_ns = self.simulated.clock.now_ns() + round(s * SECOND)
+        return self.until(lambda: self.simulated.clock.now_ns() >= end_ns)
 
     def listen(self, wait_s: float = 0) -> None:
         """Read the robot's end; the kernel passes on what the near end wrote in its own time."""
@@ -89,7 +89,7 @@ class Rigged:
 
     def edge(self, name: str, after_s: float, level: bool = True) -> None:
         """Drive an input line `after_s` from now."""
-        self.world.gpio.drive(name, level, self.world.clock.now_ns() + round(after_s * SECOND))
+        self.simulated.gpio.drive(name, level, self.simulated.clock.now_ns() + round(after_s * SECOND))
 
     def pulse(self, name: str, after_s: float) -> None:
         """A pulse of 20 ms."""

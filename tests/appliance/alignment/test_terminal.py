@@ -31,7 +31,7 @@ from appliance.core.config import SensorConfig
 from appliance.signal.contact import ContactPositions
 from appliance.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
-from tests.factories.simulated_box import SECOND, idle_world
+from tests.factories.simulated_box import SECOND, idle_devices
 
 MIDDLE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 
@@ -42,17 +42,17 @@ def model(default_bundle: Bundle) -> Bundle:
     return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE, schema=3))
 
 
-def views_of(world: devices.SimDevices, model: Bundle) -> Callable[[float], list[View]]:
-    """A function that reads the skin of `world` for some seconds and returns the Views of this time."""
-    settings = world.wire(config.load(None, [], site=NO_SITE))
-    alignment = Alignment(settings.sensor, model, world)
+def views_of(simulated: devices.SimDevices, model: Bundle) -> Callable[[float], list[View]]:
+    """A function that reads the skin of `simulated` for some seconds and returns the Views of this time."""
+    settings = simulated.wire(config.load(None, [], site=NO_SITE))
+    alignment = Alignment(settings.sensor, model, simulated)
 
     def views(seconds: float) -> list[View]:
-        seen, end_ns, next_ns = [], world.clock.now_ns() + round(seconds * SECOND), world.clock.now_ns()
-        while world.clock.now_ns() < end_ns:
+        seen, end_ns, next_ns = [], simulated.clock.now_ns() + round(seconds * SECOND), simulated.clock.now_ns()
+        while simulated.clock.now_ns() < end_ns:
             alignment.read()
-            if world.clock.now_ns() >= next_ns:
-                next_ns = world.clock.now_ns() + live.VIEW_NS
+            if simulated.clock.now_ns() >= next_ns:
+                next_ns = simulated.clock.now_ns() + live.VIEW_NS
                 seen.append(alignment.view())
         return seen
 
@@ -105,16 +105,16 @@ def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
 
 def test_an_unplugged_skin_is_told_and_waited_for(model: Bundle):
     """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is read anew."""
-    world = resting()
-    views = views_of(world, model)
+    simulated = resting()
+    views = views_of(simulated, model)
     views(2)
-    world.backend.unplug()
+    simulated.backend.unplug()
     gone = views(0.6)[-1]
     assert gone.state == "no-skin"
     assert gone.message in ("no skin: absent", "no skin: lost")
     assert gone.hint
     assert gone.load == ()
-    world.backend.plug()
+    simulated.backend.plug()
     assert states(views(4)) == ["no-skin", "wait", "lift", "no-contact", "off"]
 
 
@@ -139,8 +139,8 @@ def test_another_skin_shape(model: Bundle):
     load = np.zeros((3000, 2, 3), np.float32)
     load[1000:, :, 1:] = 60.0
     load[:, 0, 0] = np.nan
-    world = devices.build(fmt, [rig.Act(load, 0, 2999, "")], rig.VirtualClock(), "sim")
-    seen = views_of(world, other)(3)
+    simulated = devices.build(fmt, [rig.Act(load, 0, 2999, "")], rig.VirtualClock(), "sim")
+    seen = views_of(simulated, other)(3)
     assert seen[-1].message == "2.0 mm too far towards column 3"
     assert seen[-1].load[0][0] == 0
     screen = Canvas(seen[-1], ASCII, 80, 24, "").lines(False)
@@ -214,20 +214,22 @@ def test_only_a_terminal_that_knows_colours_gets_them():
 
 def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     """Views come as fast as VIEW_NS allows, not one for each frame; `stopped` ends it and the skin is let go."""
-    world, out = resting(), io.StringIO()
-    end_ns = world.clock.now_ns() + 5 * SECOND
+    simulated, out = resting(), io.StringIO()
+    end_ns = simulated.clock.now_ns() + 5 * SECOND
     monkeypatch.setattr("appliance.alignment.terminal.LINE_NS", 0)
-    settings = world.wire(config.load(None, [], site=NO_SITE))
-    live.run(settings.sensor, model, world, [Screen(out, world.clock)], lambda: world.clock.now_ns() >= end_ns)
+    settings = simulated.wire(config.load(None, [], site=NO_SITE))
+    live.run(
+        settings.sensor, model, simulated, [Screen(out, simulated.clock)], lambda: simulated.clock.now_ns() >= end_ns
+    )
     assert 24 <= len(out.getvalue().splitlines()) <= 26
-    assert not world.backend.board.running
+    assert not simulated.backend.board.running
 
 
 def test_a_denied_skin_is_named(model: Bundle):
     """What keeps the skin from being read is said with its remedy, and is no end."""
-    world = idle_world()
-    world.backend.errors["open"] = errno.EACCES
-    alignment = Alignment(SensorConfig(), model, world)
+    simulated = idle_devices()
+    simulated.backend.errors["open"] = errno.EACCES
+    alignment = Alignment(SensorConfig(), model, simulated)
     alignment.read()
     view = alignment.view()
     assert (view.state, view.skin, view.message) == ("no-skin", "denied", "no skin: denied")

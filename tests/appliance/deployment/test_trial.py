@@ -18,7 +18,7 @@ from appliance.deployment.trial import Trial
 from appliance.sim import devices, rig, script, skin
 from tests.factories import deliveries
 from tests.factories.deliveries import Delivery
-from tests.factories.simulated_box import Rigged, idle_world
+from tests.factories.simulated_box import Rigged, idle_devices
 
 pytestmark = deliveries.NEEDED
 SECOND = 1_000_000_000
@@ -234,8 +234,8 @@ def test_a_person_may_commit_while_it_runs(box: Trying):
 def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
     """The whole way on the rig: five sweeps of the simulated robot, each with its answer."""
     trial = box.tried()
-    world = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
-    running = rigged(world, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
+    simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
+    running = rigged(simulated, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
     running.until(lambda: running.box.answered >= 5 and not trial.text)
     assert box.standing.committed
 
@@ -243,8 +243,8 @@ def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
 def test_a_box_without_a_skin_takes_its_start_back(box: Trying, rigged: Callable[..., Rigged]):
     """The whole way on the rig, with nothing on the bus."""
     trial = box.tried()
-    world = idle_world()
-    world.backend.unplug()
-    running = rigged(world, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
+    simulated = idle_devices()
+    simulated.backend.unplug()
+    running = rigged(simulated, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
     running.seconds(1)
     assert box.standing.starts == 0

@@ -97,16 +97,18 @@ def acts(*slides: np.ndarray, label: str = "left", new_object: tuple[int, ...] =
     ]
 
 
-def world_of(*slides: np.ndarray, stops: bool = True, packet_frames: int = 3, clock=None, **more) -> devices.SimDevices:
-    """A world in which these are slid."""
-    world = devices.build(FMT, acts(*slides, **more), clock or rig.VirtualClock(), "sim", stops=stops)
-    world.backend.board = rig.Board(FMT, world.robot, world.clock, packet_frames=packet_frames)
-    return world
+def simulated_slides(
+    *slides: np.ndarray, stops: bool = True, packet_frames: int = 3, clock=None, **more
+) -> devices.SimDevices:
+    """Simulated devices on which the finger slides like this."""
+    simulated = devices.build(FMT, acts(*slides, **more), clock or rig.VirtualClock(), "sim", stops=stops)
+    simulated.backend.board = rig.Board(FMT, simulated.robot, simulated.clock, packet_frames=packet_frames)
+    return simulated
 
 
 def all_of(box: Rigged) -> list[Verdict]:
     """The verdicts on everything that the robot does, and what comes in two seconds after it."""
-    verdicts = box.until(lambda: box.world.finished(box.box.answered))
+    verdicts = box.until(lambda: box.simulated.finished(box.box.answered))
     return verdicts + box.seconds(2)
 
 
@@ -115,9 +117,9 @@ def told(verdicts: list[Verdict]) -> list[tuple[str, str, float]]:
     return [(str(v.status), v.label, v.share) for v in verdicts]
 
 
-def levels(world: devices.SimDevices, *names: str) -> list[tuple[str, bool]]:
+def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]:
     """How these lines moved."""
-    return [(name, level) for _, name, level in world.gpio.written if name in names]
+    return [(name, level) for _, name, level in simulated.gpio.written if name in names]
 
 
 @pytest.mark.parametrize(
@@ -144,8 +146,8 @@ def test_the_rule(scores: list[float], agree: int, want: bool):
 
 def test_an_early_answer(rigged: Callable[..., Rigged]):
     """Left less right: -10, then 60. After 0.4 of the window the mean is 25, so sigmoid(2.5): more than 0.9."""
-    world = world_of(slid(-10, 60))
-    box = rigged(world, SETS, toy())
+    simulated = simulated_slides(slid(-10, 60))
+    box = rigged(simulated, SETS, toy())
     (verdict,) = all_of(box)
     assert told([verdict]) == [("ok", "left", 0.4)]
     assert verdict.probability == pytest.approx(1 / (1 + np.exp(-2.5)), abs=1e-6)
@@ -157,30 +159,30 @@ def test_an_early_answer(rigged: Callable[..., Rigged]):
 
 def test_steps_must_agree(rigged: Callable[..., Rigged]):
     """The same slide where two steps must name one label: the first said "right", so it takes the third."""
-    assert told(all_of(rigged(world_of(slid(-10, 60)), SETS, toy(agree=2)))) == [("ok", "left", 0.6)]
+    assert told(all_of(rigged(simulated_slides(slid(-10, 60)), SETS, toy(agree=2)))) == [("ok", "left", 0.6)]
 
 
 @pytest.mark.parametrize(("sets", "least"), [((), 0.9), (SETS, 1.1)])
 def test_otherwise_the_answer_is_the_usual_one(rigged: Callable[..., Rigged], sets: tuple[str, ...], least: float):
     """Off by default; and where no step is sure enough: the middle window, once, bit for bit the same."""
-    (want,) = all_of(rigged(world_of(slid(20, 20)), (), toy(early=False)))
-    world = world_of(slid(20, 20))
-    (verdict,) = all_of(rigged(world, sets, toy((least,) * STEPS)))
+    (want,) = all_of(rigged(simulated_slides(slid(20, 20)), (), toy(early=False)))
+    simulated = simulated_slides(slid(20, 20))
+    (verdict,) = all_of(rigged(simulated, sets, toy((least,) * STEPS)))
     assert told([verdict]) == [("ok", "left", 1.0)]
     assert verdict.scores.tobytes() == want.scores.tobytes()
-    assert (devices.DECIDED, True) not in levels(world, devices.DECIDED)
+    assert (devices.DECIDED, True) not in levels(simulated, devices.DECIDED)
 
 
 def test_the_robot_stops_and_is_faster(rigged: Callable[..., Rigged]):
     """DECIDED ends the slide: three sweeps, three answers, each touch as short as its share and the robot's reaction."""
-    world = world_of(slid(60), slid(-10, 60), slid(10))
-    box = rigged(world, SETS, toy())
+    simulated = simulated_slides(slid(60), slid(-10, 60), slid(10))
+    box = rigged(simulated, SETS, toy())
     verdicts = box.until(lambda: box.box.answered == 1)
     assert box.box.newest_frame().any()
     box.seconds(0.1)
     assert not box.box.newest_frame().any()
     assert told(verdicts + all_of(box)) == [("ok", "left", 0.2), ("ok", "left", 0.4), ("ok", "left", 1.0)]
-    touched = [a.stop - a.start for a in world.robot.played]
+    touched = [a.stop - a.start for a in simulated.robot.played]
     for frames, n in zip(touched, (20, 40), strict=False):
         assert LEAD + n < frames <= LEAD + n + 3 + 3  # the rest of a packet, 20 ms to react, and up to the next frame
     assert touched[2] == SLIDE
@@ -189,36 +191,36 @@ def test_the_robot_stops_and_is_faster(rigged: Callable[..., Rigged]):
 
 def test_lines_tell_it_in_order(rigged: Callable[..., Rigged]):
     """Sentence, class bits, RESULT VALID, then DECIDED with READY and BUSY; DECIDED falls when the next sweep starts."""
-    world = world_of(slid(60), slid(10))
+    simulated = simulated_slides(slid(60), slid(10))
     heard_before: list[bool] = []
     kept_after: list[bool] = []
     keep = OnSweep(lambda sweep, verdict: kept_after.append(bool(heard_before)))  # a disk may be slow
-    box = rigged(world, SETS, toy(), observers=[keep])
-    stop = world.gpio.watchers[devices.DECIDED]
+    box = rigged(simulated, SETS, toy(), observers=[keep])
+    stop = simulated.gpio.watchers[devices.DECIDED]
 
     def watch(t_ns: int) -> None:
         box.listen(SETTLE_S)
         heard_before.append(any(",RES,1," in line for line in box.heard))
         stop(t_ns)
 
-    world.gpio.watchers[devices.DECIDED] = watch
+    simulated.gpio.watchers[devices.DECIDED] = watch
     all_of(box)
     names = devices.READY, devices.BUSY, devices.DECIDED, devices.RESULT_VALID, devices.BITS[0]
     start, free = [(devices.READY, False), (devices.BUSY, True)], [(devices.READY, True), (devices.BUSY, False)]
     first = [*start, (devices.BITS[0], True), (devices.RESULT_VALID, True), *free, (devices.DECIDED, True)]
     second = [(devices.RESULT_VALID, False), *start, (devices.DECIDED, False), (devices.RESULT_VALID, True), *free]
-    assert levels(world, *names) == [(devices.READY, True), *first, *second]
+    assert levels(simulated, *names) == [(devices.READY, True), *first, *second]
     assert heard_before == [True]
     assert kept_after == [True, True]
 
 
 def test_a_start_edge_beside_the_answer(rigged: Callable[..., Rigged]):
     """In the turn of an early answer the next sweep starts: RESULT VALID and DECIDED were up, and fall for it."""
-    world = world_of(slid(60), stops=False, packet_frames=30)
-    box = rigged(world, SETS, toy())
-    world.gpio.drive(devices.START, True, world.backend.board.frame_ns(85))  # frame 69 comes with frame 89
+    simulated = simulated_slides(slid(60), stops=False, packet_frames=30)
+    box = rigged(simulated, SETS, toy())
+    simulated.gpio.drive(devices.START, True, simulated.backend.board.frame_ns(85))  # frame 69 comes with frame 89
     box.until(lambda: box.box.answered == 1)
-    assert levels(world, devices.DECIDED, devices.RESULT_VALID) == [
+    assert levels(simulated, devices.DECIDED, devices.RESULT_VALID) == [
         (name, level) for level in (True, False) for name in (devices.RESULT_VALID, devices.DECIDED)
     ]
     assert told(box.seconds(1)) == [("ok", "left", 0.2)]  # the finger still slides
@@ -226,17 +228,17 @@ def test_a_start_edge_beside_the_answer(rigged: Callable[..., Rigged]):
 
 def test_a_robot_that_slides_on_gets_no_second_answer(rigged: Callable[..., Rigged]):
     """The stop edge at the slide's usual end is silent, and the next sweep is a sweep like any other."""
-    world = world_of(slid(60), slid(60), stops=False)
-    assert told(all_of(rigged(world, SETS, toy()))) == [("ok", "left", 0.2)] * 2
-    assert [a.stop - a.start for a in world.robot.played] == [SLIDE] * 2
+    simulated = simulated_slides(slid(60), slid(60), stops=False)
+    assert told(all_of(rigged(simulated, SETS, toy()))) == [("ok", "left", 0.2)] * 2
+    assert [a.stop - a.start for a in simulated.robot.played] == [SLIDE] * 2
 
 
 @pytest.mark.parametrize("packet_frames", [1, 7, 30])
 def test_how_frames_come_changes_nothing(rigged: Callable[..., Rigged], packet_frames: int):
     """Single frames, or packets that hold a step and a half: the same steps, the same scores bit for bit."""
     slides = slid(-10, 20, 60), slid(-10, -10, 60), slid(60)
-    want = all_of(rigged(world_of(*slides), SETS, toy()))
-    have = all_of(rigged(world_of(*slides, packet_frames=packet_frames), SETS, toy()))
+    want = all_of(rigged(simulated_slides(*slides), SETS, toy()))
+    have = all_of(rigged(simulated_slides(*slides, packet_frames=packet_frames), SETS, toy()))
     assert told(have) == told(want) == [("ok", "left", s) for s in (0.6, 0.8, 0.2)]
     assert [v.scores.tobytes() for v in have] == [v.scores.tobytes() for v in want]
 
@@ -251,7 +253,7 @@ def test_one_run_of_the_graph_at_each_step(rigged: Callable[..., Rigged], monkey
     heads, look = Classifier.early, SweepCutter._seq_at
     monkeypatch.setattr(SweepCutter, "_seq_at", lambda self, t_ns: looked.append(box.box.answered) or look(self, t_ns))
     monkeypatch.setattr(Classifier, "early", lambda self, x: asked.append(box.box.answered) or heads(self, x))
-    box = rigged(world_of(slid(10), slid(-10, 60)), SETS, toy())
+    box = rigged(simulated_slides(slid(10), slid(-10, 60)), SETS, toy())
     all_of(box)
     assert [asked.count(k) for k in (0, 1, 2)] == [4, 2, 0]
     assert looked == [0, 0, 1]
@@ -294,15 +296,15 @@ def spoiled(how: str) -> np.ndarray:
 @pytest.mark.parametrize("how", ["saturated", "stuck-taxel", "dead-taxel", "no-contact"])
 def test_a_spoiled_skin_is_not_decided_early(rigged: Callable[..., Rigged], how: str):
     """However sure the heads are, the whole sweep says what is wrong; without the spoiling it is decided at once."""
-    assert told(all_of(rigged(world_of(spoiled(how)), SETS, toy((0.5,) * STEPS)))) == [(how, "", 1.0)]
-    assert told(all_of(rigged(world_of(spoiled("")), SETS, toy((0.5,) * STEPS)))) == [("ok", "left", 0.2)]
+    assert told(all_of(rigged(simulated_slides(spoiled(how)), SETS, toy((0.5,) * STEPS)))) == [(how, "", 1.0)]
+    assert told(all_of(rigged(simulated_slides(spoiled("")), SETS, toy((0.5,) * STEPS)))) == [("ok", "left", 0.2)]
 
 
 def test_a_taxel_that_moves_late_is_no_fault(rigged: Callable[..., Rigged]):
     """Constant in the first step, moving in the second: refused there, decided here."""
     frames = slid(60)
     frames[: LEAD + NEEDS[0], 0, 0] = 160
-    assert told(all_of(rigged(world_of(frames), SETS, toy()))) == [("ok", "left", 0.4)]
+    assert told(all_of(rigged(simulated_slides(frames), SETS, toy()))) == [("ok", "left", 0.4)]
 
 
 def test_a_tare_counts(rigged: Callable[..., Rigged]):
@@ -326,10 +328,10 @@ def test_a_tare_counts(rigged: Callable[..., Rigged]):
 )
 def test_missing_frames(rigged: Callable[..., Rigged], at: int, lost: int, counted: int, want: tuple[str, str, float]):
     """Two lost frames, also the last of a step, are interpolated and counted; over a wider gap nothing is decided."""
-    world = world_of(slid(-10, 60), packet_frames=1)
+    simulated = simulated_slides(slid(-10, 60), packet_frames=1)
     count = itertools.count()
-    world.backend.mangle = lambda data: b"" if 0 <= next(count) - 40 - LEAD - at < lost else data
-    box = rigged(world, SETS, toy())
+    simulated.backend.mangle = lambda data: b"" if 0 <= next(count) - 40 - LEAD - at < lost else data
+    box = rigged(simulated, SETS, toy())
     assert told(all_of(box)) == [want]
     assert [s.lost for s in box.kept] == [counted]
 
@@ -340,11 +342,11 @@ def test_missing_frames(rigged: Callable[..., Rigged], at: int, lost: int, count
 )
 def test_what_goes_wrong_after_the_answer(rigged: Callable[..., Rigged], what: str, want: list[str]):
     """Unplugged, started again, aborted, edges lost: the early answer stays the only one to its trigger."""
-    world = world_of(slid(60), stops=False)
-    box = rigged(world, SETS, toy())
+    simulated = simulated_slides(slid(60), stops=False)
+    box = rigged(simulated, SETS, toy())
     verdicts = box.until(lambda: box.box.answered == 1)
     if what == "unplug":
-        world.backend.unplug()
+        simulated.backend.unplug()
     elif what == "abort":
         assert "no sweep is open" in box.ask("$PPLP,ABORT")
     elif what == "start":
@@ -360,29 +362,29 @@ def test_what_goes_wrong_after_the_answer(rigged: Callable[..., Rigged], what: s
 
 def test_what_goes_wrong_before_the_answer(rigged: Callable[..., Rigged]):
     """Unplugged before a step is sure: `sensor-lost` at once, and nothing early after it is plugged in again."""
-    world = world_of(slid(-10, 60), stops=False)
-    box = rigged(world, SETS, toy())
-    box.until(lambda: box.box.format == FMT and ("BUSY", True) in levels(world, "BUSY"))
-    now = world.clock.now_ns()
-    world.backend.at(now + SECOND // 4, world.backend.unplug)
-    world.backend.at(now + SECOND // 2, world.backend.plug)
+    simulated = simulated_slides(slid(-10, 60), stops=False)
+    box = rigged(simulated, SETS, toy())
+    box.until(lambda: box.box.format == FMT and ("BUSY", True) in levels(simulated, "BUSY"))
+    now = simulated.clock.now_ns()
+    simulated.backend.at(now + SECOND // 4, simulated.backend.unplug)
+    simulated.backend.at(now + SECOND // 2, simulated.backend.plug)
     assert [str(v.status) for v in all_of(box)] == ["sensor-lost"]
 
 
 def test_a_trigger_while_not_ready_is_not_decided(rigged: Callable[..., Rigged]):
     """The start edge comes while the skin is away: `not-ready`, though the slide that follows is clear."""
-    world = world_of(slid(60), stops=False)
-    box = rigged(world, SETS, toy())
-    start = world.backend.board.frame_ns(40)
-    world.backend.at(start - SECOND // 10, world.backend.unplug)
-    world.backend.at(start + SECOND // 20, world.backend.plug)
+    simulated = simulated_slides(slid(60), stops=False)
+    box = rigged(simulated, SETS, toy())
+    start = simulated.backend.board.frame_ns(40)
+    simulated.backend.at(start - SECOND // 10, simulated.backend.unplug)
+    simulated.backend.at(start + SECOND // 20, simulated.backend.plug)
     assert [str(v.status) for v in all_of(box)] == ["not-ready"]
 
 
 def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Callable[..., Rigged]):
     """Three sweeps of an object, the second whole: fused 1, 2, 3, with the product of their probabilities."""
-    world = world_of(slid(60), slid(20), slid(30), new_object=(0,))
-    verdicts = all_of(rigged(world, SETS, toy()))
+    simulated = simulated_slides(slid(60), slid(20), slid(30), new_object=(0,))
+    verdicts = all_of(rigged(simulated, SETS, toy()))
     assert [(v.fused, v.share) for v in verdicts] == [(1, 0.2), (2, 1.0), (3, 0.2)]
     logits = np.cumsum([6.0, 2.0, 3.0])  # sigmoid(2) is below 0.9: the rule is about the sweep itself
     assert [v.probability for v in verdicts] == pytest.approx(1 / (1 + np.exp(-logits)), abs=1e-6)
@@ -390,15 +392,15 @@ def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Callable[...,
 
 def test_what_would_be_unsure_goes_on(rigged: Callable[..., Rigged]):
     """`min_probability` is not reached by one sweep: no early answer, the whole one asks for another; fused it comes early."""
-    world = world_of(slid(30), slid(30), new_object=(0,))
-    verdicts = all_of(rigged(world, (*SETS, "classifier.min_probability=0.99"), toy()))
+    simulated = simulated_slides(slid(30), slid(30), new_object=(0,))
+    verdicts = all_of(rigged(simulated, (*SETS, "classifier.min_probability=0.99"), toy()))
     assert [(str(v.status), v.fused, v.share) for v in verdicts] == [("unsure", 1, 1.0), ("ok", 2, 0.2)]
 
 
 def test_a_bundle_without_heads_says_so(rigged: Callable[..., Rigged]):
     """At start, naming the bundle, the setting and the way out."""
     with pytest.raises(BundleError, match=r"toy 1 has no early heads.*classifier\.early = false"):
-        rigged(world_of(slid(60)), SETS, toy(early=False))
+        rigged(simulated_slides(slid(60)), SETS, toy(early=False))
 
 
 class Ticking(rig.VirtualClock):
@@ -415,14 +417,14 @@ def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_pat
     """Lost packets, early and whole answers, fused ones, a stop edge beside a step: replayed, all is the same."""
     rng = np.random.default_rng(7)
     slides = [slid(*rng.integers(-30, 50, 5)) for _ in range(20)]
-    world = world_of(*slides, stops=False, packet_frames=packet_frames, clock=Ticking(), new_object=(5, 9))
+    simulated = simulated_slides(*slides, stops=False, packet_frames=packet_frames, clock=Ticking(), new_object=(5, 9))
     played = acts(*slides, new_object=(5, 9))
     for i in range(10, 20):  # stopped too early on purpose, anywhere near the last step
         played[i] = replace(played[i], stop=played[i].start + LEAD + NEEDS[-1] + i - 12)
-    world.robot._script = iter(played)
-    world.backend.mangle = lambda data: b"" if rng.random() < 0.03 / packet_frames else data
+    simulated.robot._script = iter(played)
+    simulated.backend.mangle = lambda data: b"" if rng.random() < 0.03 / packet_frames else data
     capture = CaptureWriter(tmp_path / "capture", FMT)
-    box = rigged(world, SETS, toy((0.97, 0.95, 0.93, 0.7)), capture=capture)
+    box = rigged(simulated, SETS, toy((0.97, 0.95, 0.93, 0.7)), capture=capture)
     first = all_of(box)
     capture.close()
     play = Playback(tmp_path / "capture")
@@ -445,7 +447,7 @@ def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_pat
 
 def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_path: Path):
     """What was kept of an early answer is what it saw; read again it is decided again, with the same scores."""
-    box = rigged(world_of(slid(-10, 60)), SETS, toy())
+    box = rigged(simulated_slides(slid(-10, 60)), SETS, toy())
     (verdict,) = all_of(box)
     save(tmp_path / "sweep-000001.npy", box.kept[0], FMT)
     sweep, fmt = load(tmp_path / "sweep-000001.npy")
@@ -486,12 +488,12 @@ def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.Capt
 def test_the_demo_shows_what_it_saves(rigged: Callable[..., Rigged]):
     """The share beside an early answer, and the mean touch time below; neither where nothing was early."""
     for slides, early in (((slid(60), slid(10)), 1), ((slid(10), slid(10)), 0)):
-        world = world_of(*slides)
-        box, out = rigged(world, SETS, toy()), io.StringIO()
-        show = demo.Demo(world.robot.played, box.far_end, world.clock, out, raw=False)
+        simulated = simulated_slides(*slides)
+        box, out = rigged(simulated, SETS, toy()), io.StringIO()
+        show = demo.Demo(simulated.robot.played, box.far_end, simulated.clock, out, raw=False)
         show.run(box.box, 2, lambda: False)
         assert out.getvalue().count("after 20% of the window") == early
-        want = [(a.stop - a.start) / 100 for a in world.robot.played]
+        want = [(a.stop - a.start) / 100 for a in simulated.robot.played]
         line = f"touch time      {np.mean(want):.2f} s mean, {early} of 2 answered early"
         assert (line in out.getvalue()) == bool(early)
         assert ("touch time" in out.getvalue()) == bool(early)

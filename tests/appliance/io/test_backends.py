@@ -36,7 +36,7 @@ Need = Callable[..., Backend]
 
 
 @pytest.fixture(scope="module")
-def world() -> Iterator[Backend]:
+def chosen() -> Iterator[Backend]:
     """The backend of this process."""
     try:
         with backends.opened(backends.chosen()) as made:
@@ -46,20 +46,20 @@ def world() -> Iterator[Backend]:
 
 
 @pytest.fixture
-def need(world: Backend) -> Need:
+def need(chosen: Backend) -> Need:
     """Gives the backend as it is at the start of a test, to tests that ask no more of it than it can."""
 
     def able(*wanted: str) -> Backend:
-        if lacking := [what for what in wanted if what not in world.can]:
-            pytest.skip(f"{world.name}: no {', no '.join(lacking)} here")
-        world.reset()
-        return world
+        if lacking := [what for what in wanted if what not in chosen.can]:
+            pytest.skip(f"{chosen.name}: no {', no '.join(lacking)} here")
+        chosen.reset()
+        return chosen
 
     return able
 
 
 def now(u: Backend) -> int:
-    """The world's time in nanoseconds."""
+    """The backend's time in nanoseconds."""
     return u.clock.now_ns()
 
 
@@ -69,7 +69,7 @@ def limit(u: Backend) -> int:
 
 
 def until(u: Backend, done: Callable[[], Any], step_s: float = 0.002) -> None:
-    """Ask again and again until it is so; fails after LIMIT_S of the world's time."""
+    """Ask again and again until it is so; fails after LIMIT_S of the backend's time."""
     end_ns = limit(u)
     while not done():
         assert now(u) < end_ns, "it did not happen"

@@ -46,7 +46,7 @@ def output_config(**changes: Any) -> OutputConfig:
     return OutputConfig(**wired | changes)
 
 
-class World:
+class TriggerSetup:
     """A simulated gpiod, a trigger on it and their clock. Times count from `t0`; line `high` is high by then."""
 
     def __init__(
@@ -88,37 +88,37 @@ class World:
 
 def test_two_lines() -> None:
     """A rise of START is START, a rise of STOP is STOP, with the kernel's stamps; falls and NEW say their part."""
-    world = World(new_object="NEW")
-    world.drive("NEW", 3 * MS + 1, 5 * MS)
-    world.drive("START", 10 * MS + 7, 30 * MS)
-    world.drive("STOP", 200 * MS + 13, 220 * MS)
-    assert world.run(300 * MS) == [(NEW_OBJECT, 3 * MS + 1), (START, 10 * MS + 7), (STOP, 200 * MS + 13)]
+    setup = TriggerSetup(new_object="NEW")
+    setup.drive("NEW", 3 * MS + 1, 5 * MS)
+    setup.drive("START", 10 * MS + 7, 30 * MS)
+    setup.drive("STOP", 200 * MS + 13, 220 * MS)
+    assert setup.run(300 * MS) == [(NEW_OBJECT, 3 * MS + 1), (START, 10 * MS + 7), (STOP, 200 * MS + 13)]
 
 
 def test_one_line() -> None:
     """A rise is START and a fall is STOP; a stop line that is named anyway is not asked for."""
-    world = World(mode="one-line", stop="NOWHERE")
-    world.drive("START", 10 * MS + 7, 200 * MS + 13)
-    assert world.run(300 * MS) == [(START, 10 * MS + 7), (STOP, 200 * MS + 13)]
+    setup = TriggerSetup(mode="one-line", stop="NOWHERE")
+    setup.drive("START", 10 * MS + 7, 200 * MS + 13)
+    assert setup.run(300 * MS) == [(START, 10 * MS + 7), (STOP, 200 * MS + 13)]
 
 
 def test_told_when_settled() -> None:
     """A clean edge is held back until exactly `glitch_us` after it, and told once."""
-    world = World()
-    world.drive("START", MS)
-    assert [world.poll(t) for t in (MS, MS + GLITCH - 1, MS + GLITCH, 9 * MS)] == [[], [], [(START, MS)], []]
+    setup = TriggerSetup()
+    setup.drive("START", MS)
+    assert [setup.poll(t) for t in (MS, MS + GLITCH - 1, MS + GLITCH, 9 * MS)] == [[], [], [(START, MS)], []]
 
 
 def test_start_and_stop_in_one_call() -> None:
     """Whole sweeps that lie between two calls come out of the second one, in order."""
-    world = World(mode="one-line", stop="")
-    world.drive("START", 10 * MS, 200 * MS, 300 * MS, 400 * MS)
-    assert world.poll(500 * MS) == [(START, 10 * MS), (STOP, 200 * MS), (START, 300 * MS), (STOP, 400 * MS)]
+    setup = TriggerSetup(mode="one-line", stop="")
+    setup.drive("START", 10 * MS, 200 * MS, 300 * MS, 400 * MS)
+    assert setup.poll(500 * MS) == [(START, 10 * MS), (STOP, 200 * MS), (START, 300 * MS), (STOP, 400 * MS)]
 
 
 def test_both_edges_undebounced() -> None:
     """The kernel is asked for both edges on the monotonic clock, without its debouncing, and for a long queue."""
-    for request in World().gpio.requests:
+    for request in TriggerSetup().gpio.requests:
         (settings,) = request.settings.values()
         assert settings.direction is gpiod.line.Direction.INPUT
         assert settings.edge_detection is gpiod.line.Edge.BOTH
@@ -129,8 +129,8 @@ def test_both_edges_undebounced() -> None:
 
 def test_a_request_for_each_line() -> None:
     """Each input is requested by itself, also on one chip: then the kernel numbers what it tells, without a hole."""
-    world = World(new_object="NEW")
-    assert [request.names for request in world.gpio.requests] == [{1: "START"}, {2: "STOP"}, {3: "NEW"}]
+    setup = TriggerSetup(new_object="NEW")
+    assert [request.names for request in setup.gpio.requests] == [{1: "START"}, {2: "STOP"}, {3: "NEW"}]
 
 
 @pytest.mark.parametrize(
@@ -139,22 +139,22 @@ def test_a_request_for_each_line() -> None:
 )
 def test_bias(bias: str, wanted: str) -> None:
     """Each bias of the configuration reaches the request."""
-    assert World(bias=bias).gpio.requests[0].settings[1].bias is gpiod.line.Bias[wanted]
+    assert TriggerSetup(bias=bias).gpio.requests[0].settings[1].bias is gpiod.line.Bias[wanted]
 
 
 def test_active_low() -> None:
     """With active_low and a pull-up a fall is START; the high level at rest is none."""
-    world = World(mode="one-line", stop="", active_low=True, bias="pull-up")
-    world.drive("START", 10 * MS, 200 * MS, level=False)
-    assert world.run(300 * MS) == [(START, 10 * MS), (STOP, 200 * MS)]
+    setup = TriggerSetup(mode="one-line", stop="", active_low=True, bias="pull-up")
+    setup.drive("START", 10 * MS, 200 * MS, level=False)
+    assert setup.run(300 * MS) == [(START, 10 * MS), (STOP, 200 * MS)]
 
 
 def test_high_at_start_up() -> None:
     """A line that is high when the box comes up makes no START; its fall is a STOP and its next rise a START."""
-    world = World(high="START", mode="one-line", stop="")
-    assert world.run(50 * MS) == []
-    world.drive("START", 100 * MS, 200 * MS, level=False)
-    assert world.run(300 * MS) == [(STOP, 100 * MS), (START, 200 * MS)]
+    setup = TriggerSetup(high="START", mode="one-line", stop="")
+    assert setup.run(50 * MS) == []
+    setup.drive("START", 100 * MS, 200 * MS, level=False)
+    assert setup.run(300 * MS) == [(STOP, 100 * MS), (START, 200 * MS)]
 
 
 # ---------------------------------------------------------------- bounce and glitches
@@ -162,38 +162,38 @@ def test_high_at_start_up() -> None:
 
 def test_bounce_keeps_first_stamp() -> None:
     """A bouncing contact is one START with the stamp of its first edge."""
-    world = World(mode="one-line", stop="")
+    setup = TriggerSetup(mode="one-line", stop="")
     bounce = [10 * MS + us * US for us in (0, 20, 90, 300, 420, 900, 1300)]
-    world.drive("START", *bounce, 100 * MS)
-    assert world.run(200 * MS) == [(START, 10 * MS), (STOP, 100 * MS)]
-    assert world.trigger.edge_counters.glitches == 0
+    setup.drive("START", *bounce, 100 * MS)
+    assert setup.run(200 * MS) == [(START, 10 * MS), (STOP, 100 * MS)]
+    assert setup.trigger.edge_counters.glitches == 0
 
 
 @pytest.mark.parametrize("width_ns", [10 * US, 100 * US, GLITCH - 1])
 @pytest.mark.parametrize("high", [False, True])
 def test_glitch(width_ns: int, high: bool) -> None:
     """A pulse shorter than `glitch_us`, up or down, is counted and is nothing else."""
-    world = World(high="START" if high else "", mode="one-line", stop="")
-    world.drive("START", 10 * MS, 10 * MS + width_ns, level=not high)
-    assert world.run(20 * MS) == []
-    assert world.trigger.edge_counters.glitches == 1
+    setup = TriggerSetup(high="START" if high else "", mode="one-line", stop="")
+    setup.drive("START", 10 * MS, 10 * MS + width_ns, level=not high)
+    assert setup.run(20 * MS) == []
+    assert setup.trigger.edge_counters.glitches == 1
 
 
 def test_pulse_of_glitch_us() -> None:
     """A pulse of exactly `glitch_us` is real."""
-    world = World(mode="one-line", stop="")
-    world.drive("START", 10 * MS, 10 * MS + GLITCH)
-    assert world.run(20 * MS) == [(START, 10 * MS), (STOP, 10 * MS + GLITCH)]
+    setup = TriggerSetup(mode="one-line", stop="")
+    setup.drive("START", 10 * MS, 10 * MS + GLITCH)
+    assert setup.run(20 * MS) == [(START, 10 * MS), (STOP, 10 * MS + GLITCH)]
 
 
 def test_level_seen_too_late() -> None:
     """The kernel may look when the level is gone: the same edge twice is one, and one back to the level is none."""
-    world = World()
-    world.queue((False, MS, 1), (False, MS + US, 2))
-    assert world.poll(3 * MS) == []
-    assert world.trigger.edge_counters.glitches == 1
-    world.queue((True, 4 * MS, 3), (True, 4 * MS + US, 4))
-    assert world.poll(6 * MS) == [(START, 4 * MS)]
+    setup = TriggerSetup()
+    setup.queue((False, MS, 1), (False, MS + US, 2))
+    assert setup.poll(3 * MS) == []
+    assert setup.trigger.edge_counters.glitches == 1
+    setup.queue((True, 4 * MS, 3), (True, 4 * MS + US, 4))
+    assert setup.poll(6 * MS) == [(START, 4 * MS)]
 
 
 # ---------------------------------------------------------------- order
@@ -202,47 +202,47 @@ def test_level_seen_too_late() -> None:
 @pytest.mark.parametrize("chips", [{CHIP0: INPUTS}, {CHIP0: ("START",), CHIP1: ("NEW", "STOP")}])
 def test_order_across_lines(chips: dict[str, tuple[str, ...]]) -> None:
     """A clean STOP waits for the older START that still bounces; on one chip and on two."""
-    world = World(chips)
-    world.drive("START", *(10 * MS + us * US for us in (0, 400, 800, 1200, 1600)))
-    world.drive("STOP", 10 * MS + 100 * US)
-    assert world.poll(11 * MS) == []
-    assert world.poll(12 * MS) == []
-    assert world.poll(13 * MS) == [(START, 10 * MS), (STOP, 10 * MS + 100 * US)]
+    setup = TriggerSetup(chips)
+    setup.drive("START", *(10 * MS + us * US for us in (0, 400, 800, 1200, 1600)))
+    setup.drive("STOP", 10 * MS + 100 * US)
+    assert setup.poll(11 * MS) == []
+    assert setup.poll(12 * MS) == []
+    assert setup.poll(13 * MS) == [(START, 10 * MS), (STOP, 10 * MS + 100 * US)]
 
 
 def test_interrupts_overtake() -> None:
     """An edge that the kernel's thread hands over late, but within `glitch_us`, is told in its order and is no loss."""
-    world = World()
-    world.drive("START", MS)
-    world.drive("STOP", MS + 5 * US)
-    assert world.poll(0) == []
-    request = world.gpio.requests[0]
-    world.clock.sleep_until(world.t0 + MS + 5 * US)
-    world.gpio.now_ns()
+    setup = TriggerSetup()
+    setup.drive("START", MS)
+    setup.drive("STOP", MS + 5 * US)
+    assert setup.poll(0) == []
+    request = setup.gpio.requests[0]
+    setup.clock.sleep_until(setup.t0 + MS + 5 * US)
+    setup.gpio.now_ns()
     late = request.queue.popleft()
-    assert world.poll(MS + 10 * US) == []
+    assert setup.poll(MS + 10 * US) == []
     request.queue.append(late)
-    assert world.run(3 * MS, 100 * US) == [(START, MS), (STOP, MS + 5 * US)]
-    assert world.trigger.edge_counters.lost_edges == 0
+    assert setup.run(3 * MS, 100 * US) == [(START, MS), (STOP, MS + 5 * US)]
+    assert setup.trigger.edge_counters.lost_edges == 0
 
 
 def test_edges_that_the_kernel_joins() -> None:
     """Two interrupts before their thread has run are one event with the level after both: no loss, be it a glitch or not."""
-    world = World()
+    setup = TriggerSetup()
     rise, fall = gpiod.EdgeEvent.Type.RISING_EDGE.value, gpiod.EdgeEvent.Type.FALLING_EDGE.value
     told = (fall, MS + 20 * US, 2, 1), (rise, 5 * MS + 20 * US, 5, 2)  # kind, stamp, edges so far, events so far
-    world.gpio.requests[0].queue.extend(gpiod.EdgeEvent(k, world.t0 + t, 1, edges, n) for k, t, edges, n in told)
-    assert world.poll(9 * MS) == [(START, 5 * MS + 20 * US)]
-    assert (world.trigger.edge_counters.lost_edges, world.trigger.edge_counters.glitches) == (0, 1)
+    setup.gpio.requests[0].queue.extend(gpiod.EdgeEvent(k, setup.t0 + t, 1, edges, n) for k, t, edges, n in told)
+    assert setup.poll(9 * MS) == [(START, 5 * MS + 20 * US)]
+    assert (setup.trigger.edge_counters.lost_edges, setup.trigger.edge_counters.glitches) == (0, 1)
 
 
 def test_event_numbers_wrap() -> None:
     """The kernel's 32-bit event numbers wrap without a loss."""
-    world = World()
-    world.trigger._lines[0].seqno = 2**32 - 2
-    world.queue((True, MS, 2**32 - 1), (False, 3 * MS, 0), (True, 5 * MS, 1))
-    assert world.poll(9 * MS) == [(START, MS), (START, 5 * MS)]
-    assert world.trigger.edge_counters.lost_edges == 0
+    setup = TriggerSetup()
+    setup.trigger._lines[0].seqno = 2**32 - 2
+    setup.queue((True, MS, 2**32 - 1), (False, 3 * MS, 0), (True, 5 * MS, 1))
+    assert setup.poll(9 * MS) == [(START, MS), (START, 5 * MS)]
+    assert setup.trigger.edge_counters.lost_edges == 0
 
 
 # ---------------------------------------------------------------- losses and storms
@@ -250,129 +250,131 @@ def test_event_numbers_wrap() -> None:
 
 def test_overrun() -> None:
     """Dropped events are counted and told as one LOST; nothing is made up from what is left or from the level."""
-    world = World(mode="one-line", stop="", queue=4)
-    world.drive("START", 5 * MS)
-    assert world.run(6 * MS) == [(START, 5 * MS)]
-    world.drive("START", *(t * MS for t in range(10, 17)), level=False)
-    assert world.poll(20 * MS) == [(LOST, 13 * MS)]  # the first that was left
-    assert world.trigger.edge_counters.lost_edges == 3
-    world.drive("START", 30 * MS, 40 * MS)  # it is low now, though a START was told last
-    assert world.run(50 * MS) == [(START, 30 * MS), (STOP, 40 * MS)]
-    assert world.trigger.edge_counters.glitches == world.trigger.edge_counters.storms == 0
+    setup = TriggerSetup(mode="one-line", stop="", queue=4)
+    setup.drive("START", 5 * MS)
+    assert setup.run(6 * MS) == [(START, 5 * MS)]
+    setup.drive("START", *(t * MS for t in range(10, 17)), level=False)
+    assert setup.poll(20 * MS) == [(LOST, 13 * MS)]  # the first that was left
+    assert setup.trigger.edge_counters.lost_edges == 3
+    setup.drive("START", 30 * MS, 40 * MS)  # it is low now, though a START was told last
+    assert setup.run(50 * MS) == [(START, 30 * MS), (STOP, 40 * MS)]
+    assert setup.trigger.edge_counters.glitches == setup.trigger.edge_counters.storms == 0
 
 
 def test_blind_until_quiet() -> None:
     """After a loss nothing counts until all lines have been quiet for `glitch_us`; then the levels are read anew."""
-    world = World(mode="one-line", stop="", queue=4)
-    world.drive("START", *(t * 100 * US for t in (100, 110, 120, 130, 140, 144, 148)))
-    assert (world.poll(14_500 * US), world.trigger.blind) == ([(LOST, 12 * MS)], True)
-    assert (world.poll(15_000 * US), world.trigger.blind) == ([], True)
-    assert (world.poll(15_299 * US), world.trigger.blind) == ([], True)
-    assert (world.poll(15_300 * US), world.trigger.blind) == ([], False)
-    world.drive("START", 20 * MS, level=False)
-    assert world.poll(30 * MS) == [(STOP, 20 * MS)]
+    setup = TriggerSetup(mode="one-line", stop="", queue=4)
+    setup.drive("START", *(t * 100 * US for t in (100, 110, 120, 130, 140, 144, 148)))
+    assert (setup.poll(14_500 * US), setup.trigger.blind) == ([(LOST, 12 * MS)], True)
+    assert (setup.poll(15_000 * US), setup.trigger.blind) == ([], True)
+    assert (setup.poll(15_299 * US), setup.trigger.blind) == ([], True)
+    assert (setup.poll(15_300 * US), setup.trigger.blind) == ([], False)
+    setup.drive("START", 20 * MS, level=False)
+    assert setup.poll(30 * MS) == [(STOP, 20 * MS)]
 
 
 def test_loss_upon_loss() -> None:
     """A loss is told at once where it must be one, and losses that follow before it is quiet are only counted."""
-    world = World(queue=32)
-    world.drive("START", *(10 * MS + i * US for i in range(100)))
-    assert world.poll(10 * MS + 49 * US) == [(LOST, 10 * MS + 18 * US)]
-    assert world.trigger.edge_counters.lost_edges == 50 - 32
-    assert world.run(20 * MS) == []
-    assert world.trigger.edge_counters.lost_edges == 100 - 32 - 32
+    setup = TriggerSetup(queue=32)
+    setup.drive("START", *(10 * MS + i * US for i in range(100)))
+    assert setup.poll(10 * MS + 49 * US) == [(LOST, 10 * MS + 18 * US)]
+    assert setup.trigger.edge_counters.lost_edges == 50 - 32
+    assert setup.run(20 * MS) == []
+    assert setup.trigger.edge_counters.lost_edges == 100 - 32 - 32
 
 
 def test_loss_ends_what_is_open() -> None:
     """A loss drops bursts that are still open; an edge that only waited for them had settled, and comes before it."""
-    world = World({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
-    world.drive("START", *(t * 100 * US for t in (50, 54, 58, 62, 66, 70, 74, 78)))
-    world.drive("STOP", 5_100 * US)
-    assert world.poll(5_900 * US) == []
-    assert world.poll(10 * MS) == [(STOP, 5_100 * US), (LOST, 6_600 * US)]
-    assert world.poll(20 * MS) == []
+    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
+    setup.drive("START", *(t * 100 * US for t in (50, 54, 58, 62, 66, 70, 74, 78)))
+    setup.drive("STOP", 5_100 * US)
+    assert setup.poll(5_900 * US) == []
+    assert setup.poll(10 * MS) == [(STOP, 5_100 * US), (LOST, 6_600 * US)]
+    assert setup.poll(20 * MS) == []
 
 
 def test_nothing_between_loss_and_quiet() -> None:
     """An edge of another chip that came after the loss is not told: its STOP might be among what is lost."""
-    world = World({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
-    world.drive("STOP", *(t * MS for t in range(10, 15)))
-    world.drive("START", 15 * MS, 17 * MS)
-    assert world.poll(20 * MS) == [(LOST, 11 * MS)]
-    assert world.run(30 * MS) == []
+    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
+    setup.drive("STOP", *(t * MS for t in range(10, 15)))
+    setup.drive("START", 15 * MS, 17 * MS)
+    assert setup.poll(20 * MS) == [(LOST, 11 * MS)]
+    assert setup.run(30 * MS) == []
 
 
 @pytest.mark.parametrize("step_ns", [US, 10 * US])
 def test_storm(step_ns: int) -> None:
     """10,000 edges in a burst are one LOST at the first that is too many; the line works again when it is quiet."""
-    world = World(mode="one-line", stop="")
-    world.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
-    assert world.run(200 * MS) == [(LOST, 10 * MS + 2000 * step_ns)]
-    assert (world.trigger.edge_counters.storms, world.trigger.edge_counters.lost_edges) == (1, 0)
-    world.drive("START", 300 * MS, 400 * MS)
-    assert world.run(500 * MS) == [(START, 300 * MS), (STOP, 400 * MS)]
+    setup = TriggerSetup(mode="one-line", stop="")
+    setup.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
+    assert setup.run(200 * MS) == [(LOST, 10 * MS + 2000 * step_ns)]
+    assert (setup.trigger.edge_counters.storms, setup.trigger.edge_counters.lost_edges) == (1, 0)
+    setup.drive("START", 300 * MS, 400 * MS)
+    assert setup.run(500 * MS) == [(START, 300 * MS), (STOP, 400 * MS)]
 
 
 def test_storm_of_just_storm_edges() -> None:
     """A burst of `storm_edges` edges and not more is an edge or a glitch like any other."""
-    world = World(storm_edges=5)
-    world.drive("START", *(10 * MS + i * US for i in range(5)))
-    assert world.run(20 * MS) == [(START, 10 * MS)]
+    setup = TriggerSetup(storm_edges=5)
+    setup.drive("START", *(10 * MS + i * US for i in range(5)))
+    assert setup.run(20 * MS) == [(START, 10 * MS)]
 
 
 def test_storm_between_two_calls() -> None:
     """Of 10,000 edges between two calls the kernel keeps the last 1024: one LOST, and all the others counted."""
-    world = World()
-    world.drive("START", *(10 * MS + i * US for i in range(10_000)))
-    assert world.poll(50 * MS) == [(LOST, 10 * MS + 8976 * US)]
-    assert world.trigger.edge_counters.lost_edges == 8976
-    world.drive("START", 60 * MS)
-    assert world.run(70 * MS) == [(START, 60 * MS)]
+    setup = TriggerSetup()
+    setup.drive("START", *(10 * MS + i * US for i in range(10_000)))
+    assert setup.poll(50 * MS) == [(LOST, 10 * MS + 8976 * US)]
+    assert setup.trigger.edge_counters.lost_edges == 8976
+    setup.drive("START", 60 * MS)
+    assert setup.run(70 * MS) == [(START, 60 * MS)]
 
 
 def test_reading_is_bounded() -> None:
     """A call reads no more than `storm_edges` events and leaves the rest to the next one."""
-    world = World(storm_edges=100)
-    world.drive("START", *(10 * MS + i * US for i in range(1000)))
-    world.poll(50 * MS)
-    assert len(world.gpio.requests[0].queue) == 1000 - 100 // 2  # of two lines
-    assert [edge for _ in range(20) for edge in world.poll(50 * MS)] == [(LOST, 10 * MS + 100 * US)]
-    assert not world.trigger.blind
+    setup = TriggerSetup(storm_edges=100)
+    setup.drive("START", *(10 * MS + i * US for i in range(1000)))
+    setup.poll(50 * MS)
+    assert len(setup.gpio.requests[0].queue) == 1000 - 100 // 2  # of two lines
+    assert [edge for _ in range(20) for edge in setup.poll(50 * MS)] == [(LOST, 10 * MS + 100 * US)]
+    assert not setup.trigger.blind
 
 
 def test_unread_rest_of_a_burst() -> None:
     """A burst whose rest is still in the queue has not settled, though the call is long after it."""
-    world = World({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=3)  # one event of each chip a call
-    world.drive("START", 10 * MS, 10 * MS + 100 * US, 10 * MS + 200 * US)
-    world.drive("STOP", 11 * MS)
-    told = [world.poll((50 + i) * MS) for i in range(5)]
+    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=3)  # one event of each chip a call
+    setup.drive("START", 10 * MS, 10 * MS + 100 * US, 10 * MS + 200 * US)
+    setup.drive("STOP", 11 * MS)
+    told = [setup.poll((50 + i) * MS) for i in range(5)]
     assert [edge for edges in told for edge in edges] == [(START, 10 * MS), (STOP, 11 * MS)]
     assert told[0] == told[1] == []
-    assert world.trigger.edge_counters.glitches == 0
+    assert setup.trigger.edge_counters.glitches == 0
 
 
 def test_unread_edges_of_another_chip() -> None:
     """While one chip's queue is being worked off, edges come out as they become certain, and later ones wait."""
-    world = World({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2)  # one event of each chip a call
-    world.drive("START", 10 * MS, 20 * MS)
-    world.drive("STOP", *(t * MS for t in (1, 2, 3, 4)))
-    told = [world.poll((50 + i) * MS) for i in range(6)]
+    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2)  # one event of each chip a call
+    setup.drive("START", 10 * MS, 20 * MS)
+    setup.drive("STOP", *(t * MS for t in (1, 2, 3, 4)))
+    told = [setup.poll((50 + i) * MS) for i in range(6)]
     assert told == [[], [(STOP, 1 * MS)], [], [(STOP, 3 * MS)], [(START, 10 * MS)], []]
 
 
 def test_three_chips() -> None:
     """Each chip is read in each call, however few edges make a storm."""
-    world = World({CHIP0: ("START",), CHIP1: ("STOP",), "/dev/gpiochip2": ("NEW",)}, new_object="NEW", storm_edges=2)
-    world.drive("START", MS)
-    assert world.run(5 * MS) == [(START, MS)]
+    setup = TriggerSetup(
+        {CHIP0: ("START",), CHIP1: ("STOP",), "/dev/gpiochip2": ("NEW",)}, new_object="NEW", storm_edges=2
+    )
+    setup.drive("START", MS)
+    assert setup.run(5 * MS) == [(START, MS)]
 
 
 def test_chip_pulled_out() -> None:
     """A chip that goes away while it is read is a LineError that names a line of it and the errno."""
-    world = World()
-    world.gpio.refuse[CHIP0] = 19
+    setup = TriggerSetup()
+    setup.gpio.refuse[CHIP0] = 19
     with pytest.raises(LineError, match=r"cannot read gpio lines START: .*errno 19.*plug it in"):
-        world.poll(MS)
+        setup.poll(MS)
 
 
 # ---------------------------------------------------------------- any edges at all
@@ -405,12 +407,12 @@ def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
 @given(st.tuples(gaps, gaps, gaps), st.integers(20, 5000))
 def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) -> None:
     """Whatever three lines on two chips do and whenever calls come: the edges by the book, in order of time."""
-    world = World({CHIP0: ("NEW", "STOP"), CHIP1: ("START",)}, new_object="NEW")
+    setup = TriggerSetup({CHIP0: ("NEW", "STOP"), CHIP1: ("START",)}, new_object="NEW")
     wanted = []
     for name, kind, gaps_us in zip(("START", "STOP", "NEW"), (START, STOP, NEW_OBJECT), lines, strict=True):
-        world.drive(name, *toggles(gaps_us))
+        setup.drive(name, *toggles(gaps_us))
         wanted += [(kind, t_ns) for t_ns, level in settled(toggles(gaps_us)) if level]
-    told = world.run(max(sum(gaps_us) for gaps_us in lines) * US + MS, step_us * US)
+    told = setup.run(max(sum(gaps_us) for gaps_us in lines) * US + MS, step_us * US)
     assert sorted(told) == sorted(wanted)
     assert [t_ns for _, t_ns in told] == sorted(t_ns for _, t_ns in wanted)
 
@@ -419,17 +421,17 @@ def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) 
 @given(gaps, st.integers(20, 5000), st.integers(2, 30), st.sampled_from([2, 8, 64]), st.booleans())
 def test_any_losses(gaps_us: list[int], step_us: int, storm_edges: int, queue: int, high: bool) -> None:
     """START and STOP alternate unless LOST lies between, stamps never go back, nothing too short makes an edge."""
-    world = World(high="START" if high else "", mode="one-line", stop="", storm_edges=storm_edges, queue=queue)
+    setup = TriggerSetup(high="START" if high else "", mode="one-line", stop="", storm_edges=storm_edges, queue=queue)
     times = toggles(gaps_us)
-    world.drive("START", *times, level=not high)
-    told = world.run((sum(gaps_us) + 1500 + 50 * step_us) * US, step_us * US)
+    setup.drive("START", *times, level=not high)
+    told = setup.run((sum(gaps_us) + 1500 + 50 * step_us) * US, step_us * US)
     assert all(a != b or a is LOST for (a, _), (b, _) in pairwise(told))
     assert all(a <= b for (_, a), (_, b) in pairwise(told))
     by_the_book = {(START if level != high else STOP, t_ns) for t_ns, level in settled(times)}
     assert {edge for edge in told if edge[0] is not LOST} <= by_the_book
-    lost = world.trigger.edge_counters.lost_edges + world.trigger.edge_counters.storms
+    lost = setup.trigger.edge_counters.lost_edges + setup.trigger.edge_counters.storms
     assert bool(lost) == any(kind is LOST for kind, _ in told)
-    assert not world.trigger.blind
+    assert not setup.trigger.blind
 
 
 # ---------------------------------------------------------------- finding and requesting lines

@@ -19,35 +19,35 @@ from appliance.io.usb_sensor import UsbSensor
 from appliance.recording.sweep_window import SweepCutter
 from appliance.sim import skin
 from appliance.sim.devices import SimDevices
-from tests.factories.simulated_box import SECOND, idle_world
+from tests.factories.simulated_box import SECOND, idle_devices
 
 FMT = skin.FORMAT
 COUNTS = 1 << 32
 Alter = Callable[[wire.Packet, wire.Packet], tuple[int, int]]
 
 
-def sensor_on(world: SimDevices, **settings) -> UsbSensor:
-    """The real driver on this world's bus."""
-    return UsbSensor(SensorConfig(**settings), FMT, world.clock, world.backend)
+def sensor_on(simulated: SimDevices, **settings) -> UsbSensor:
+    """The real driver on the simulated bus."""
+    return UsbSensor(SensorConfig(**settings), FMT, simulated.clock, simulated.backend)
 
 
-def read_for(sensor: UsbSensor, world: SimDevices, seconds: float) -> tuple[Frames, set[str]]:
-    """All frames of some seconds of the world, and the states that were seen."""
-    end_ns = world.clock.now_ns() + round(seconds * SECOND)
+def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> tuple[Frames, set[str]]:
+    """All frames of some seconds, and the states that were seen."""
+    end_ns = simulated.clock.now_ns() + round(seconds * SECOND)
     parts, states = [], set()
-    while world.clock.now_ns() < end_ns:
+    while simulated.clock.now_ns() < end_ns:
         parts.append(sensor.read())
         states.add(sensor.state)
     return Frames.joined(parts), states
 
 
-def late_ms(frames: Frames, world: SimDevices) -> np.ndarray:
+def late_ms(frames: Frames, simulated: SimDevices) -> np.ndarray:
     """By how many ms each frame's stamp [n] is later than the moment at which the board took it."""
-    taken_ns = [world.backend.board.frame_ns(int(seq) & ((1 << EPOCH_BITS) - 1)) for seq in frames.seq]
+    taken_ns = [simulated.backend.board.frame_ns(int(seq) & ((1 << EPOCH_BITS) - 1)) for seq in frames.seq]
     return (frames.t_ns - np.array(taken_ns)) / 1e6
 
 
-def alter(world: SimDevices, how: Alter, packets: int) -> None:
+def alter(simulated: SimDevices, how: Alter, packets: int) -> None:
     """The next packets get another number and another time, as `how` says of (a packet, the first one)."""
     first: list[wire.Packet] = []
 
@@ -59,7 +59,7 @@ def alter(world: SimDevices, how: Alter, packets: int) -> None:
         seq, t_us = how(packet, first[0])
         return wire.pack(seq % COUNTS, t_us % COUNTS, packet.taxels, packet.flags)
 
-    world.backend.mangle = mangle
+    simulated.backend.mangle = mangle
 
 
 @pytest.mark.parametrize("packet_frames", [1, 6])
@@ -77,28 +77,28 @@ def alter(world: SimDevices, how: Alter, packets: int) -> None:
 )
 def test_a_clock_that_cannot_be_right(how: Alter, packets: int, packet_frames: int):
     """Where the board's clock parts from its count: mismatch, no frame gets a wrong time, and it streams again after."""
-    world = idle_world(packet_frames=packet_frames)
-    sensor = sensor_on(world)
-    read_for(sensor, world, 3)
-    alter(world, how, packets)
-    frames, states = read_for(sensor, world, 4)
+    simulated = idle_devices(packet_frames=packet_frames)
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 3)
+    alter(simulated, how, packets)
+    frames, states = read_for(sensor, simulated, 4)
     assert states == {"streaming", "mismatch"}
-    assert np.abs(late_ms(frames, world)).max(initial=0) < 50
-    world.backend.mangle = bytes
-    read_for(sensor, world, 1)
-    frames, states = read_for(sensor, world, 2)
+    assert np.abs(late_ms(frames, simulated)).max(initial=0) < 50
+    simulated.backend.mangle = bytes
+    read_for(sensor, simulated, 1)
+    frames, states = read_for(sensor, simulated, 2)
     assert states == {"streaming"}
-    assert np.abs(late_ms(frames, world)).max() < 1
+    assert np.abs(late_ms(frames, simulated)).max() < 1
 
 
 @pytest.mark.parametrize("ahead", [1_000, 10_000, 1 << 30])
 def test_a_count_that_jumps(ahead: int):
     """A count that jumps ahead while the clock does not is no loss of so many frames: mismatch, and started anew."""
-    world = idle_world()
-    sensor = sensor_on(world)
-    read_for(sensor, world, 1)
-    alter(world, lambda p, first: (p.seq + ahead, p.t_us), 10**9)
-    _, states = read_for(sensor, world, 2)
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 1)
+    alter(simulated, lambda p, first: (p.seq + ahead, p.t_us), 10**9)
+    _, states = read_for(sensor, simulated, 2)
     assert states == {"streaming", "mismatch"}
     assert sensor.state == "streaming"
     assert sensor.counters.enumerations == 2
@@ -109,12 +109,12 @@ def test_a_count_that_jumps(ahead: int):
 def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
     """500 ppm, stamps that waver by half a frame, both counters at their wrap, two seconds lost: nothing to refuse."""
     rng = np.random.default_rng(7)
-    world = idle_world(packet_frames=packet_frames, ppm=ppm, first_seq=COUNTS - 2000, fifo_frames=300)
-    sensor = sensor_on(world, read_bytes=8192)
-    alter(world, lambda p, first: (p.seq, p.t_us + COUNTS - 5_000_000 + int(rng.integers(-600, 600))), 10**9)
-    states = read_for(sensor, world, 8)[1]
-    world.clock.sleep_until(world.clock.now_ns() + 2 * SECOND)
-    states |= read_for(sensor, world, 4)[1]
+    simulated = idle_devices(packet_frames=packet_frames, ppm=ppm, first_seq=COUNTS - 2000, fifo_frames=300)
+    sensor = sensor_on(simulated, read_bytes=8192)
+    alter(simulated, lambda p, first: (p.seq, p.t_us + COUNTS - 5_000_000 + int(rng.integers(-600, 600))), 10**9)
+    states = read_for(sensor, simulated, 8)[1]
+    simulated.clock.sleep_until(simulated.clock.now_ns() + 2 * SECOND)
+    states |= read_for(sensor, simulated, 4)[1]
     assert states == {"streaming"}
     assert sensor.counters.lost_frames > 1000
     assert sensor.counters.enumerations == 1
@@ -125,24 +125,24 @@ def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
     """A board that stamps late by up to 4 ms and in whole milliseconds, so that time seems to stand or go back: no refusal."""
     rng = np.random.default_rng(8)
     fmt = SweepFormat(4, 4, rate_hz, 1500, "uint8")
-    world = idle_world(60, fmt, packet_frames=packet_frames)
-    sensor = UsbSensor(SensorConfig(silence_ms=2000), fmt, world.clock, world.backend)
-    alter(world, lambda p, first: (p.seq, (p.t_us + int(rng.integers(0, 4000))) // 1000 * 1000), 10**9)
-    frames, states = read_for(sensor, world, 8)
+    simulated = idle_devices(60, fmt, packet_frames=packet_frames)
+    sensor = UsbSensor(SensorConfig(silence_ms=2000), fmt, simulated.clock, simulated.backend)
+    alter(simulated, lambda p, first: (p.seq, (p.t_us + int(rng.integers(0, 4000))) // 1000 * 1000), 10**9)
+    frames, states = read_for(sensor, simulated, 8)
     assert states == {"streaming"}
-    assert np.abs(late_ms(frames, world)).max() < 6
+    assert np.abs(late_ms(frames, simulated)).max() < 6
 
 
 def test_a_stalled_endpoint_is_cleared():
     """errno 32 is not for ever: the endpoint is cleared, and the board streams again without being replugged."""
-    world = idle_world()
-    sensor = sensor_on(world)
-    read_for(sensor, world, 1)
-    world.backend.halted = True
-    states = read_for(sensor, world, 1)[1]
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 1)
+    simulated.backend.halted = True
+    states = read_for(sensor, simulated, 1)[1]
     assert states == {"lost", "streaming"}
     assert sensor.state == "streaming"
-    assert not world.backend.halted
+    assert not simulated.backend.halted
 
 
 @pytest.mark.parametrize(
@@ -150,8 +150,8 @@ def test_a_stalled_endpoint_is_cleared():
 )
 def test_a_serial_number_that_is_no_text(string: bytes, state: str):
     """Where the serial number chooses the board and is no text: a state that says so, not the end of the program."""
-    world = idle_world()
-    backend, control = world.backend, world.backend.ctrl_transfer
+    simulated = idle_devices()
+    backend, control = simulated.backend, simulated.backend.ctrl_transfer
 
     def spoken(handle, kind, request, value, index, data, ms):
         if kind == 0x80 and value == 0x303:
@@ -160,8 +160,8 @@ def test_a_serial_number_that_is_no_text(string: bytes, state: str):
         return control(handle, kind, request, value, index, data, ms)
 
     backend.ctrl_transfer = spoken
-    sensor = sensor_on(world, serial="SIM0001")
-    read_for(sensor, world, 1)
+    sensor = sensor_on(simulated, serial="SIM0001")
+    read_for(sensor, simulated, 1)
     assert sensor.state == state
     assert "udev" not in str(sensor.trouble) or state == "absent"
 
@@ -171,16 +171,16 @@ def test_windows_over_many_offsets(ppm: float):
     """80 ppm, one packet in a hundred 50 to 200 ms late: 120 windows with edges anywhere, each within a frame of the middle."""
     rng = np.random.default_rng(11)
     late = (150_000 + int(rng.integers(50, 200)) * 1_000_000 * (rng.random() < 0.01) for _ in iter(int, 1))
-    world = idle_world(ppm=ppm, latency=lambda: next(late), fifo_frames=3000, packet_frames=6)
-    sensor, board = sensor_on(world), world.backend.board
+    simulated = idle_devices(ppm=ppm, latency=lambda: next(late), fifo_frames=3000, packet_frames=6)
+    sensor, board = sensor_on(simulated), simulated.backend.board
     recorders = [SweepCutter(FMT, SweepConfig()) for _ in range(10)]
-    begun = world.clock.now_ns()
+    begun = simulated.clock.now_ns()
     edges = [
         [round(begun + (5 + 2.4 * k + rng.uniform(0, 0.3)) * SECOND) for k in range(13)] for _ in recorders
     ]  # a stop is the next one's start
     apart = []
-    while world.clock.now_ns() < begun + 35 * SECOND:
-        frames, now = sensor.read(), world.clock.now_ns()
+    while simulated.clock.now_ns() < begun + 35 * SECOND:
+        frames, now = sensor.read(), simulated.clock.now_ns()
         for recorder, own in zip(recorders, edges, strict=True):
             recorder.put(frames, now)
             while own and own[0] <= now:
@@ -198,22 +198,22 @@ def test_windows_over_many_offsets(ppm: float):
 
 def test_a_box_that_had_no_processor_does_not_call_the_skin_silent():
     """Pauses of the box, between reads and within one, are no silence; half a second of listening in vain is."""
-    world = idle_world(fifo_frames=6000)
-    sensor = sensor_on(world)
-    read_for(sensor, world, 1)
-    bulk_read = world.backend.bulk_read
+    simulated = idle_devices(fifo_frames=6000)
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 1)
+    bulk_read = simulated.backend.bulk_read
 
     def late(*args) -> int:
-        world.clock.sleep_until(world.clock.now_ns() + 700_000_000)
+        simulated.clock.sleep_until(simulated.clock.now_ns() + 700_000_000)
         raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
 
     for _ in range(3):
-        world.clock.sleep_until(world.clock.now_ns() + 700_000_000)
-        world.backend.bulk_read = late
+        simulated.clock.sleep_until(simulated.clock.now_ns() + 700_000_000)
+        simulated.backend.bulk_read = late
         sensor.read()
-        world.backend.bulk_read = bulk_read
+        simulated.backend.bulk_read = bulk_read
         assert len(sensor.read())
     assert sensor.counters.enumerations == 1
     assert sensor.counters.lost_frames == 0
-    world.backend.board.running = False
-    assert "silent" in read_for(sensor, world, 1)[1]
+    simulated.backend.board.running = False
+    assert "silent" in read_for(sensor, simulated, 1)[1]

@@ -13,22 +13,22 @@ from appliance.io import packets
 from appliance.io.usb_sensor import UsbSensor
 from appliance.sim import rig, skin
 from appliance.sim.devices import SimDevices
-from tests.factories.simulated_box import SECOND, idle_world, numbered
+from tests.factories.simulated_box import SECOND, idle_devices, numbered
 
 FMT = skin.FORMAT
 
 
-def sensor_on(world: SimDevices, fmt: SweepFormat = FMT, **settings) -> UsbSensor:
-    """The real driver on this world's bus."""
-    link = "acm" if world.backend.acm else "vendor"
-    return UsbSensor(SensorConfig(link=link, **settings), fmt, world.clock, world.backend)
+def sensor_on(simulated: SimDevices, fmt: SweepFormat = FMT, **settings) -> UsbSensor:
+    """The real driver on the simulated bus."""
+    link = "acm" if simulated.backend.acm else "vendor"
+    return UsbSensor(SensorConfig(link=link, **settings), fmt, simulated.clock, simulated.backend)
 
 
-def read_for(sensor: UsbSensor, world: SimDevices, seconds: float) -> Frames:
-    """All frames of some seconds of the world."""
-    end_ns = world.clock.now_ns() + round(seconds * SECOND)
+def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> Frames:
+    """All frames of some seconds."""
+    end_ns = simulated.clock.now_ns() + round(seconds * SECOND)
     parts = []
-    while world.clock.now_ns() < end_ns:
+    while simulated.clock.now_ns() < end_ns:
         parts.append(sensor.read())
     return Frames.joined(parts)
 
@@ -43,27 +43,27 @@ def check_content(frames: Frames) -> None:
 @pytest.mark.parametrize("acm", [False, True])
 def test_streams_without_loss(acm: bool):
     """A healthy board, vendor class or CDC-ACM: every frame in order, its time within a millisecond of the truth."""
-    world = idle_world(acm=acm)
-    sensor = sensor_on(world)
-    frames = read_for(sensor, world, 5)
+    simulated = idle_devices(acm=acm)
+    sensor = sensor_on(simulated)
+    frames = read_for(sensor, simulated, 5)
     assert sensor.state == "streaming"
     assert sensor.trouble is None
     assert (np.diff(frames.seq) == 1).all()
     assert len(frames) > 3700
     check_content(frames)
-    truth = np.array([world.backend.board.frame_ns(int(s)) for s in frames.seq])
+    truth = np.array([simulated.backend.board.frame_ns(int(s)) for s in frames.seq])
     assert np.abs(frames.t_ns - truth).max() < 1_000_000
     assert sensor.identity.serial == "SIM0001"
     sensor.close()
-    assert not world.backend.board.running
+    assert not simulated.backend.board.running
 
 
 def test_acm_takes_the_board_from_the_kernel():
     """cdc_acm holds a laboratory board at first; it is detached."""
-    world = idle_world(acm=True)
-    assert world.backend.kernel_driver
-    read_for(sensor_on(world), world, 0.1)
-    assert not world.backend.kernel_driver
+    simulated = idle_devices(acm=True)
+    assert simulated.backend.kernel_driver
+    read_for(sensor_on(simulated), simulated, 0.1)
+    assert not simulated.backend.kernel_driver
 
 
 def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
@@ -73,9 +73,9 @@ def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
         raise usb.core.NoBackendError("No backend available")
 
     monkeypatch.setattr(usb.core, "find", no_backend)
-    world = idle_world()
-    sensor = sensor_on(world)
-    read_for(sensor, world, 0.3)
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 0.3)
     assert "apt install libusb-1.0-0" in str(sensor.trouble)
 
 
@@ -92,38 +92,38 @@ def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
 )
 def test_failures_have_their_state_and_end(call: str, code: int, state: str, hint: str):
     """An errno at open, claim, request or read: its own state and message; when it is over, frames come again."""
-    world = idle_world()
-    sensor = sensor_on(world)
-    world.backend.errors[call] = code
-    read_for(sensor, world, 1)
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    simulated.backend.errors[call] = code
+    read_for(sensor, simulated, 1)
     assert sensor.state == state
     assert hint in str(sensor.trouble)
-    world.backend.errors.clear()
-    assert len(read_for(sensor, world, 1)) > 100
+    simulated.backend.errors.clear()
+    assert len(read_for(sensor, simulated, 1)) > 100
     assert sensor.state == "streaming"
 
 
 @pytest.mark.parametrize("code", [errno.EACCES, errno.EIO])
 def test_serial_number_that_cannot_be_read(code: int):
     """A board whose descriptors may not be read is a board that is denied or failing, not another board."""
-    world = idle_world()
-    world.backend.errors["control"] = code
-    sensor = sensor_on(world, serial="SIM0001")
-    read_for(sensor, world, 0.3)
+    simulated = idle_devices()
+    simulated.backend.errors["control"] = code
+    sensor = sensor_on(simulated, serial="SIM0001")
+    read_for(sensor, simulated, 0.3)
     assert sensor.state in ("denied", "lost")
     assert "absent" not in str(sensor.trouble)
 
 
 def test_unplug_and_replug_in_mid_read():
     """errno 19 while reading; back again: a new epoch, numbers never look adjacent, content is right."""
-    world = idle_world()
-    sensor = sensor_on(world)
-    now = world.clock.now_ns()
-    world.backend.at(now + 2 * SECOND, world.backend.unplug)
-    world.backend.at(now + 3 * SECOND, world.backend.plug)
-    frames = read_for(sensor, world, 2.5)
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    now = simulated.clock.now_ns()
+    simulated.backend.at(now + 2 * SECOND, simulated.backend.unplug)
+    simulated.backend.at(now + 3 * SECOND, simulated.backend.plug)
+    frames = read_for(sensor, simulated, 2.5)
     assert sensor.state in ("lost", "absent")
-    later = read_for(sensor, world, 2)
+    later = read_for(sensor, simulated, 2)
     assert sensor.state == "streaming"
     assert sensor.counters.enumerations == 2
     assert set(frames.seq >> EPOCH_BITS) == {0}
@@ -135,8 +135,8 @@ def test_unplug_and_replug_in_mid_read():
 
 def test_timeouts_with_partial_data():
     """Transfers cut anywhere by a timeout: the rest is put to what came before, no frame is lost or counted."""
-    world = idle_world()
-    sensor = sensor_on(world)
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
     rng = np.random.default_rng(0)
     held = b""
 
@@ -147,8 +147,8 @@ def test_timeouts_with_partial_data():
         held = data[cut:]
         return data[:cut]
 
-    world.backend.mangle = torn
-    frames = read_for(sensor, world, 3)
+    simulated.backend.mangle = torn
+    frames = read_for(sensor, simulated, 3)
     assert (np.diff(frames.seq) == 1).all()
     assert len(frames) > 2200
     check_content(frames)
@@ -157,14 +157,14 @@ def test_timeouts_with_partial_data():
 
 def test_zero_length_packets():
     """Zero-length packets in between change nothing; nothing but them is silence."""
-    world = idle_world()
-    sensor = sensor_on(world)
-    board, every = world.backend.board, iter(range(10**6))
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    board, every = simulated.backend.board, iter(range(10**6))
     take = board.take
-    world.backend.mangle = lambda data: data
+    simulated.backend.mangle = lambda data: data
     board.take = lambda: b"" if next(every) % 3 == 0 else take()
     due = board.due_ns
-    frames = read_for(sensor, world, 2)
+    frames = read_for(sensor, simulated, 2)
     assert (np.diff(frames.seq) == 1).all()
     assert due() is not None
     board.take = lambda: (take(), b"")[1]
@@ -174,12 +174,12 @@ def test_zero_length_packets():
 
 def test_overflow_loses_one_transfer():
     """A transfer larger than asked for is lost, counted, and seen in the numbers; streaming goes on."""
-    world = idle_world()
-    sensor = sensor_on(world)
-    read_for(sensor, world, 1)
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 1)
     once = iter([bytes(100_000)])
-    world.backend.mangle = lambda data: next(once, data)
-    frames = read_for(sensor, world, 1)
+    simulated.backend.mangle = lambda data: next(once, data)
+    frames = read_for(sensor, simulated, 1)
     assert sensor.state == "streaming"
     assert sensor.counters.overflows == 1
     assert sensor.counters.lost_frames == 4
@@ -188,11 +188,11 @@ def test_overflow_loses_one_transfer():
 
 def test_garbage_on_the_cable():
     """Corrupted transfers are counted in bytes and frames; what is intact is right."""
-    world = idle_world()
-    sensor = sensor_on(world)
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
     count = iter(range(10**6))
-    world.backend.mangle = lambda data: bytes(len(data)) if next(count) % 10 == 9 else data
-    frames = read_for(sensor, world, 3)
+    simulated.backend.mangle = lambda data: bytes(len(data)) if next(count) % 10 == 9 else data
+    frames = read_for(sensor, simulated, 3)
     assert sensor.counters.garbage_bytes > 0
     assert sensor.counters.lost_frames == 4 * (next(count) // 10)
     check_content(frames)
@@ -200,11 +200,11 @@ def test_garbage_on_the_cable():
 
 def test_a_host_that_pauses_too_long():
     """Two seconds without a read overflow the FIFO: the newest frames come, the gap is counted, the board says so."""
-    world = idle_world(fifo_frames=188)
-    sensor = sensor_on(world)
-    read_for(sensor, world, 1)
-    world.clock.sleep_until(world.clock.now_ns() + 2 * SECOND)
-    frames = read_for(sensor, world, 1)
+    simulated = idle_devices(fifo_frames=188)
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 1)
+    simulated.clock.sleep_until(simulated.clock.now_ns() + 2 * SECOND)
+    frames = read_for(sensor, simulated, 1)
     assert sensor.counters.fifo_overflows == 1
     assert sensor.counters.lost_frames == pytest.approx(1500 - 188, abs=8)
     check_content(frames)
@@ -221,35 +221,35 @@ def test_a_host_that_pauses_too_long():
 )
 def test_a_board_that_does_not_fit(change: dict, hint: str):
     """Another protocol, grid, digit type or rate: state mismatch, both sides named; a fitting board is taken up."""
-    world = idle_world()
-    board = world.backend.board
+    simulated = idle_devices()
+    board = simulated.backend.board
     before = {name: getattr(board, name) for name in change}
     for name, fields in change.items():
         setattr(board, name, replace(before[name], **fields))
-    sensor = sensor_on(world)
-    assert len(read_for(sensor, world, 1)) == 0
+    sensor = sensor_on(simulated)
+    assert len(read_for(sensor, simulated, 1)) == 0
     assert sensor.state == "mismatch"
     assert hint in str(sensor.trouble)
     for name, value in before.items():
         setattr(board, name, value)
-    assert len(read_for(sensor, world, 1)) > 100
+    assert len(read_for(sensor, simulated, 1)) > 100
 
 
 def test_a_board_that_answers_nonsense(monkeypatch: pytest.MonkeyPatch):
     """Too short an identity is a mismatch that points to the firmware."""
-    world = idle_world()
+    simulated = idle_devices()
     monkeypatch.setattr(packets, "pack_identity", lambda who: b"\x01")
-    sensor = sensor_on(world)
-    read_for(sensor, world, 0.3)
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 0.3)
     assert sensor.state == "mismatch"
     assert "check the firmware" in str(sensor.trouble)
 
 
 def test_frames_of_another_form_than_announced():
     """A board that announces 4x4 and sends 2x2 is a mismatch, and its frames are not taken."""
-    world = idle_world()
-    world.backend.mangle = lambda data: packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
-    sensor = sensor_on(world)
+    simulated = idle_devices()
+    simulated.backend.mangle = lambda data: packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
+    sensor = sensor_on(simulated)
     states = []
     for _ in range(10):
         assert len(sensor.read()) == 0
@@ -259,47 +259,47 @@ def test_frames_of_another_form_than_announced():
 
 def test_no_fitting_interface():
     """A CDC-ACM board where a vendor device is configured: the message names the setting."""
-    world = idle_world(acm=True)
-    sensor = UsbSensor(SensorConfig(link="vendor"), FMT, world.clock, world.backend)
-    read_for(sensor, world, 0.3)
+    simulated = idle_devices(acm=True)
+    sensor = UsbSensor(SensorConfig(link="vendor"), FMT, simulated.clock, simulated.backend)
+    read_for(sensor, simulated, 0.3)
     assert sensor.state == "mismatch"
     assert "sensor.link" in str(sensor.trouble)
 
 
 def test_acm_board_that_never_answers():
     """A CDC-ACM board that ignores requests: no hang, a state, and another try."""
-    world = idle_world(acm=True)
-    world.backend.board.request = lambda request: b""
-    sensor = sensor_on(world)
-    read_for(sensor, world, 3)
+    simulated = idle_devices(acm=True)
+    simulated.backend.board.request = lambda request: b""
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 3)
     assert sensor.state != "streaming"
     assert sensor.trouble is not None
 
 
 def test_acm_board_that_answers_a_byte_at_a_time():
     """A reply that never gets whole is given up after its half second, however much of it still comes."""
-    world = idle_world(acm=True)
-    sensor = sensor_on(world)
-    backend = world.backend
+    simulated = idle_devices(acm=True)
+    sensor = sensor_on(simulated)
+    backend = simulated.backend
     backend.bulk_write = lambda *args: 1
 
     def a_byte(handle, ep, intf, buff, ms) -> int:
-        world.clock.sleep_until(world.clock.now_ns() + 400_000_000)
+        simulated.clock.sleep_until(simulated.clock.now_ns() + 400_000_000)
         return 1
 
     backend.bulk_read = a_byte
-    begun = world.clock.now_ns()
+    begun = simulated.clock.now_ns()
     sensor.read()
     assert sensor.state == "mismatch"
-    assert world.clock.now_ns() - begun < 3 * SECOND
+    assert simulated.clock.now_ns() - begun < 3 * SECOND
 
 
 def test_another_format_is_not_other_code():
     """16x1 int16 at 35.61 Hz over the same wire."""
     fmt = SweepFormat(16, 1, 35.61, 128, "int16")
-    world = idle_world(600, fmt)
-    sensor = sensor_on(world, fmt)
-    frames = read_for(sensor, world, 20)
+    simulated = idle_devices(600, fmt)
+    sensor = sensor_on(simulated, fmt)
+    frames = read_for(sensor, simulated, 20)
     assert frames.taxels.dtype == np.int16
     assert frames.taxels.shape[1:] == (16, 1)
     assert (np.diff(frames.seq) == 1).all()
@@ -309,20 +309,20 @@ def test_another_format_is_not_other_code():
 @pytest.mark.parametrize("replugged", [True, False])
 def test_a_board_whose_clock_starts_anew(replugged: bool):
     """After a replug, or a crash of the firmware that USB does not notice, times and numbers begin a new epoch, and are right."""
-    world = idle_world(first_seq=1_000_000)
-    sensor = sensor_on(world)
-    now = world.clock.now_ns()
+    simulated = idle_devices(first_seq=1_000_000)
+    sensor = sensor_on(simulated)
+    now = simulated.clock.now_ns()
 
     def swap() -> None:
-        world.backend.board = rig.Board(FMT, world.robot, world.clock)
-        world.backend.board.running = not replugged
+        simulated.backend.board = rig.Board(FMT, simulated.robot, simulated.clock)
+        simulated.backend.board.running = not replugged
 
     if replugged:
-        world.backend.at(now + 2 * SECOND, world.backend.unplug)
-    world.backend.at(now + 3 * SECOND, swap)
-    read_for(sensor, world, 3.2)
-    frames = read_for(sensor, world, 2)
+        simulated.backend.at(now + 2 * SECOND, simulated.backend.unplug)
+    simulated.backend.at(now + 3 * SECOND, swap)
+    read_for(sensor, simulated, 3.2)
+    frames = read_for(sensor, simulated, 2)
     assert sensor.counters.enumerations == 1 + replugged
     assert set(frames.seq >> EPOCH_BITS) == {1}
-    truth = np.array([world.backend.board.frame_ns(int(s) & ((1 << EPOCH_BITS) - 1)) for s in frames.seq])
+    truth = np.array([simulated.backend.board.frame_ns(int(s) & ((1 << EPOCH_BITS) - 1)) for s in frames.seq])
     assert np.abs(frames.t_ns - truth).max() < 1_000_000

@@ -150,7 +150,7 @@ def test_its_folder_is_ready_before_the_first_sweep(tmp_path: Path):
 
 def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tmp_path: Path):
     """The sentence is on the line before the disk is asked for anything; and the sweep is in the box."""
-    world = devices.build(skin.FORMAT, script.tubes(1, 2), rig.VirtualClock(), "sim")
+    simulated = devices.build(skin.FORMAT, script.tubes(1, 2), rig.VirtualClock(), "sim")
     made: Rigged
     black = BlackBox(tmp_path, skin.FORMAT, 1)
     heard_before: list[int] = []
@@ -159,8 +159,8 @@ def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tm
         made.listen(0.05)
         heard_before.append(sum(",RES," in line for line in made.heard))
 
-    made = rigged(world, observers=[OnSweep(listen), black])
-    made.until(lambda: world.finished(made.box.answered))
+    made = rigged(simulated, observers=[OnSweep(listen), black])
+    made.until(lambda: simulated.finished(made.box.answered))
     assert heard_before == [1, 2]
     assert held(tmp_path) == [2]
     black.close()

@@ -44,18 +44,18 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     rng = np.random.default_rng(5)
     acts = list(script.tubes(1010, 8))
     acts[3] = rig.Act(acts[3].frames, acts[3].start, acts[3].stop, acts[3].label, new_object=True)
-    world = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
-    world.backend.board = rig.Board(
-        skin.FORMAT, world.robot, world.clock, ppm=80,
+    simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
+    simulated.backend.board = rig.Board(
+        skin.FORMAT, simulated.robot, simulated.clock, ppm=80,
         latency=lambda: int(rng.exponential(100_000) + (rng.random() < 0.01) * rng.uniform(5e6, 4e7)),
     )  # fmt: skip
-    world.backend.mangle = lambda data: b"" if rng.random() < 0.001 else data
-    begin = world.clock.now_ns()
-    world.backend.at(begin + 9 * SECOND, world.backend.unplug)
-    world.backend.at(begin + 10 * SECOND, world.backend.plug)
+    simulated.backend.mangle = lambda data: b"" if rng.random() < 0.001 else data
+    begin = simulated.clock.now_ns()
+    simulated.backend.at(begin + 9 * SECOND, simulated.backend.unplug)
+    simulated.backend.at(begin + 10 * SECOND, simulated.backend.plug)
     capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
-    box = rigged(world, capture=capture)
-    first = box.until(lambda: world.finished(box.box.answered))
+    box = rigged(simulated, capture=capture)
+    first = box.until(lambda: simulated.finished(box.box.answered))
     capture.close()
     verdicts, sweeps = played(tmp_path / "capture", default_bundle)
     assert [(v.sweep, v.status, v.label, v.fused, v.lost) for v in verdicts] == [
@@ -72,15 +72,15 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
 
 def test_commands_are_part_of_a_capture(rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path):
     """NEW and ABORT change what comes after them, so they are captured: replayed sweeps fuse and end as they did."""
-    world = devices.build(skin.FORMAT, script.tubes(1014, 5), rig.VirtualClock(), "sim")
+    simulated = devices.build(skin.FORMAT, script.tubes(1014, 5), rig.VirtualClock(), "sim")
     capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
-    box = rigged(world, capture=capture)
+    box = rigged(simulated, capture=capture)
     first = box.until(lambda: box.box.answered == 1)
     assert ",NEW,ok" in box.ask("$PPLP,NEW")
     first += box.until(lambda: box.box.answered == 3)
     first += box.seconds(2)
     os.write(box.far_end, b"$PPLP,ABORT\r\n")
-    first += box.until(lambda: world.finished(box.box.answered))
+    first += box.until(lambda: simulated.finished(box.box.answered))
     capture.close()
     verdicts, _ = played(tmp_path / "capture", default_bundle)
     assert [v.fused for v in first] == [1, 1, 2, 0, 3]
@@ -93,13 +93,13 @@ def test_a_capture_of_a_skin_that_sent_another_form(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
     """Packets of another grid in mid stream: the sweep is `sensor-lost` when it happens and when it is replayed."""
-    world = devices.build(skin.FORMAT, script.tubes(1015, 2), rig.VirtualClock(), "sim")
+    simulated = devices.build(skin.FORMAT, script.tubes(1015, 2), rig.VirtualClock(), "sim")
     count = itertools.count()
     other = packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
-    world.backend.mangle = lambda data: other if next(count) == 200 else data
+    simulated.backend.mangle = lambda data: other if next(count) == 200 else data
     capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
-    box = rigged(world, capture=capture)
-    first = box.until(lambda: world.finished(box.box.answered))
+    box = rigged(simulated, capture=capture)
+    first = box.until(lambda: simulated.finished(box.box.answered))
     capture.close()
     verdicts, _ = played(tmp_path / "capture", default_bundle)
     assert first[0].status == "sensor-lost"
@@ -110,9 +110,9 @@ def test_a_capture_that_was_cut_off_plays_up_to_there(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
     """A power cut in mid record: everything before it is played."""
-    world = devices.build(skin.FORMAT, script.tubes(1011, 2), rig.VirtualClock(), "sim")
+    simulated = devices.build(skin.FORMAT, script.tubes(1011, 2), rig.VirtualClock(), "sim")
     capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
-    box = rigged(world, capture=capture)
+    box = rigged(simulated, capture=capture)
     box.until(lambda: box.box.answered == 2)
     capture.close()
     data = (tmp_path / "capture").read_bytes()
@@ -157,9 +157,9 @@ def test_an_unknown_record(tmp_path: Path):
 
 def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_path: Path):
     """Frames, times, numbers, status: all come back; nothing is left over beside the two files."""
-    world = devices.build(skin.FORMAT, script.tubes(1012, 1), rig.VirtualClock(), "sim")
-    box = rigged(world)
-    box.until(lambda: world.finished(box.box.answered))
+    simulated = devices.build(skin.FORMAT, script.tubes(1012, 1), rig.VirtualClock(), "sim")
+    box = rigged(simulated)
+    box.until(lambda: simulated.finished(box.box.answered))
     (sweep,) = box.kept
     save(tmp_path / "s.npy", sweep, skin.FORMAT)
     again, fmt = load(tmp_path / "s.npy")
@@ -196,9 +196,9 @@ def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_p
 )
 def test_broken_recordings_are_named(rigged: Callable[..., Rigged], tmp_path: Path, spoil, hint: str):
     """A missing or broken sidecar, an unknown schema, another grid, a broken array, a pickle."""
-    world = devices.build(skin.FORMAT, script.tubes(1013, 1), rig.VirtualClock(), "sim")
-    box = rigged(world)
-    box.until(lambda: world.finished(box.box.answered))
+    simulated = devices.build(skin.FORMAT, script.tubes(1013, 1), rig.VirtualClock(), "sim")
+    box = rigged(simulated)
+    box.until(lambda: simulated.finished(box.box.answered))
     save(tmp_path / "s.npy", box.kept[0], skin.FORMAT)
     spoil(tmp_path)
     with pytest.raises(FormatError, match=hint):

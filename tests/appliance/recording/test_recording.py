@@ -76,10 +76,10 @@ def pairs(*numbers: int) -> list[str]:
 def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Callable[..., Rigged]:
     """Builds boxes that record to `tmp_path`."""
 
-    def make(world: devices.SimDevices, labels: Labels = NONE) -> Rigged:
+    def make(simulated: devices.SimDevices, labels: Labels = NONE) -> Rigged:
         box: Rigged
-        recording = RecordingSession(tmp_path, skin.FORMAT, labels, world.clock, lambda line: box.port.say(line))
-        box = rigged(world, observers=[recording], commands=recording.commands)
+        recording = RecordingSession(tmp_path, skin.FORMAT, labels, simulated.clock, lambda line: box.port.say(line))
+        box = rigged(simulated, observers=[recording], commands=recording.commands)
         return box
 
     return make
@@ -95,8 +95,8 @@ def test_a_label_is_of_the_sweeps_that_start_after_it(recorded: Callable[..., Ri
     first, *others = script.tubes(1, 3)
     before = np.zeros((3 * 750, 4, 4), np.uint8)  # time enough for the first command
     first = rig.Act(np.concatenate([before, first.frames]), len(before) + first.start, len(before) + first.stop, "")
-    world = devices.build(skin.FORMAT, [first, *others], rig.VirtualClock(), "sim")
-    box = recorded(world, Labels(session="first day"))
+    simulated = devices.build(skin.FORMAT, [first, *others], rig.VirtualClock(), "sim")
+    box = recorded(simulated, Labels(session="first day"))
     box.seconds(0.1)
     assert ",MATERIAL,ok,wood,,first day*" in box.ask("$PPLP,MATERIAL,wood")
     box.until(lambda: box.box.health.sweeping)
@@ -105,7 +105,7 @@ def test_a_label_is_of_the_sweeps_that_start_after_it(recorded: Callable[..., Ri
     box.until(lambda: box.box.answered == 1)
     box.until(lambda: box.box.health.sweeping)
     assert ",NEXT,ok,metal,2,first day*" in box.ask("$PPLP,NEXT")
-    box.until(lambda: world.finished(box.box.answered))
+    box.until(lambda: simulated.finished(box.box.answered))
     want = [("wood", "", "first day"), ("metal", "1", "first day"), ("metal", "2", "first day")]
     sweeps = [load(tmp_path / f"sweep-{n:06d}.npy")[0] for n in (1, 2, 3)]
     assert [(s.material, s.position, s.session) for s in sweeps] == want
@@ -117,9 +117,9 @@ def test_a_label_is_of_the_sweeps_that_start_after_it(recorded: Callable[..., Ri
 
 def test_a_sidecar_tells_all(recorded: Callable[..., Rigged], tmp_path: Path):
     """Verdict bit for bit, board, clock, tare, rule, bundle and run stand beside the frames, in plain JSON."""
-    world = devices.build(skin.FORMAT, script.tubes(2, 1), rig.VirtualClock(), "sim")
-    box = recorded(world, Labels("wood", "3", "monday"))
-    (verdict,) = box.until(lambda: world.finished(box.box.answered))
+    simulated = devices.build(skin.FORMAT, script.tubes(2, 1), rig.VirtualClock(), "sim")
+    box = recorded(simulated, Labels("wood", "3", "monday"))
+    (verdict,) = box.until(lambda: simulated.finished(box.box.answered))
     about = json.loads((tmp_path / "sweep-000001.json").read_text())
     assert about["verdict"] == verdict.as_dict()
     assert np.array(about["verdict"]["own"]).tobytes() == verdict.own.tobytes()
@@ -141,12 +141,12 @@ def test_a_recording_is_a_set_to_train_on(recorded: Callable[..., Rigged], tmp_p
     )
     from appliance.core.sweep_set import SweepSet
 
-    world = devices.build(skin.FORMAT, script.tubes(3, 2), rig.VirtualClock(), "sim")
-    box = recorded(world, Labels("wood", "1", "a"))
+    simulated = devices.build(skin.FORMAT, script.tubes(3, 2), rig.VirtualClock(), "sim")
+    box = recorded(simulated, Labels("wood", "1", "a"))
     box.until(lambda: box.box.answered == 1)
     for command in ("MATERIAL,metal", "POSITION,2"):
         box.ask(f"$PPLP,{command}")
-    box.until(lambda: world.finished(box.box.answered))
+    box.until(lambda: simulated.finished(box.box.answered))
     made = files.read(tmp_path, SweepSet)
     assert [made.materials[k] for k in made.labels] == ["wood", "metal"]
     assert made.groups["position"].tolist() == [1, 2]
@@ -378,9 +378,9 @@ def test_a_disk_that_is_full_costs_no_answer(recorded: Callable[..., Rigged], mo
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(recording, "save", full)
-    world = devices.build(skin.FORMAT, script.tubes(4, 2), rig.VirtualClock(), "sim")
-    box = recorded(world, Labels("wood"))
-    verdicts = box.until(lambda: world.finished(box.box.answered))
+    simulated = devices.build(skin.FORMAT, script.tubes(4, 2), rig.VirtualClock(), "sim")
+    box = recorded(simulated, Labels("wood"))
+    verdicts = box.until(lambda: simulated.finished(box.box.answered))
     box.seconds(0.1)
     assert len(verdicts) == 2
     assert [rec[1] for rec in heard(box)] == ["full", "full"]

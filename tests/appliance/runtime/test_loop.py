@@ -281,8 +281,8 @@ def test_stopping_answers_what_is_open(rigged: Callable[..., Rigged]):
     """The loop ends when it is stopped, and the sweep that was open is answered `aborted`."""
     box = rigged(quiet())
     box.pulse(devices.START, 0.2)
-    end = box.world.clock.now_ns() + SECOND
-    box.box.run(lambda: box.world.clock.now_ns() > end)
+    end = box.simulated.clock.now_ns() + SECOND
+    box.box.run(lambda: box.simulated.clock.now_ns() > end)
     box.listen(SETTLE_S)
     assert [a.status for a in answers(box)] == ["aborted"]
 

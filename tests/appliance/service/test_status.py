@@ -22,7 +22,7 @@ from appliance.service import status
 from appliance.service.status import StatusFile
 from appliance.service.systemd import REASONS, VerdictLog
 from appliance.sim import devices, rig
-from tests.factories.simulated_box import SECOND, Rigged, idle_world
+from tests.factories.simulated_box import SECOND, Rigged, idle_devices
 
 HEALTH = Health(
     time_ns=0, skin="streaming", trouble="", streams=True, sweeping=False, answered=7, frames=5_000_000, lost_frames=3,
@@ -249,11 +249,11 @@ def burst(line: str, edges: int, apart_s: float) -> Callable[[Rigged], None]:
 @pytest.mark.parametrize(
     ("name", "field", "fault", "text"),
     [
-        ("stale_frames", 12, lambda box: setattr(box.world.backend, "mangle", once(lambda data: data * 2)),
+        ("stale_frames", 12, lambda box: setattr(box.simulated.backend, "mangle", once(lambda data: data * 2)),
          "4 repeated or late"),
-        ("overflows", 13, lambda box: setattr(box.world.backend, "mangle", once(lambda data: data + bytes(5000))),
+        ("overflows", 13, lambda box: setattr(box.simulated.backend, "mangle", once(lambda data: data + bytes(5000))),
          "1 transfers too large"),
-        ("fifo_overflows", 14, lambda box: box.world.clock.sleep_until(box.world.clock.now_ns() + 2 * SECOND),
+        ("fifo_overflows", 14, lambda box: box.simulated.clock.sleep_until(box.simulated.clock.now_ns() + 2 * SECOND),
          "1 times the board's FIFO was full"),
         ("glitches", 15, burst(devices.START, 2, 1e-4), "1 glitches; check the trigger lines"),
         ("lost_edges", 16, burst(devices.STOP, 3000, 1e-6), "edges lost; check the trigger lines"),
@@ -264,7 +264,7 @@ def test_what_is_counted_is_shown(
     rigged: Callable[..., Rigged], tmp_path: Path, name: str, field: int, fault: Callable[[Rigged], None], text: str
 ):
     """Each fault is in the STA sentence, in its answer to STATE, in the file and in words, and was not before it."""
-    simulated = idle_world(60)
+    simulated = idle_devices(60)
     file = StatusFile(tmp_path / "status.json", simulated.clock)
     box = rigged(simulated, ("trigger.storm_edges=50",) if name == "storms" else (), observers=[file])
     box.seconds(1.5)

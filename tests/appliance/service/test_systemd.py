@@ -20,7 +20,7 @@ from appliance.core.health import Health
 from appliance.core.observer import Observer
 from appliance.service.systemd import Notifier
 from appliance.sim import devices, rig, script, skin
-from tests.factories.simulated_box import SECOND, OnSweep, Rigged, idle_world
+from tests.factories.simulated_box import SECOND, OnSweep, Rigged, idle_devices
 
 WATCHDOG = {"WATCHDOG_USEC": "10000000"}
 
@@ -180,7 +180,7 @@ class TurnLog(Observer):
 
 def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., Rigged]):
     """Without a skin the status names what is missing; then it streams, and counts the answered sweeps."""
-    turn_log, simulated = TurnLog(), idle_world()
+    turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.unplug()
     box = rigged(simulated, observers=[turn_log])
     box.seconds(2)
@@ -202,7 +202,7 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., 
 
 def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[..., Rigged]):
     """It counts as streaming until it is found silent, but nothing of it has ever come."""
-    turn_log, simulated = TurnLog(), idle_world()
+    turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.mangle = lambda data: b""
     rigged(simulated, observers=[turn_log]).seconds(3)
     received = {status.split(" for ")[0] for _, status in turn_log.notes}
@@ -232,11 +232,11 @@ def test_stopping_is_sent_before_the_last_answer(rigged: Callable[..., Rigged]):
     """What is open is answered after systemd has been notified."""
     turn_log = TurnLog()
     box = rigged(
-        idle_world(), observers=[turn_log, OnSweep(lambda sweep, verdict: turn_log.notes.append(str(sweep.status)))]
+        idle_devices(), observers=[turn_log, OnSweep(lambda sweep, verdict: turn_log.notes.append(str(sweep.status)))]
     )
     box.pulse(devices.START, 0.2)
-    end = box.world.clock.now_ns() + SECOND
-    box.box.run(lambda: box.world.clock.now_ns() > end)
+    end = box.simulated.clock.now_ns() + SECOND
+    box.box.run(lambda: box.simulated.clock.now_ns() > end)
     assert turn_log.notes[-2:] == ["stopping", "aborted"]
 
 
