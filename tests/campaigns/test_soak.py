@@ -440,7 +440,7 @@ def result(clean) -> dict:
 
 def test_the_page_needs_nothing_else_and_tells_all(result):
     """Both boxes, every target, the fault and what was left out; no address, no script; the picture is sound XML."""
-    html, svg = soak_page.tell(result)
+    html, svg = soak_page.render(result)
     assert {e.tag.rpartition("}")[2] for e in ET.fromstring(svg).iter()} >= {"svg", "title", "path", "text"}
     assert not re.search(r"<script|<link|<img|@import|url\((?!#)|href=\"(?!#)", html)
     for text in ("this machine", "virtual box", "third box; it was not there", "answer 7 came again", "not reached",

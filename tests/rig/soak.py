@@ -232,7 +232,7 @@ def draw(work: Path, out: Path) -> bool:
         },
         "boxes": boxes,
     }
-    html, svg = soak_page.tell(results)
+    html, svg = soak_page.render(results)
     write(out / "results.json", results)
     (out / "index.html").write_text(html)
     (out / "soak.svg").write_text(svg)

@@ -1,4 +1,4 @@
-"""Draws a soak. In: records with their sums. Out: a page and its picture of four charts over time.
+"""The page of a soak. In: records with their sums. Out: HTML and its picture of four charts over time.
 
 Nothing is computed here but what a chart needs; every sentence with a number takes it from the sums.
 """
@@ -6,6 +6,7 @@ Nothing is computed here but what a chart needs; every sentence with a number ta
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -26,57 +27,58 @@ from tests.rig.soak_judge import (
     kind,
     targets,
 )
-from train.reports import html
-from train.reports.plot_style import ACCENT, FAINT, INK, SMALL, WIDTH, add, scale, svg
+from train.reports import formatting, html
+from train.reports.plot_style import ACCENT, BLACK, FAINT, SMALL, WIDTH, add_axes, set_ticks, to_svg
 
 Json = Mapping[str, Any]
-LOOKS = {"color": ACCENT, "linewidth": 1.8}, {"color": INK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))}
+LOOKS = {"color": ACCENT, "linewidth": 1.8}, {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))}
 """Of the boxes; where both do the same, one shows through the other."""
 DOTS = 1500
 """Dots of a chart; of more sweeps the slowest of each few is drawn."""
+ORIGIN = ("what", "machine", "versions", "commit", "seed", "format", "started", "runs")
 MARKS = {True: "reached", False: "not reached", None: "too short to judge"}
 
 
-def tell(results: Json) -> tuple[str, str]:
+def render(records: Json) -> tuple[str, str]:
     """The page (HTML) and its picture (SVG)."""
-    picture = charts(results)
-    return html.page(
-        "Soak", opening(results), drawn(results, picture), figures(results), faults(results), run(results)
-    ), picture
+    boxes = records["boxes"]
+    svg = charts(records)
+    page = html.render(
+        "soak_page.html.j2",
+        Path(__file__).parent,
+        picture=html.picture(svg),
+        names=list(boxes),
+        hours=[f"{_hours(box['sums']['hours'])} on {_the(name)}" for name, box in boxes.items()],
+        left_out=[(_the(name), why) for name, why in records["left_out"].items()],
+        targets=_targets(boxes),
+        lines=[f"{_the(name)} {'dashed' if i else 'in blue'}" for i, name in enumerate(boxes)],
+        sums=_sums([box["sums"] for box in boxes.values()]),
+        growth_limit=GROWTH_KIB_H,
+        least_minutes=SECURE_MIN,
+        in_flight=IN_FLIGHT,
+        faults=[
+            [name, f"{at_s:.1f}", what]
+            for name, box in boxes.items()
+            for run in box["runs"]
+            for at_s, what in run["faults"]
+        ],
+        origin=[[name, *(_about(box, name) for box in boxes.values())] for name in ORIGIN],
+    )
+    return page, svg
 
 
-def opening(results: Json) -> str:
-    """What was asked and what came out, target by target."""
-    boxes = results["boxes"]
+def _targets(boxes: Json) -> list[list[str]]:
+    """What was asked and what came out, a line for each target."""
     rows = []
     for each in zip(*(targets(box["sums"]) for box in boxes.values()), strict=True):
         marks = [met for *_, met in each]
         reached = MARKS[False if False in marks else None if None in marks else True]
         rows.append([each[0][0], each[0][1], *(came for _, _, came, _ in each), reached])
-    hours = ", ".join(f"{_hours(box['sums']['hours'])} on {_the(name)}" for name, box in boxes.items())
-    left = [html.text(f"Left out: {_the(name)}; {why}.", kind="note") for name, why in results["left_out"].items()]
-    return "\n".join([
-        html.text(f"Sweeps without pause, in real time: {hours or 'none yet'}. The skin is simulated in both boxes; each sentence "
-                  "is compared with what the robot did."),
-        *left,
-        html.table(["what", "wanted", *boxes, ""], rows, texts=(0,)) if rows else "",
-    ])  # fmt: skip
+    return rows
 
 
-def drawn(results: Json, picture: str) -> str:
-    """The charts with what they show."""
-    names = " and ".join(f"{_the(name)} {'dashed' if i else 'in blue'}" for i, name in enumerate(results["boxes"]))
-    return html.heading("Over time") + html.figure(
-        picture,
-        f"{names[:1].upper()}{names[1:]}. Memory is resident memory, latency the figure that the box reports for each sweep, loss all "
-        "frames of a minute that never came, and the band is where the count of wrong verdicts lies in 95 % of cases if the box "
-        "errs as often as its network by itself does on the same sweeps.",
-    )
-
-
-def figures(results: Json) -> str:
-    """All sums."""
-    sums = [box["sums"] for box in results["boxes"].values()]
+def _sums(sums: Sequence[Json]) -> list[list[str]]:
+    """All sums, a line each."""
     statuses = dict.fromkeys(status for s in sums for status in s["statuses"])
     lines: list[tuple[str, Any]] = [
         ("hours", lambda s: f"{s['hours']:.2f}"),
@@ -86,7 +88,7 @@ def figures(results: Json) -> str:
         *((f"answered {name}", lambda s, n=name: f"{s['statuses'].get(n, 0):,}") for name in statuses),
         ("other than the network by itself", lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}"),
         ("frames received", lambda s: f"{s['received']:,}"),
-        ("frames lost, reported by the box", lambda s: f"{s['lost']:,}"),
+        ("frames lost, as the box reports them", lambda s: f"{s['lost']:,}"),
         ("not accounted for", lambda s: f"{s['unaccounted']:,}"),
         ("bytes of no packet", lambda s: f"{s['garbage']:,}"),
         ("enumerations", lambda s: f"{s['enumerations']}"),
@@ -97,37 +99,15 @@ def figures(results: Json) -> str:
         ("PSS, MiB: start, half-way, end", lambda s: _mib(s["pss_kib"])),
         ("slope of the second half, KiB an hour", lambda s: _slope(s["memory"])),
         ("the same, KiB for 1,000 sweeps", _each),
-        ("share of a core", lambda s: f"{s['cpu']:.3f}"),
+        ("share of a core", lambda s: formatting.percent(s["cpu"])),
     ]
-    rows = [[what, *(of(s) for s in sums)] for what, of in lines]
-    return html.heading("Sums") + html.table(["", *results["boxes"]], rows, texts=(0,)) + html.text(
-        "Shares with 95 % Wilson intervals. Refused are all answers without a label, such as unknown, and count neither as right "
-        f"nor as wrong. Memory is flat where the 95 % interval of its slope ends below {GROWTH_KIB_H:g} KiB an hour, a bound set "
-        f"before the first run, and judged only on second halves of {SECURE_MIN} minutes or more. Frames that the board "
-        f"took and the box counted neither as received nor as lost are not accounted for; {IN_FLIGHT} may be on their way.",
-    )  # fmt: skip
+    return [[what, *(of(s) for s in sums)] for what, of in lines]
 
 
-def faults(results: Json) -> str:
-    """What must not be and was."""
-    rows = [[name, f"{at_s:.1f}", what] for name, box in results["boxes"].items() for run in box["runs"]
-            for at_s, what in run["faults"]]  # fmt: skip
-    return html.heading("Faults") + html.table(["box", "s", "what"], rows, texts=(0, 2)) if rows else ""
-
-
-def run(results: Json) -> str:
-    """What was run."""
-    names = ("what", "machine", "versions", "commit", "seed", "format", "started", "runs")
-    rows = [[name, *(_about(box, name) for box in results["boxes"].values())] for name in names]
-    return html.heading("What was run") + html.table(
-        ["", *results["boxes"]], rows, texts=range(len(results["boxes"]) + 1)
-    )
-
-
-def charts(results: Json) -> str:
+def charts(records: Json) -> str:
     """Four small charts, memory and latency above loss and verdicts."""
     figure = Figure((WIDTH, 4.4))
-    boxes = list(results["boxes"].items())
+    boxes = list(records["boxes"].items())
     hours = max([box["sums"]["hours"] for _, box in boxes] or [0]) or 1
     by, unit = (1, "min") if hours < 4 else (60, "h")
     for i, (title, draw) in enumerate(
@@ -140,8 +120,8 @@ def charts(results: Json) -> str:
     ):
         row, column = divmod(i, 2)
         left, top = 0.075 + 0.5 * column, 0.91 - 0.48 * row
-        axes = add(figure, left, left + 0.41, top, top - 0.34)
-        axes.set_title(title, color=INK, size=SMALL + 0.5, loc="left", pad=5)
+        axes = add_axes(figure, left, left + 0.41, top, top - 0.34)
+        axes.set_title(title, color=BLACK, size=SMALL + 0.5, loc="left", pad=5)
         axes.set_xlim(0, 60 * hours / by * 1.01)
         for (_, box), look in zip(boxes, LOOKS, strict=False):
             draw(axes, box, look, 60 * by)
@@ -150,13 +130,13 @@ def charts(results: Json) -> str:
         mark = "╍" if "linestyle" in look else "—"
         figure.text(0.075 + 0.25 * i, 0.985, f"{mark} {name}", color=look["color"], size=SMALL + 0.5, va="center")
     with matplotlib.rc_context({"path.simplify": False}):  # it would leave out strokes without length
-        return svg(figure, "memory, latency, loss and wrong verdicts of a soak over time")
+        return to_svg(figure, "memory, latency, loss and wrong verdicts of a soak over time")
 
 
 def _memory(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
-    held = columns([row for run in box["runs"] for row in run["samples"]], SAMPLE)
-    mib = np.divide(held["rss_kib"], 1024)
-    axes.plot(np.divide(held["s"], unit_s), mib, **look)
+    samples = columns([row for run in box["runs"] for row in run["samples"]], SAMPLE)
+    mib = np.divide(samples["rss_kib"], 1024)
+    axes.plot(np.divide(samples["s"], unit_s), mib, **look)
     low, high = (axes.get_ylim() if axes.lines[1:] else (np.inf, -np.inf)) if len(mib) else (0, 1)
     axes.set_ylim(min(low, np.min(mib, initial=np.inf) - 4), max(high, np.max(mib, initial=-np.inf) + 4))
 
@@ -184,11 +164,11 @@ def _latency(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
 def _loss(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
     most = 1.0
     for run in box["runs"]:
-        held = columns(run["samples"], SAMPLE)
+        samples = columns(run["samples"], SAMPLE)
         minutes = np.arange(run["began_s"], run["began_s"] + run["length_s"] + 1, 60)
-        if len(minutes) < 2 or not held["s"]:
+        if len(minutes) < 2 or not samples["s"]:
             continue
-        lost = np.interp(minutes, held["s"], held["lost"])
+        lost = np.interp(minutes, samples["s"], samples["lost"])
         axes.stairs(np.diff(lost), minutes / unit_s, baseline=None, **look)
         most = max(most, 1.1 * float(np.diff(lost).max(initial=0)))
     axes.set_ylim(-0.04 * most, max(most, axes.get_ylim()[1] if axes.patches[1:] else 0))
@@ -211,10 +191,12 @@ def _scales(axes: Axes, unit: str) -> None:
         along = MaxNLocator(4, integer=True, steps=[1, 1.5, 2, 3, 6, 10]) if axis is axes.xaxis else MaxNLocator(4)
         there = [10.0**k for k in range(-3, 7)] if axis.get_scale() == "log" else along.tick_values(*ends)
         ticks = [tick for tick in there if ends[0] <= tick <= ends[1]]
-        labels = [f"{tick / 1000:g}k" if tick >= 10_000 else f"{tick:g}" for tick in ticks]
-        if axis is axes.xaxis and labels:
-            labels[-1] += f" {unit}"
-        scale(axis, ticks, labels)
+        if max(ticks, default=0) >= 10_000:
+            set_ticks(axis, ticks, "k", 1e-3)
+        else:
+            set_ticks(axis, ticks, unit if axis is axes.xaxis else "")
+    for label in axes.get_xticklabels()[-1:]:
+        label.set_horizontalalignment("right")  # the unit stays inside of the picture
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
 
 
@@ -227,7 +209,7 @@ def _hours(hours: float) -> str:
 
 
 def _share(s: Json) -> str:
-    return f"{s['n']:,}: {s['n'] / max(s['of'], 1):.3f} [{s['low']:.3f}, {s['high']:.3f}]"
+    return f"{s['n']:,}: {formatting.estimate([s['n'] / max(s['of'], 1), s['low'], s['high']])}"
 
 
 def _mib(kib: Sequence[float]) -> str:

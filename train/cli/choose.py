@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> None:
     told |= _origin(args, asked, sweeps)
     page = args.page or args.out.with_name(f"{args.out.name}-why")
     put(page / "choice.json", (json.dumps(told, indent=1) + "\n").encode(), parents=True)
-    put(page / "index.html", selection_report.html(told).encode(), parents=True)
+    put(page / "index.html", selection_report.page(told).encode(), parents=True)
     print(selection_report.text(told))
     print(f"bundle: {args.out}; why: {page / 'index.html'}")
 

@@ -21,7 +21,7 @@ from train.evaluation.corruptions import EvaluationSweeps
 from train.export import contact_positions
 from train.metrics import score
 from train.models import methods
-from train.reports import contact_report, plots, uncertainty_report
+from train.reports import contact_plot, plots, uncertainty_report
 
 
 def register(add: Add) -> None:
@@ -147,7 +147,7 @@ def run_stress(args: argparse.Namespace) -> None:
     table = robustness.table(told)
     put(args.out / "results.json", (json.dumps(told) + "\n").encode(), parents=True)
     put(args.out / "table.md", table.encode(), parents=True)
-    put(args.out / "curves.svg", plots.stress(told, args.strong.split(",")).encode(), parents=True)
+    put(args.out / "curves.svg", plots.robustness(told, args.strong.split(",")).encode(), parents=True)
     print(table)
 
 
@@ -179,5 +179,5 @@ def run_alignment(args: argparse.Namespace) -> None:
     told = contact_positions.measure(box, args.unseen, args.seen, args.hard, options.Log())
     args.out.mkdir(parents=True, exist_ok=True)
     put(args.out / "place.json", (json.dumps(told, indent=1) + "\n").encode(), parents=True)
-    put(args.out / "place.svg", (contact_report.chart(told) + "\n").encode(), parents=True)
+    put(args.out / "place.svg", (contact_plot.draw(told) + "\n").encode(), parents=True)
     print("\n".join(contact_positions.lines(told)))

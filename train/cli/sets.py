@@ -47,7 +47,7 @@ def run_describe(args: argparse.Namespace) -> None:
 
 def run_view(args: argparse.Namespace) -> None:
     """The picture's name."""
-    put(args.out, sweep_plot.draw(sweep_plot.look(args.sweep, args.number)).encode(), parents=True)
+    put(args.out, sweep_plot.draw(sweep_plot.load(args.sweep, args.number)).encode(), parents=True)
     print(args.out)
 
 

@@ -17,7 +17,7 @@ from appliance.core.types import Frames, Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.sim import skin
 from train.data import sets
-from train.reports.plot_style import ACCENT, FAINT, GREY, INK, SMALL, TEXT, add, svg, write
+from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, MEDIUM, SMALL, add_axes, to_svg, write
 
 WIDE, HIGH = 10.0, 3.5
 SHOWN_S = 0.4
@@ -36,7 +36,7 @@ def draw(material: str, seed: int = 7) -> str:
     samples = sweeps.samples[sweeps.labels == sweeps.materials.index(material)][0]
     verdict = _verdict(samples)
     figure = Figure((WIDE, HIGH))
-    page = add(figure, 0, 1, 1, 0)
+    page = add_axes(figure, 0, 1, 1, 0)
     page.set(xlim=(0, WIDE), ylim=(0, HIGH))
     page.set_axis_off()
     for x, title in (
@@ -44,12 +44,12 @@ def draw(material: str, seed: int = 7) -> str:
         (3.55, "2  The skin sends 16 signals"),
         (7.0, "3  The box answers"),
     ):
-        write(page, x, HIGH - 0.3, title, INK, TEXT + 2, ha="left", weight="bold")
+        write(page, x, HIGH - 0.3, title, BLACK, MEDIUM + 2, ha="left", weight="bold")
     _finger(page, samples)
-    _signal(add(figure, 0.355, 0.665, 0.80, 0.17), samples)
+    _signal(add_axes(figure, 0.355, 0.665, 0.80, 0.17), samples)
     _answer(page, verdict)
     about = f"A finger slides along a tube of {material}; the signal of 16 taxels; the box answers {verdict.label}"
-    return svg(figure, about + " (simulated)")
+    return to_svg(figure, about + " (simulated)")
 
 
 def _verdict(samples: NDArray[Any]) -> Verdict:
@@ -76,7 +76,7 @@ def _finger(page: Axes, samples: NDArray[Any]) -> None:
         page.add_patch(
             Rectangle(at, side * 0.88, side * 0.88, fc=ACCENT, alpha=0.15 + 0.85 * float(shade[row, column]), ec="none")
         )
-    page.add_patch(FancyArrowPatch((0.55, 0.38), (2.65, 0.38), arrowstyle="-|>", mutation_scale=14, color=INK, lw=1.5))
+    page.add_patch(FancyArrowPatch((0.55, 0.38), (2.65, 0.38), arrowstyle="-|>", mutation_scale=14, color=BLACK, lw=1.5))
     write(page, 1.6, 0.16, "two seconds along a tube", GREY, SMALL)
 
 
@@ -106,15 +106,15 @@ def _signal(axes: Axes, samples: NDArray[Any]) -> None:
 def _answer(page: Axes, verdict: Verdict) -> None:
     """The label in large letters, the probability of every label as a bar."""
     left, width = 7.0, 1.35
-    write(page, left, 2.62, verdict.label, ACCENT, TEXT + 9, ha="left", weight="bold")
+    write(page, left, 2.62, verdict.label, ACCENT, MEDIUM + 9, ha="left", weight="bold")
     labels = bundle.load(bundle.DEFAULT).manifest.labels
     order = sorted(zip(labels, verdict.scores, strict=True), key=lambda pair: -pair[1])
     for i, (label, probability) in enumerate(order):
         y = 2.1 - 0.27 * i
-        write(page, left, y, label, INK if i == 0 else GREY, SMALL, ha="left")
+        write(page, left, y, label, BLACK if i == 0 else GREY, SMALL, ha="left")
         page.add_patch(Rectangle((left + 1.05, y - 0.07), width, 0.14, fc=FAINT, ec="none"))
         page.add_patch(Rectangle((left + 1.05, y - 0.07), width * float(probability), 0.14, fc=ACCENT, ec="none"))
         write(
-            page, left + 1.05 + width + 0.08, y, f"{100 * probability:.1f} %", INK if i == 0 else GREY, SMALL, ha="left"
+            page, left + 1.05 + width + 0.08, y, f"{100 * probability:.1f} %", BLACK if i == 0 else GREY, SMALL, ha="left"
         )
     write(page, left, 0.3, "on a serial line and on GPIO lines", GREY, SMALL, ha="left")

@@ -1,7 +1,6 @@
-"""The room of the paper: its experiment on the simulated sets, and what it did not compare. In: a plan. Out: a folder.
+"""The paper's experiment on the simulated sets, with more methods. In: a plan. Out: a folder with results.json, pictures, page.
 
-The folder holds results.json, the pictures and a page that tells the story (story.py). Folds are kept by evaluate, so
-that what was interrupted goes on where it was.
+The page is made by paper_report. Folds are kept by evaluate, so that an interrupted run goes on where it was.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from train.evaluation.parallel import spoken
 from train.metrics import score
 from train.models import methods, prior_work
 from train.models.methods import FULL_EFFORT, Effort
-from train.reports import paper_page, paper_printed
+from train.reports import paper_report, paper_values
 
 Array = NDArray[Any]
 Log = Callable[[str], None]
@@ -38,15 +37,15 @@ SURE = (0.9, 0.95, 0.99)
 """Posteriors at which no more sweeps are added."""
 SEVERAL = 3
 ATTACHMENTS = 20
-"""Seeds of T-HARD for each world, 60 sweeps each."""
+"""Seeds of T-HARD for each simulated world, 60 sweeps each."""
 COST_POINTS = 160
 
 
 @dataclass(frozen=True)
 class PaperPart:
-    """A column of the paper's results: what is trained on, what is tested on.
+    """A column of the paper's results: the sets to train and test on.
 
-    sets: joined; {w} stands for the world, {a} and {b} for its first and last seed of T-HARD. only: of each set.
+    sets: joined; {w} stands for the simulated world, {a} and {b} for its first and last seed of T-HARD. only: of each set.
     """
 
     sets: tuple[str, ...]
@@ -63,9 +62,9 @@ class PaperPart:
 
 @dataclass(frozen=True)
 class Step:
-    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, for the time left only.
+    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, to estimate the time left.
 
-    means_removed: of sweeps without each taxel's mean; then their names say so.
+    means_removed: from each taxel of each sweep; the methods' names then end in paper_values.CENTRED.
     """
 
     methods: tuple[str, ...]
@@ -96,7 +95,7 @@ FULL_STEPS = (
     Step(NETWORKS, EASY, (1,), 30),
     Step(("paper-cnn",), ("lopo",), (1,), 170),
 )
-"""What is hard comes first, so that a run that was broken off has told the most: see `kept`."""
+"""Hard parts come first, so that a run that was interrupted has the most important results: see `kept`."""
 QUICK = {
     "lopo": PaperPart(("sim:T-REAL:{w}:4",), "leave:position", 3, ("position<=2",)),
     "hard": PaperPart(("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", 1, ("position<=2",)),
@@ -114,9 +113,10 @@ QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method did in a part of a world, without the sweeps: labels [n], logits [n, K] of what was tested.
+    """The result of a method in a part of a simulated world, without the sweeps: labels [n], logits [n, K] of those tested.
 
-    place: int [n], where the skin sat; no two worlds share one. costs: of each fold that has them, [iterations, 2].
+    place: int [n], the attachment of the skin; no two worlds share one. costs: of each fold that has them, [iterations, 2].
+    about: what results.json holds of it.
     """
 
     part: str
@@ -126,26 +126,26 @@ class Outcome:
     logits: Array
     place: Array
     costs: list[Array] = field(repr=False)
-    told: dict[str, Any] = field(repr=False)
+    about: dict[str, Any] = field(repr=False)
 
     @classmethod
     def of(cls, part: str, world: int, result: Result) -> Outcome:
-        """Of what evaluate gave."""
+        """From a result of evaluate."""
         test, sweeps = result.test, result.sweeps
         place = sweeps.group("position")[test] + 10_000 * world
         costs = [_thinned(fold.cost) for fold in result.folds if len(fold.cost)]
-        method = result.method + result.means_removed * paper_printed.MEANS_OUT
+        method = result.method + result.means_removed * paper_values.CENTRED
         about = result.json() | {"part": part, "world": world}
         return cls(part, method, world, sweeps.labels[test], result.logits, place, costs, about)
 
     @cached_property
     def explorations(self) -> Array:
-        """What `objects` draws of it."""
+        """What `objects` draws of these sweeps."""
         return objects(self.labels, self.place, self.world)
 
     @property
     def right(self) -> Array:
-        """Which [n] were named right."""
+        """bool [n], which were named rightly."""
         return self.logits.argmax(1) == self.labels
 
 
@@ -158,13 +158,13 @@ def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effo
     parts, steps = (QUICK, QUICK_STEPS) if quick else (FULL, FULL_STEPS)
     effort = QUICK_EFFORT if quick else effort
     outcomes = list(_outcomes(parts, steps, where, effort, log))
-    told = summary(outcomes, parts, effort) | {
+    results = summary(outcomes, parts, effort) | {
         "quick": quick,
         "commit": score.provenance()["commit"],
         "took_s": round(time.monotonic() - start),
     }
-    put(out / "results.json", _lines(told).encode(), parents=True)
-    page, pictures = paper_page.tell(told)
+    put(out / "results.json", _lines(results).encode(), parents=True)
+    page, pictures = paper_report.render(results)
     for name, svg in pictures.items():
         put(out / f"{name}.svg", svg.encode(), parents=True)
     put(out / "index.html", page.encode(), parents=True)
@@ -174,7 +174,7 @@ def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effo
 def _outcomes(
     parts: dict[str, PaperPart], steps: Sequence[Step], where: Where, effort: Effort, log: Log
 ) -> Iterator[Outcome]:
-    """Step by step; after each fold `log` gets how far it is and how long all that is left will take."""
+    """Step by step; after each fold `log` gets the progress and an estimate of the time left."""
     todo = [(step, part, world) for step in steps for part in step.parts for world in step.worlds]
     expected = [len(step.methods) * parts[part].folds * step.fold_s for step, part, _ in todo]
     pace = 1 / (os.cpu_count() or 1)
@@ -192,52 +192,52 @@ def _outcomes(
         for result in evaluate(parts[part].load(world), plan, where, count):
             yield Outcome.of(part, world, result)
         took = time.monotonic() - start
-        if took > expected[i] * pace / 10:  # else it came out of the cache
+        if took > expected[i] * pace / 10:  # else it came from the cache
             pace = took / expected[i]
 
 
 def summary(outcomes: Sequence[Outcome], parts: dict[str, PaperPart], effort: Effort = FULL_EFFORT) -> dict[str, Any]:
-    """All that the page tells, as plain numbers; see story.py, which reads it."""
-    held: dict[tuple[str, str], list[Outcome]] = {}
+    """All that paper_report needs, as plain numbers."""
+    groups: dict[tuple[str, str], list[Outcome]] = {}
     for outcome in outcomes:
-        held.setdefault((outcome.part, outcome.method), []).append(outcome)
-    lopo = {method: those for (part, method), those in held.items() if part == "lopo"}
+        groups.setdefault((outcome.part, outcome.method), []).append(outcome)
+    lopo = {method: those for (part, method), those in groups.items() if part == "lopo"}
     return {
         "parts": {k: {"sets": part.sets, "only": part.only, "protocol": part.protocol} for k, part in parts.items()},
-        "table": [_row(*key, those) for key, those in held.items()],
-        "costs": {m: [cost.tolist() for o in lopo[m] for cost in o.costs] for m in paper_printed.CNNS if m in lopo},
-        "confusion": {m: np.sum([o.told["confusion"] for o in those], 0).tolist() for m, those in lopo.items()},
+        "table": [_row(*key, those) for key, those in groups.items()],
+        "costs": {m: [cost.tolist() for o in lopo[m] for cost in o.costs] for m in paper_values.CNNS if m in lopo},
+        "confusion": {m: np.sum([o.about["confusion"] for o in those], 0).tolist() for m, those in lopo.items()},
         "several": {m: several(those) for m, those in lopo.items()},
         "explored": {m: explored(those) for m, those in lopo.items()},
         "methods": {
-            name: method.about for name, method in methods.every(effort).items() if name in {m for _, m in held}
+            name: method.about for name, method in methods.every(effort).items() if name in {m for _, m in groups}
         },
-        "results": [outcome.told for outcome in outcomes],
+        "results": [outcome.about for outcome in outcomes],
     }
 
 
 def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
-    """One line of the table. attachments: accuracies of the worst and the best single one, as many as were tested."""
+    """One line of the table. attachments: how many there are, and the accuracy of the worst and the best of them."""
     right, place = (np.concatenate([getattr(o, name) for o in those]) for name in ("right", "place"))
     each = [float(right[place == p].mean()) for p in np.unique(place)]
     return {
         "part": part, "method": method, "worlds": [o.world for o in those], "right": int(right.sum()),
-        "total": len(right), "share": estimate(right, place), "printed": paper_printed.ACCURACY[part].get(method),
-        "attachments": [len(each), round(min(each), 4), round(max(each), 4)], "ran": those[0].told["ran"],
-        **{k: round(float(np.median([o.told[k] for o in those])), 4) for k in ("fit_s", "ms_p50")},
-        "agreement": min(o.told["agreement"] for o in those),
+        "total": len(right), "share": estimate(right, place), "printed": paper_values.ACCURACY[part].get(method),
+        "attachments": [len(each), round(min(each), 4), round(max(each), 4)], "ran": those[0].about["ran"],
+        **{k: round(float(np.median([o.about[k] for o in those])), 4) for k in ("fit_s", "ms_p50")},
+        "agreement": min(o.about["agreement"] for o in those),
     }  # fmt: skip
 
 
 def estimate(right: Array, place: Array) -> list[float]:
-    """Share of `right` [n] and its 95 % interval, over the places that the skin sat at (score.interval)."""
+    """Share of `right` [n] and its 95 % interval over attachments `place` [n] (score.interval)."""
     return [round(float(right.mean()), 4), *score.interval(right, place)]
 
 
 def objects(labels: Array, place: Array, seed: int) -> Array:
-    """Explorations of one object each, numbers of sweeps [n, S]: sec. V.D, sweeps of one material from the test set.
+    """Explorations of one object each, indices of sweeps [n, S]: sec. V.D, sweeps of one material from the test set.
 
-    Every sweep comes first once, others of its material and place follow in random order, as many as all have.
+    Every sweep comes first once; others of its material and place follow in random order, as many as every group has.
     """
     rng = np.random.default_rng(seed)
     alike = np.unique(np.stack([labels, place]), axis=1, return_inverse=True)[1].ravel()
@@ -249,24 +249,25 @@ def objects(labels: Array, place: Array, seed: int) -> Array:
 
 
 def several(those: Sequence[Outcome]) -> dict[str, list[list[float]]]:
-    """By "vote" and by "product", as the box fuses: the estimate after one, two, three sweeps of an object."""
-    told: dict[str, list[list[float]]] = {}
-    for how in ("vote", "product"):
+    """Estimates after one, two, three sweeps of an object, by "vote" and by "product", as the box fuses."""
+    estimates: dict[str, list[list[float]]] = {}
+    for rule in ("vote", "product"):
         for n in range(1, SEVERAL + 1):
-            right = np.concatenate([_fused(o, n, how) for o in those])
-            told.setdefault(how, []).append(estimate(right, np.concatenate([o.place for o in those])))
-    return told
+            right = np.concatenate([_fused(o, n, rule) for o in those])
+            estimates.setdefault(rule, []).append(estimate(right, np.concatenate([o.place for o in those])))
+    return estimates
 
 
-def _fused(outcome: Outcome, n: int, how: str) -> Array:
+def _fused(outcome: Outcome, n: int, rule: str) -> Array:
+    """bool [n], whether the first `n` sweeps of each exploration give its material."""
     scores = softmax(outcome.logits)
     drawn = outcome.explorations[:, :n]
-    return np.array([fuse([scores[i] for i in row], how).argmax() for row in drawn]) == outcome.labels
+    return np.array([fuse([scores[i] for i in row], rule).argmax() for row in drawn]) == outcome.labels
 
 
 def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """Sweeps added one by one until the posterior is sure (Xu et al. 2013): estimate and mean number of sweeps."""
-    told = []
+    """Sweeps added until the posterior reaches SURE (Xu et al. 2013): estimate and mean number of sweeps."""
+    points = []
     for sure in SURE:
         right, used = [], []
         for o in those:
@@ -276,22 +277,22 @@ def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
             right.append(labels == o.labels)
             used.append(counts)
         share = estimate(np.concatenate(right), np.concatenate([o.place for o in those]))
-        told.append({"sure": sure, "share": share, "sweeps": round(float(np.concatenate(used).mean()), 3)})
-    return told
+        points.append({"sure": sure, "share": share, "sweeps": round(float(np.concatenate(used).mean()), 3)})
+    return points
 
 
 def _thinned(cost: Array) -> Array:
-    """A cost curve [n, 2] in at most COST_POINTS points, evenly on a logarithmic axis: means of what lies between."""
+    """A cost curve [n, 2] as means over at most COST_POINTS parts of equal length on a logarithmic axis."""
     ends = np.unique(np.geomspace(1, len(cost) + 1, COST_POINTS + 1).round().astype(int)) - 1
     return np.array([cost[a:b].mean(0) for a, b in pairwise(ends)]).round(5)
 
 
-def _lines(told: dict[str, Any]) -> str:
-    """JSON with one line for each figure and each result, so that a change can be read."""
+def _lines(results: dict[str, Any]) -> str:
+    """JSON with one line for each figure and each result, so that differences can be read."""
 
     def text(value: Any) -> str:
         if isinstance(value, list) and value and isinstance(value[0], dict):
             return "[\n" + ",\n".join(json.dumps(item) for item in value) + "\n]"
         return json.dumps(value)
 
-    return "{\n" + ",\n".join(f"{json.dumps(k)}: {text(v)}" for k, v in told.items()) + "\n}\n"
+    return "{\n" + ",\n".join(f"{json.dumps(k)}: {text(v)}" for k, v in results.items()) + "\n}\n"

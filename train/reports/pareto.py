@@ -1,6 +1,6 @@
-"""The room of the front. In: dots, as chart.json lists them. Out: which of them no other beats, and what axes there are.
+"""The Pareto front of the chart, and its axes. In: dots, as chart.json lists them. Out: which of them no other dominates.
 
-What is drawn (scatter.py) and what can be chosen (explorer.py) is named here once.
+scatter draws them, chart_page lets a reader choose among them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Dot = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Axis:
-    """A figure that a chart may have on an axis. short: for a line of text; about: what it is. unit: "" for shares."""
+    """A figure that can be on an axis. short: its name; about: what it is; unit: "" for shares and counts."""
 
     short: str
     about: str
@@ -23,28 +23,28 @@ class Axis:
 
 COSTS = {
     "ms_p50": Axis("time, median", "processor time of a sweep, features and model, one thread", "ms"),
-    "ms_p99": Axis("time, 99 %", "what 99 of 100 sweeps do not exceed", "ms"),
+    "ms_p99": Axis("time, 99 %", "the time that 99 % of the sweeps do not exceed", "ms"),
     "macs": Axis(
         "multiply-adds", "multiply-accumulates of a sweep: the graph's, and the Fourier transforms of features"
     ),
     "file_kb": Axis("model file", "the model alone, 1000 bytes each", "KB"),
     "rss_mb": Axis("memory", "resident memory of a process that only classifies, 2^20 bytes each", "MB"),
     "touch_s": Axis(
-        "touch time", "how much of the sweep is needed; the mean, where half a point is given for deciding early", "s"
+        "touch time", "mean part of the sweep that is needed where deciding early may cost half a point", "s"
     ),
-    "weights": Axis("weights", "trained numbers"),
+    "weights": Axis("weights", "numbers found by training"),
 }
 """Less is better."""
 ACCURACIES = {
-    "hard": Axis("T-HARD, simulated", "trained on T-REAL, tested on twenty attachments of the skin never seen"),
+    "hard": Axis("T-HARD, simulated", "trained on T-REAL, tested on twenty attachments of the skin not in training"),
     "lopo": Axis("T-REAL, simulated", "leave one position out"),
     "force": Axis("FabricSlide, force", "seven real fabrics without each window's means, leave a force out"),
     "speed": Axis("FabricSlide, speed", "seven real fabrics without each window's means, leave a speed out"),
-    "stress": Axis("worst stress", "the stress that hurts it most, mean over its severities"),
-    "stress:none": Axis("no stress", "the sweeps that are put under stress, as they are"),
-    "stress:noise": Axis("noise", "white noise of .3 of each taxel's deviation"),
+    "stress": Axis("worst stress", "the stress that costs it most accuracy, mean over severities"),
+    "stress:none": Axis("no stress", "the same sweeps without stress"),
+    "stress:noise": Axis("noise", "white noise of 0.3 of each taxel's standard deviation"),
     "stress:dead": Axis("a dead taxel", "one taxel reads 0"),
-    "stress:gain": Axis("gain ± 20 %", "all gains a fifth lower or higher, the worse of both"),
+    "stress:gain": Axis("gain ± 20 %", "all gains 20 % lower or higher, the worse of both"),
     "stress:lost": Axis("lost frames", "5 % of the frames lost"),
     "stress:shift": Axis("shift", "the skin one row of taxels further along"),
 }
@@ -52,8 +52,10 @@ ACCURACIES = {
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which of `points` (cost, accuracy) no other dominates: none costs at most as much and is at least as accurate,
-    and better in one. Equal points stand or fall together."""
+    """Which of `points` (cost, accuracy) no other dominates, that is, costs no more, is no less accurate, and better in one.
+
+    Equal points are all on the front or all behind it.
+    """
     return [not any(c <= cost and a >= accuracy and (c, a) != (cost, accuracy) for c, a in points)
             for cost, accuracy in points]  # fmt: skip
 
@@ -67,5 +69,5 @@ def placed(dots: Sequence[Dot], x: str, y: str) -> list[tuple[Dot, float, float,
 
 
 def name(dot: Dot) -> str:
-    """What a dot is called; no two of a chart share it."""
+    """A dot's name, unique in a chart."""
     return f"{dot['method']} {dot['precision']}" + ("" if dot["runtime"] == "onnx" else f" in {dot['runtime']}")

@@ -1,52 +1,76 @@
-"""The room of ink: what all pictures share. In: what was drawn with matplotlib. Out: SVG text, always the same.
+"""The style that all pictures share. In: what was drawn with matplotlib. Out: SVG text, the same in every run.
 
-A picture is 360 units wide, the width of a phone. Colours are roles (--ink, --accent …) that a page may set for light
-and dark; alone a picture is dark on white.
+A picture is 360 units wide, the width of a phone. Its colours are roles (--text, --accent …) that a page sets for light
+and dark; a picture by itself is dark on white.
 """
 
 from __future__ import annotations
 
 import io
-import re
 from collections.abc import Iterable, Sequence
-from html import escape
 from typing import Any
+from xml.etree import ElementTree
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+from matplotlib.ticker import FixedFormatter, FixedLocator, Formatter, NullFormatter, NullLocator
 
-ACCENT, INK, GREY, FAINT, PAPER = "#0b66c3", "#1f2328", "#59636e", "#d1d9e0", "#fefefe"
-ROLES = {"accent": ACCENT, "ink": INK, "grey": GREY, "faint": FAINT, "paper": PAPER}
+ACCENT, BLACK, GREY, FAINT, WHITE = "#0b66c3", "#1f2328", "#59636e", "#d1d9e0", "#fefefe"
+ROLES = {"accent": ACCENT, "text": BLACK, "grey": GREY, "faint": FAINT, "background": WHITE}
+COLOURS = {colour: f"var(--{role}, {colour})" for role, colour in ROLES.items()}
+"""What stands in an SVG for each of them."""
+DARK_ROLES = {"accent": "#58a6ff", "text": "#e6edf3", "grey": "#9ea7b3", "faint": "#343b44", "background": "#0d1117"}
+"""Colours of the same roles for readers who chose dark."""
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu Sans', sans-serif"
 WIDTH = 5.0
 """Inches, of 72 units each."""
-TEXT, SMALL = 10.5, 9.0
-DEFAULT_FONT = re.compile(r" font-family: [^;]*;")
-STYLE = re.compile(r"<defs>\s*<style.*?</style>\s*</defs>", re.S)
-NAMES = re.compile(r'(?<=<g) id="[^"]*"')
-TAG = re.compile(r"<[^>]*>")
-DIGITS = re.compile(r"(?<=\d\.\d\d)\d+")
-UPRIGHT = re.compile(r' transform="rotate\(-0 [^)]*\)"')
-HEAD = re.compile(r'width="[^"]*" height="[^"]*" (viewBox="[^"]*")([^>]*)>')
+MEDIUM, SMALL = 10.5, 9.0
+"""Sizes of text, in units."""
+PLACES = 2
+"""Decimals of coordinates: a hundredth of a unit cannot be seen."""
+DIGITS = 6
+"""Significant digits of a tick label, where the tick needs so many."""
+SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+NUMBERS = {"x", "y", "x1", "y1", "x2", "y2", "width", "height"}
+"""Attributes that hold one coordinate."""
+ElementTree.register_namespace("", SVG)
+ElementTree.register_namespace("xlink", XLINK)
 
 
-def share(value: float) -> str:
-    """A share as the paper prints it: .86, 1.00."""
-    return f"{value:.2f}".removeprefix("0")
+class TickFormatter(Formatter):
+    """Labels that show each tick's value in full: as many decimals as it needs, up to DIGITS significant digits.
+
+    factor: a label is the tick's value times this. unit: follows the last label.
+    """
+
+    def __init__(self, factor: float = 1.0, unit: str = "") -> None:
+        self.factor, self.unit = factor, unit
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """The label of a tick at `x`, without the unit."""
+        text = np.format_float_positional(float(f"{x * self.factor:.{DIGITS}g}"), trim="-")
+        return text.replace("-", "−") if float(text) else "0"
+
+    def format_ticks(self, values: Iterable[float]) -> list[str]:
+        """All labels of an axis."""
+        labels = [self(value) for value in values]
+        if labels and self.unit:
+            labels[-1] += f" {self.unit}"
+        return labels
 
 
-def field(height: float, left: float, right: float, top: float, bottom: float) -> tuple[Figure, Axes]:
-    """A picture `height` inches high with one field; left, right: its ends as shares; top, bottom: inches around it."""
+def single_axes(height: float, left: float, right: float, top: float, bottom: float) -> tuple[Figure, Axes]:
+    """A picture `height` inches high with one plot; left, right: its ends as shares; top, bottom: inches around it."""
     figure = Figure((WIDTH, height))
-    return figure, add(figure, left, right, 1 - top / height, bottom / height)
+    return figure, add_axes(figure, left, right, 1 - top / height, bottom / height)
 
 
-def add(figure: Figure, left: float, right: float, top: float, bottom: float) -> Axes:
-    """One more field, its ends as shares of the picture; no frame, the grid behind all else."""
-    axes: Axes = figure.add_axes((left, bottom, right - left, top - bottom))
+def add_axes(figure: Figure, left: float, right: float, top: float, bottom: float) -> Axes:
+    """One more plot, its ends as shares of the picture; no frame, the grid behind all else."""
+    axes = figure.add_axes((left, bottom, right - left, top - bottom))
     axes.set_axisbelow(True)
     axes.patch.set_visible(False)
     for spine in axes.spines.values():
@@ -60,48 +84,101 @@ def tiles(axes: Axes, rows: int, columns: int) -> None:
     axes.set_ylim(rows, 0)
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.hlines(range(rows + 1), 0, columns, color=PAPER, linewidth=1.5)
-    axes.vlines(range(columns + 1), 0, rows, color=PAPER, linewidth=1.5)
+    axes.hlines(range(rows + 1), 0, columns, color=WHITE, linewidth=1.5)
+    axes.vlines(range(columns + 1), 0, rows, color=WHITE, linewidth=1.5)
 
 
-def scale(axis: Axis, ticks: Iterable[float], labels: Sequence[str] | None = None) -> None:
-    """Ticks without strokes; labels as shares below one, else as they are."""
-    at = [round(float(tick), 9) for tick in ticks]
-    said = [share(t) if 0 < t < 1 and round(t, 2) == t else f"{t:g}" for t in at] if labels is None else labels
-    axis.set_major_locator(FixedLocator(at))
+def set_ticks(
+    axis: Axis,
+    ticks: Iterable[float],
+    unit: str = "",
+    factor: float = 1.0,
+    *,
+    percent: bool = False,
+    bare: bool = False,
+) -> None:
+    """Ticks without strokes, labelled with their values times `factor`, the last one with the unit.
+
+    percent: the values are shares and shown as per cent. bare: no labels, for a plot beside one that has them.
+    """
+    unit, factor = ("%", 100.0) if percent else (unit, factor)
+    _place_ticks(axis, ticks, NullFormatter() if bare else TickFormatter(factor, unit))
+
+
+def set_categories(axis: Axis, at: Iterable[float], names: Sequence[str]) -> None:
+    """Ticks that stand for things with names, not for values."""
+    _place_ticks(axis, at, FixedFormatter(names))
+
+
+def _place_ticks(axis: Axis, ticks: Iterable[float], formatter: Formatter) -> None:
+    axis.set_major_locator(FixedLocator([float(tick) for tick in ticks]))
     axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FixedFormatter(said))
+    axis.set_major_formatter(formatter)
     axis.set_tick_params(length=0, labelcolor=GREY, labelsize=SMALL)
 
 
-def write(axes: Axes, x: float, y: float, text: str, colour: str = INK, size: float = TEXT, **how: Any) -> None:
-    """Text at a place in the field's units, also beside the field; its middle there where nothing else is said.
+def write(axes: Axes, x: float, y: float, text: str, colour: str = BLACK, size: float = MEDIUM, **style: Any) -> None:
+    """Text at a point in the plot's units, also outside of it; centred there unless `style` says otherwise.
 
-    Of several lines the last one is there and the others stand above it, each a text of its own: so a reader's own font
-    keeps them in line.
+    Of several lines the last one is there and the others stand above it, each a text of its own, so that they stay in
+    line in a reader's own font.
     """
-    style = {"color": colour, "size": size, "va": "center", "ha": "center", "annotation_clip": False} | how
+    style = {"color": colour, "size": size, "va": "center", "ha": "center", "annotation_clip": False} | style
     for up, line in enumerate(reversed(text.split("\n"))):
         axes.annotate(line, (x, y), (0, 1.2 * size * up), textcoords="offset points", **style)
 
 
-def svg(figure: Figure, about: str) -> str:
-    """The picture as text. about: for those who cannot see it."""
-    figure.patch.set_facecolor(PAPER)
-    held = io.StringIO()
+def to_svg(figure: Figure, about: str) -> str:
+    """The picture as SVG text. about: its title, for those who cannot see it."""
+    figure.patch.set_facecolor(WHITE)
+    file = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": about}):
-        figure.savefig(held, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-    text = held.getvalue()
-    text = text[text.index("<svg") :]
-    for what in (
-        DEFAULT_FONT,
-        STYLE,
-        NAMES,
-    ):  # of matplotlib, for all of a page, twice in a page
-        text = what.sub("", text)
-    text = TAG.sub(lambda tag: DIGITS.sub("", tag[0]), text)  # finer than seen; a text keeps its digits
-    text = re.sub(r"\s*\n\s*", "\n", text)
-    for role, colour in ROLES.items():
-        text = text.replace(f": {colour}", f": var(--{role}, {colour})")
-    said = f'role="img" font-family="{FONT}" stroke-linejoin="round"><title>{escape(about)}</title>'
-    return HEAD.sub(lambda found: f"{found[1]}{found[2]} {said}", text, count=1)
+        figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    root = ElementTree.fromstring(file.getvalue())
+    for style in root.findall(f"{{{SVG}}}defs[{{{SVG}}}style]"):
+        root.remove(style)  # a style sheet would be that of the whole page
+    _drop_empty_groups(root)
+    for element in root.iter():
+        _restyle(element)
+    for name in ("width", "height"):
+        root.attrib.pop(name)  # as wide as the page
+    root.attrib |= {"role": "img", "font-family": FONT, "stroke-linejoin": "round"}
+    title = ElementTree.Element(f"{{{SVG}}}title")
+    title.text = about
+    root.insert(0, title)
+    ElementTree.indent(root, space="")
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _drop_empty_groups(parent: ElementTree.Element) -> None:
+    """Ticks without length leave groups that hold nothing."""
+    for child in list(parent):
+        _drop_empty_groups(child)
+        if child.tag == f"{{{SVG}}}g" and not len(child):
+            parent.remove(child)
+
+
+def _restyle(element: ElementTree.Element) -> None:
+    """Colours as roles, no font of matplotlib's, no names of groups, coordinates no finer than can be seen."""
+    attributes = element.attrib
+    if element.tag == f"{{{SVG}}}g":
+        attributes.pop("id", None)  # two pictures of a page would share them
+    if "style" in attributes:
+        parts = (part.partition(":") for part in attributes["style"].split(";"))
+        pairs = {name.strip(): value.strip() for name, _, value in parts if name.strip() != "font-family"}
+        attributes["style"] = "; ".join(f"{name}: {COLOURS.get(value, value)}" for name, value in pairs.items() if name)
+    for name in NUMBERS & attributes.keys():
+        attributes[name] = _short(attributes[name])
+    if "d" in attributes:
+        attributes["d"] = " ".join(part if part.isalpha() else _short(part) for part in attributes["d"].split())
+    if attributes.get("transform", "").startswith(("rotate(-0 ", "rotate(0 ")):
+        del attributes["transform"]
+
+
+def _short(number: str) -> str:
+    """A coordinate with at most PLACES decimals; what has a unit stays as it is."""
+    try:
+        text = f"{float(number):.{PLACES}f}".rstrip("0").rstrip(".")
+    except ValueError:
+        return number
+    return "0" if text == "-0" else text

@@ -1,7 +1,7 @@
-"""The room of the chart's still picture: accuracy over time per sweep. In: dots, as chart.json lists them. Out: SVG.
+"""The chart without scripts: accuracy over time per sweep. In: dots, as chart.json lists them. Out: SVG text.
 
-Ours is in the accent colour and all else dark where it is on the front; what another dot beats in both is grey. Squares
-are int8, circles float; what cannot run on the box is hollow.
+On the Pareto front our models are in the accent colour and all others dark; what another dot beats in both is grey.
+Squares are int8, circles float; what cannot run on the box is hollow.
 """
 
 from __future__ import annotations
@@ -13,22 +13,33 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
 from train.reports.pareto import ACCURACIES, COSTS, Dot, placed
-from train.reports.plot_style import ACCENT, FAINT, GREY, INK, PAPER, SMALL, TEXT, WIDTH, add, scale, svg
+from train.reports.plot_style import (
+    ACCENT,
+    BLACK,
+    FAINT,
+    GREY,
+    MEDIUM,
+    SMALL,
+    WHITE,
+    WIDTH,
+    add_axes,
+    set_ticks,
+    to_svg,
+)
 
 OURS = "Palpate"
 HEIGHT, ABOVE, BELOW, FOOT = 2.9, 0.36, 0.34, 0.42
-"""Of a panel, and around its field; of the legend: inches."""
+"""Inches: of a panel, above and below its plot, and of the legend."""
 LETTER = 0.56
-"""Width of one, in sizes of the text: wider than most fonts' mean."""
+"""Width of a letter, in sizes of the text: more than the mean of most fonts."""
 MARK = 3.2
 """Half of a mark, points."""
 PLACES = [(0, 10, "center"), (6, 0, "left"), (-6, 0, "right"), (0, -10, "center"), (-4, 8, "right"), (5, -8, "left"),
           (5, 8, "left"), (-5, -8, "right")]  # fmt: skip
-"""Where a name may stand, points from its dot; the best first."""
+"""Where a name may stand, points from its dot, and its alignment; the best first."""
 SHORT = {"paper-cnn": "paper’s CNN, raw", "paper-cnn-centred": "paper’s CNN", "minirocket": "MiniRocket",
          "tactnet2": "TactNet-II", "st-hmp": "ST-HMP"}  # fmt: skip
 Box = tuple[float, float, float, float]
@@ -42,15 +53,15 @@ def chart(dots: Sequence[Dot], panels: Sequence[str] = ("hard", "speed"), cost: 
     figure = Figure((WIDTH, height), dpi=72)
     for i, y in enumerate(there):
         top = height - i * HEIGHT - ABOVE
-        axes = add(figure, 0.085, 0.985, top / height, (top - HEIGHT + ABOVE + BELOW) / height)
+        axes = add_axes(figure, 0.085, 0.985, top / height, (top - HEIGHT + ABOVE + BELOW) / height)
         _panel(axes, placed(dots, cost, y), y, cost)
     for x, row, text, colour in (
         (0.01, 1, "■ int8   ● float   ○ cannot run on the box", GREY),
-        (0.01, 0, "━ the front: nothing is better in both", INK),
+        (0.01, 0, "━ Pareto front: nothing is better in both", BLACK),
         (0.6, 0, "■ Palpate, by weights", ACCENT),
     ):
         figure.text(x, (0.06 + 0.19 * row) / height, text, color=colour, size=SMALL)
-    return svg(figure, f"accuracy over {COSTS[cost].short} of {len(dots)} models")
+    return to_svg(figure, f"accuracy over {COSTS[cost].short} of {len(dots)} models")
 
 
 def _panel(axes: Axes, spots: Sequence[Spot], y: str, cost: str) -> None:
@@ -64,15 +75,14 @@ def _panel(axes: Axes, spots: Sequence[Spot], y: str, cost: str) -> None:
     tens = 10.0 ** np.arange(np.floor(np.log10(x.min())), np.ceil(np.log10(x.max())) + 1)
     ticks = [k * t for t in tens for k in (1, 3) if axes.get_xlim()[0] <= k * t <= axes.get_xlim()[1]]
     axis = COSTS[cost]
-    scale(axes.xaxis, ticks, [f"{t:g}" for t in ticks[:-1]] + [f"{ticks[-1]:g} {axis.unit}"])
-    axes.xaxis.set_minor_locator(NullLocator())
-    scale(axes.yaxis, np.arange(bottom, 1.001, 0.1 if bottom >= 0.4 else 0.2))
-    axes.set_title(ACCURACIES[y].short, color=INK, size=TEXT, weight="bold", loc="left", pad=6)
+    set_ticks(axes.xaxis, ticks, axis.unit)
+    set_ticks(axes.yaxis, np.arange(bottom, 1.001, 0.1 if bottom >= 0.4 else 0.2), percent=True)
+    axes.set_title(ACCURACIES[y].short, color=BLACK, size=MEDIUM, weight="bold", loc="left", pad=6)
     axes.set_title(f"share right, over {axis.short}", color=GREY, size=SMALL, loc="right", pad=6)
     best = [spot for spot in spots if spot[3]]
     edge = [axes.get_xlim()[1]]
     stairs = np.array([[s[1] for s in best] + edge, [s[2] for s in best] + [best[-1][2]]])
-    axes.step(*stairs, where="post", color=INK, linewidth=1.2)
+    axes.step(*stairs, where="post", color=BLACK, linewidth=1.2)
     for spot in sorted(spots, key=lambda s: s[3]):
         _mark(axes, spot, y)
     _labels(axes, spots, axes.transData.transform(stairs.T))
@@ -80,20 +90,20 @@ def _panel(axes: Axes, spots: Sequence[Spot], y: str, cost: str) -> None:
 
 def colour(dot: Dot, best: bool) -> str:
     """Of a dot's mark."""
-    return (ACCENT if dot["family"] == OURS else INK) if best else GREY
+    return (ACCENT if dot["family"] == OURS else BLACK) if best else GREY
 
 
 def _mark(axes: Axes, spot: Spot, y: str) -> None:
     dot, at, mean, best = spot
-    ink, told = colour(dot, best), dot["accuracy"][y]
+    shade, ends = colour(dot, best), dot["accuracy"][y]
     strength = 1.0 if best else 0.55
-    axes.plot([at, at], [told["low"], told["high"]], color=ink, linewidth=0.9, alpha=0.45 if best else 0.3)
+    axes.plot([at, at], [ends["low"], ends["high"]], color=shade, linewidth=0.9, alpha=0.45 if best else 0.3)
     axes.plot(at, mean, "s" if dot["precision"] == "int8" else "o", markersize=2 * MARK, markeredgewidth=1.2,
-              color=ink, markerfacecolor=ink if dot["runs_on_box"] else PAPER, alpha=strength, zorder=3 + best)  # fmt: skip
+              color=shade, markerfacecolor=shade if dot["runs_on_box"] else WHITE, alpha=strength, zorder=3 + best)  # fmt: skip
 
 
 def _labels(axes: Axes, spots: Sequence[Spot], stairs: NDArray[Any]) -> None:
-    """Names beside the dots, those of the front first, each name once; one that finds no free place is left out.
+    """Names beside the dots, those of the front first, each once; a name that fits nowhere is left out.
 
     stairs [n, 2]: the front's corners, in points.
     """
@@ -101,31 +111,32 @@ def _labels(axes: Axes, spots: Sequence[Spot], stairs: NDArray[Any]) -> None:
     taken: list[Box] = [(x - MARK, y - MARK, x + MARK, y + MARK) for x, y in at]
     taken += [(x, y - 1, end, y + 1) for (x, y), (end, _) in pairwise(stairs)]
     taken += [(end - 1, y, end + 1, up) for (_, y), (end, up) in pairwise(stairs)]
-    told: set[str] = set()
+    named: set[str] = set()
     leading = {label(spot[0]) for spot in spots if spot[3]}
-    frame: Box = tuple(axes.get_window_extent().extents)  # type: ignore[assignment]
+    left, bottom, right, top = map(float, axes.get_window_extent().extents)
+    frame: Box = (left, bottom, right, top)
     for i in _important(spots):
-        text, size, ink = label(spots[i][0]), SMALL, colour(spots[i][0], spots[i][3])
-        if text in told or (text in leading and not spots[i][3]):
+        text, size, shade = label(spots[i][0]), SMALL, colour(spots[i][0], spots[i][3])
+        if text in named or (text in leading and not spots[i][3]):
             continue
         for dx, dy, side in PLACES:
             box = _box(*at[i], dx, dy, side, LETTER * size * len(text), size)
             if _inside(box, frame) and not any(_meet(box, other) for k, other in enumerate(taken) if k != i):
                 taken.append(box)
-                told.add(text)
+                named.add(text)
                 axes.annotate(text, spots[i][1:3], (dx, dy), textcoords="offset points", size=size, va="center",
-                              ha=side, color=ink, annotation_clip=False, zorder=6)  # fmt: skip
+                              ha=side, color=shade, annotation_clip=False, zorder=6)  # fmt: skip
                 break
 
 
 def label(dot: Dot) -> str:
-    """A short name: of ours the size alone, and nothing that a mark's shape tells."""
+    """A short name: of our models the size alone, without the precision, which the mark shows."""
     method = str(dot["method"]).removeprefix("compact-" if dot["family"] == OURS else "")
     return SHORT.get(method, method)
 
 
 def _important(spots: Sequence[Spot]) -> Iterator[int]:
-    """Numbers of the dots in the order in which they get their names: the front, then each family's best, the rest."""
+    """Indices of the dots in the order in which they get names: the front, then the best of each family, then the rest."""
     families: dict[str, int] = {}
     for i, (dot, _, mean, _) in enumerate(spots):
         if mean > spots[families.setdefault(dot["family"], i)][2]:

@@ -1,4 +1,4 @@
-"""The room of the two pictures of a choice. In: parts of choice.json. Out: SVG text, in the style of ink.py."""
+"""The two pictures of a choice of model. In: parts of choice.json. Out: SVG text."""
 
 from __future__ import annotations
 
@@ -9,51 +9,68 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from train.reports.plot_style import ACCENT, FAINT, GREY, INK, SMALL, TEXT, WIDTH, add, field, scale, svg, write
+from train.reports.formatting import percent
+from train.reports.plot_style import (
+    ACCENT,
+    BLACK,
+    FAINT,
+    GREY,
+    MEDIUM,
+    SMALL,
+    WIDTH,
+    add_axes,
+    set_categories,
+    set_ticks,
+    single_axes,
+    to_svg,
+    write,
+)
 
 Json = Mapping[str, Any]
 TITLES = {"window": "length of the window", "rate": "frames a second", "taxels": "taxels", "bits": "bits",
-          "classes": "materials told apart"}  # fmt: skip
+          "classes": "materials distinguished"}  # fmt: skip
+COLUMNS = (1.42, 1.75, 2.05)
+"""Right ends of the columns of numbers beside `sizes`, in widths of the plot."""
 
 
-def rungs(told: Sequence[Json], chosen: str, wanted: float, about: str) -> str:
-    """Accuracy with its interval for each rung that was tried, cheapest on top; the chosen one in the accent colour."""
-    tried = [rung for rung in told if rung["accuracy"]]
-    figure, axes = field(len(tried) * 0.29 + 0.6, left=0.27, right=0.7, top=0.3, bottom=0.28)
-    lows = [rung["accuracy"]["low"] for rung in tried]
+def sizes(entries: Sequence[Json], chosen: str, wanted: float, about: str) -> str:
+    """Accuracy with its interval of each model that was tried, cheapest on top; the chosen one in the accent colour."""
+    tried = [entry for entry in entries if entry["accuracy"]]
+    figure, axes = single_axes(len(tried) * 0.29 + 0.6, left=0.27, right=0.62, top=0.3, bottom=0.28)
+    lows = [entry["accuracy"]["low"] for entry in tried]
     bottom = max(np.floor(10 * min([*lows, wanted or 1.0]) - 0.01) / 10, 0)
-    for y, rung in enumerate(tried):
-        mine, got = rung["method"] == chosen, rung["accuracy"]
-        colour = ACCENT if mine else GREY
-        axes.plot([got["low"], got["high"]], [y, y], color=colour, linewidth=2.2 if mine else 1.4)
-        axes.plot(got["mean"], y, "o", color=colour, markersize=6.5 if mine else 5)
-        how = {"size": TEXT, "annotation_clip": False, "va": "center", "color": ACCENT if mine else INK}
-        bold = {"weight": "bold" if mine else "normal"}
-        for text, at, side in (
-            (rung["method"], (-0.03, y), "right"),
-            (figure_of(got["mean"]), (1.18, y), "right"),
-            (f"{rung['ms']:.2f}", (1.45, y), "right"),
-            (f"{rung['kb']:.0f}", (1.68, y), "right"),
-        ):
-            axes.annotate(text, at, xycoords=axes.get_yaxis_transform(), ha=side, **how, **bold)
-    for text, x in (("right", 1.18), ("ms", 1.45), ("kB", 1.68)):
+    for y, entry in enumerate(tried):
+        _model(axes, y, entry, entry["method"] == chosen)
+    for text, x in zip(("right", "ms", "kB"), COLUMNS, strict=True):
         axes.annotate(text, (x, -0.85), xycoords=axes.get_yaxis_transform(), ha="right", va="center", color=GREY,
                       size=SMALL, annotation_clip=False)  # fmt: skip
     if wanted:
-        axes.axvline(wanted, color=INK, linewidth=1, linestyle=(0, (2, 2)))
+        axes.axvline(wanted, color=BLACK, linewidth=1, linestyle=(0, (2, 2)))
         write(axes, wanted, -0.85, "wanted", GREY, SMALL)
     axes.set_ylim(len(tried) - 0.5, -0.55)
     axes.set_xlim(bottom, 1.005)
     axes.grid(axis="x", color=FAINT, linewidth=0.7)
-    step = 0.1 if bottom > 0.45 else 0.2
-    scale(axes.xaxis, np.arange(bottom, 1.01, step))
-    scale(axes.yaxis, [])
-    return svg(figure, about)
+    set_ticks(axes.xaxis, np.arange(bottom, 1.01, 0.1 if bottom > 0.45 else 0.2), percent=True)
+    set_ticks(axes.yaxis, [])
+    return to_svg(figure, about)
 
 
-def less(curves: Sequence[Json], about: str, columns: int = 2) -> str:
-    """A panel for each curve: accuracy over what is left, from all of it to little. Filled where it loses no more than a
-    standard error; what could be kept is in the accent colour."""
+def _model(axes: Axes, y: float, entry: Json, chosen: bool) -> None:
+    """One row: the interval with its mean, and name, accuracy, ms and kB as text."""
+    accuracy, colour = entry["accuracy"], ACCENT if chosen else GREY
+    axes.plot([accuracy["low"], accuracy["high"]], [y, y], color=colour, linewidth=2.2 if chosen else 1.4)
+    axes.plot(accuracy["mean"], y, "o", color=colour, markersize=6.5 if chosen else 5)
+    texts = (entry["method"], percent(accuracy["mean"]), f"{entry['ms']:.2f}", f"{entry['kb']:.0f}")
+    for text, x in zip(texts, (-0.03, *COLUMNS), strict=True):
+        axes.annotate(text, (x, y), xycoords=axes.get_yaxis_transform(), ha="right", va="center", size=MEDIUM,
+                      annotation_clip=False, color=ACCENT if chosen else BLACK, weight="bold" if chosen else "normal")  # fmt: skip
+
+
+def reductions(curves: Sequence[Json], about: str, columns: int = 2) -> str:
+    """A panel for each curve: accuracy over what is kept, from everything to little.
+
+    A dot is filled where it loses no more than one standard error; the least that is enough is in the accent colour.
+    """
     rows, above, each = -(-len(curves) // columns), 0.1, 1.35
     figure = Figure((WIDTH, above + rows * each))
     inch = 1 / figure.get_figheight()
@@ -62,12 +79,12 @@ def less(curves: Sequence[Json], about: str, columns: int = 2) -> str:
     for i, curve in enumerate(curves):
         row, column = divmod(i, columns)
         low = ((rows - 1 - row) * each + 0.42) * inch
-        left = 0.075 + 0.925 * column / columns
-        axes = add(figure, left, left + 0.925 / columns - 0.04, low + 0.78 * inch, low)
+        left = 0.09 + 0.91 * column / columns
+        axes = add_axes(figure, left, left + 0.91 / columns - 0.04, low + 0.78 * inch, low)
         _panel(axes, curve)
         axes.set_ylim(bottom, 1.02)
-        scale(axes.yaxis, np.arange(bottom, 1.01, 0.1 if bottom > 0.55 else 0.2), [] if column else None)
-    return svg(figure, about)
+        set_ticks(axes.yaxis, np.arange(bottom, 1.01, 0.1 if bottom > 0.55 else 0.2), percent=True, bare=column > 0)
+    return to_svg(figure, about)
 
 
 def _panel(axes: Axes, curve: Json) -> None:
@@ -81,12 +98,7 @@ def _panel(axes: Axes, curve: Json) -> None:
         fine = point.get("fine", True)
         axes.plot(at, mean[at], "o", markersize=7 if kept else 5, color=ACCENT if kept else GREY,
                   markerfacecolor=(ACCENT if kept else GREY) if fine else "none")  # fmt: skip
-    axes.set_title(TITLES[curve["kind"]], color=INK, size=SMALL + 0.5, loc="left", pad=3)
+    axes.set_title(TITLES[curve["kind"]], color=BLACK, size=SMALL + 0.5, loc="left", pad=3)
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.set_xlim(-0.35, len(points) - 0.65 if len(points) > 1 else 0.35)
-    scale(axes.xaxis, x, [p["name"].partition(" ")[0] for p in points])
-
-
-def figure_of(value: float) -> str:
-    """A share with three digits: .914, 1.000."""
-    return f"{value:.3f}".removeprefix("0")
+    set_categories(axes.xaxis, x, [p["name"].partition(" ")[0] for p in points])

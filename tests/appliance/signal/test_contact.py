@@ -20,7 +20,7 @@ from appliance.sim import skin
 from train.data import sets
 from train.data.sets import Dataset
 from train.export import contact_positions
-from train.reports import contact_report
+from train.reports import contact_plot
 
 TARE = np.zeros((4, 4))
 MIDDLE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
@@ -232,7 +232,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     assert ahead["told_mm"] > 1.2 > home["told_mm"]
     text = "\n".join(contact_positions.lines(told))
     assert "rows +5.0 mm" in text
-    assert "flagged" in contact_report.chart(told)
+    assert "flagged" in contact_plot.draw(told)
     with pytest.raises(FormatError, match="no positions"):
         contact_positions.measure(
             Classifier(replace(wide, manifest=replace(wide.manifest, place=None)), SystemClock()), "", "", "", print

@@ -141,7 +141,7 @@ def test_two_materials_leave_nobody_out():
                one.copied_labels[also], one.copied_groups[also], one.new[test], one.labels[test], one.places[test])  # fmt: skip
     figures = uncertainty.figures([one], NAMES[:2], 1)
     assert set(figures) == {"calibration", "sequence", "early"}
-    html, pictures = uncertainty_report.tell(figures | dict.fromkeys(ABOUT, "x"))
+    html, pictures = uncertainty_report.render(figures | dict.fromkeys(ABOUT, "x"))
     assert set(pictures) == {"reliability", "sweeps", "touch"}
     assert "never trained<" not in html
 
@@ -152,7 +152,7 @@ ABOUT = ("set", "test", "protocol", "method", "seed", "effort", "folds", "traini
 
 def test_the_page_stands_alone(told):
     """One file without script or address; its pictures are sound XML; each target says whether it was reached."""
-    html, pictures = uncertainty_report.tell(told | dict.fromkeys(ABOUT, "x"))
+    html, pictures = uncertainty_report.render(told | dict.fromkeys(ABOUT, "x"))
     assert not re.search(r"<script|src=|href=\"http", html)
     assert len(pictures) == 5
     for svg in pictures.values():

@@ -118,7 +118,7 @@ def test_hovering_names_a_dot_and_its_figures(seen: Seen):
     x, y = seen.places()[3]
     frame = seen.page.locator("#plot svg").bounding_box()
     seen.page.mouse.move(frame["x"] + x + 6, frame["y"] + y + 6)
-    for text in ("H-svm float", "L and H", ".930", ".910 – .950", "0.5 ms", "behind compact-20k int8"):
+    for text in ("H-svm float", "L and H", "93.0 %", "91.0 – 95.0 %", "0.5 ms", "behind compact-20k int8"):
         assert text in seen.tip()
     seen.page.mouse.move(frame["x"] + 60, frame["y"] + 20)
     assert seen.tip() == ""
@@ -224,7 +224,7 @@ def test_the_first_dot_may_be_hidden_and_tab_still_finds_one(seen: Seen):
 
 def test_dots_are_named_for_those_who_do_not_see_them(seen: Seen):
     """Each has its name and the two figures chosen; the controls have labels."""
-    assert seen.page.get_by_role("img", name="H-svm float: .930, 0.5 ms").count() == 1
+    assert seen.page.get_by_role("img", name="H-svm float: 93.0 %, 0.5 ms").count() == 1
     assert seen.page.get_by_label("accuracy", exact=True).count() == 1
     assert seen.page.get_by_label("log of the error").count() == 1
 

@@ -233,5 +233,5 @@ def test_the_front_of_the_picture_is_dark_and_the_rest_grey():
     told = {pareto.name(spot[0]): scatter.colour(spot[0], spot[3]) for spot in spots}
     assert told["compact-1k int8"] == scatter.ACCENT
     assert told["compact-1k float"] == scatter.GREY
-    assert told["minirocket float in aeon"] == scatter.INK
+    assert told["minirocket float in aeon"] == scatter.BLACK
     assert told["minirocket float"] == scatter.GREY

@@ -43,7 +43,7 @@ def words(svg: str) -> str:
 
 def drawn(path: Path, *more, **also) -> str:
     """The picture of `sweep`."""
-    return sweep_plot.draw(sweep_plot.look(sweep(path, *more, **also)))
+    return sweep_plot.draw(sweep_plot.load(sweep(path, *more, **also)))
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_the_picture_says_what_is_known(small: str):
         "cork, position 3, session mon", "sweep-000017.npy, sweep 7: ok", "4x4 uint8 at 750 Hz, window 1500",
         "2 frames lost, filled in from their neighbours", "verdict: status unsure, label cork, probability 0.9877",
         "bundle: 9f3c2a1b", "device: board readout, serial A4, firmware 1.4.2", "clock: jitter us 41.23", "grey: the skin at rest",
-        "digits over seconds after the start edge", "digits per √Hz over Hz", "what rounding to whole digits makes; without 1 that stand still",
+        "raw counts over seconds after the start edge", "raw counts per √Hz over Hz", "the noise of rounding to whole counts; without 1 that stand still",
     ):  # fmt: skip
         assert text in told, text
     assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(told.split("\n"))
@@ -69,7 +69,7 @@ def test_the_picture_says_what_is_known(small: str):
 def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
     """A recording of before, with no sidecar's extras: nothing is said of rest, verdict or device."""
     record(tmp_path / "1.npy", "a")
-    told = words(sweep_plot.draw(sweep_plot.look(str(tmp_path / "1.npy"))))
+    told = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "1.npy"))))
     assert told.startswith("a\n1.npy, sweep 1: ok")
     for text in ("rest", "verdict", "bundle", "device", "clock", "lost", "None"):
         assert text not in told
@@ -117,7 +117,7 @@ def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
     """A sine of 100 Hz has its peak there, and its height as a density: amplitude over root of twice the bin's noise width."""
     fmt = SweepFormat(1, 1, 750.0, 1500, "float32")
     tone = 8 * np.sin(2 * np.pi * 100 * np.arange(1500) / 750)[:, None]
-    axes = sweep_plot.add(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
+    axes = sweep_plot.add_axes(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
     sweep_plot._spectrum(axes, tone, fmt)
     hz, density = axes.lines[0].get_data()
     assert hz[0] == 1
@@ -146,7 +146,7 @@ def test_a_silent_skin_can_be_drawn(tmp_path: Path, digits: int):
     fmt = SweepFormat(2, 2, 100.0, 300, "uint8")
     still = np.full((300, 2, 2), digits, np.uint8)
     save(tmp_path / "a.npy", Sweep(1, 0, 1, Status.OK, Frames(np.arange(300) * 10**7, np.arange(300), still)), fmt)
-    told = words(sweep_plot.draw(sweep_plot.look(str(tmp_path / "a.npy"))))
+    told = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npy"))))
     assert "no material" in told
     assert "no spectrum: less than 8 frames, or nothing moves" in told
 
@@ -156,9 +156,9 @@ def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """Where the numbers jump there is a bar, as wide as the gap lasted; the spectrum is of the longest run without one."""
     fmt = SweepFormat(*grid, 100.0, 400, "uint8")
     whole = drawn(tmp_path / "a.npy", fmt)
-    seen = sweep_plot.look(sweep(tmp_path / "b.npy", fmt, seq=np.r_[0:300, 350:400]))
+    seen = sweep_plot.load(sweep(tmp_path / "b.npy", fmt, seq=np.r_[0:300, 350:400]))
     assert list(seen.gaps) == [299]
-    axes = sweep_plot.add(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
+    axes = sweep_plot.add_axes(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
     seen.span(axes)
     (bar,) = axes.patches
     assert (bar.get_x(), bar.get_width()) == (pytest.approx(3.99), pytest.approx(0.51))
@@ -178,20 +178,20 @@ def test_texts_are_shown_as_they_are(tmp_path: Path):
     s = easy(2)
     object.__setattr__(s, "materials", ("a\x01b", "c", "d"))
     s.save(tmp_path / "a.npz")
-    assert words(sweep_plot.draw(sweep_plot.look(str(tmp_path / "a.npz"), 0))).startswith("a�b, recording 0")
+    assert words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npz"), 0))).startswith("a�b, recording 0")
 
 
 def test_a_sweep_of_a_set_is_chosen_by_number(tmp_path: Path):
     """Of a file, a simulated set, a folder: the one that training counts so; its groups are named."""
     s = easy(4)
     s.save(tmp_path / "s.npz")
-    seen = sweep_plot.look(str(tmp_path / "s.npz"), 11)
+    seen = sweep_plot.load(str(tmp_path / "s.npz"), 11)
     np.testing.assert_array_equal(seen.taxels, s.samples[11])
     assert (seen.title, seen.since) == ("high, recording 11, speed 3", "seconds")
-    assert sweep_plot.look("sim:T-HARD:1001:1", 5).title == "foam, position 0, world 1001"
+    assert sweep_plot.load("sim:T-HARD:1001:1", 5).title == "foam, position 0, world 1001"
     record(tmp_path / "box" / "0.npy", status=Status.GAP, frames=0)
     record(tmp_path / "box" / "1.npy", "a", id=50)
-    assert sweep_plot.look(str(tmp_path / "box"), 0).taxels[0, 0, 0] == 50
+    assert sweep_plot.load(str(tmp_path / "box"), 0).taxels[0, 0, 0] == 50
 
 
 @pytest.mark.parametrize(
@@ -218,6 +218,6 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path, what: str, number: int | 
             record(tmp_path / "box" / f"{name}.npy")
             save(tmp_path / "box" / f"{name}.npy", *load(tmp_path / "box" / f"{name}.npy"), {"tare": tare})
             with pytest.raises(FormatError, match=f"{name}.npy: the tare in its .json is no 2 x 3 numbers"):
-                sweep_plot.look(str(tmp_path / "box" / f"{name}.npy"))
+                sweep_plot.load(str(tmp_path / "box" / f"{name}.npy"))
     with pytest.raises(FormatError, match=message):
-        sweep_plot.look(str(tmp_path / what), number)
+        sweep_plot.load(str(tmp_path / what), number)

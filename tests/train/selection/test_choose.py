@@ -426,7 +426,7 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
     assert "http" not in page.replace("http://www.w3.org", "")
     said = capsys.readouterr().out
     assert f"{told['chosen']} with" in said or f"{told['chosen']} is enough" in said
-    assert "Reached: .800 is wanted" in said
+    assert "Reached: 80 % is wanted" in said
     assert main(args) == 0  # again, from what is kept
     assert json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"] == told["rungs"]
 
@@ -439,7 +439,7 @@ def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, mon
     (tmp_path / "scene.toml").write_text('sets = ["skin.npz"]\nvaries = ["place"]\naccuracy = 0.99\nreduce = []\n')
     scene_file, out, cache = (str(tmp_path / name) for name in ("scene.toml", "b", "c"))
     assert main(["choose", "--scene", scene_file, "--out", out, "--jobs", "1", "--cache", cache]) == 0
-    assert "Not reached: .990 is wanted" in capsys.readouterr().out
+    assert "Not reached: 99 % is wanted" in capsys.readouterr().out
     assert 'class="stop">Not reached' in (tmp_path / "b-why" / "index.html").read_text()
     assert bundle.load(tmp_path / "b").manifest.name == "scene"
 

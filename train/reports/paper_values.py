@@ -1,6 +1,6 @@
-"""The room of what the paper printed: accuracies by part and method, training cost, confusion, several sweeps.
+"""Values printed in the paper: accuracies by part and method, training cost, confusion, several sweeps.
 
-Its figures did not survive as text; these are the values printed in them. Parts are named as in paper.py.
+Its figures did not survive as text; these are the values printed in them. Parts are named as in paper_experiment.
 """
 
 from __future__ import annotations
@@ -10,17 +10,18 @@ import numpy as np
 from train.evaluation import sim_calibration
 
 FIGURES = {"lab": 4, "lopo": 5, "random": 6, "hard": 7}
-ACCURACY = {
+ACCURACY: dict[str, dict[str, float]] = {
     part: dict(zip(sim_calibration.METHODS, figure.printed, strict=True))
     for part, number in FIGURES.items()
     for figure in sim_calibration.FIGURES
     if figure.number == number
 }
 """Figs. 4 to 7."""
-MEANS_OUT = ", means out"
-CNNS = ("paper-cnn", "paper-cnn" + MEANS_OUT)
+CENTRED = ", means out"
+"""Ends the name of a method, in results.json, that got sweeps without each taxel's mean."""
+CNNS = ("paper-cnn", "paper-cnn" + CENTRED)
 """The paper's network, and the same on sweeps without each taxel's mean, which needs far fewer iterations: the printed
-numbers are the first one's, and what the second one is compared with."""
+numbers are those of the first, and the second is compared with them."""
 for _cnn in CNNS:
     ACCURACY["lopo"][_cnn], ACCURACY["hard"][_cnn] = 0.923, 0.917  # Fig. 10
 COST = ((500, 0.08), (2500, 0.002))
@@ -36,10 +37,18 @@ CONFUSION = np.array(
     ]
 )
 """Fig. 11, the CNN on T-REAL with a position left out: rows are the truth, in the order of skin.MATERIALS."""
-SEVERAL = {"H-svm": (0.86, None, 0.92), **dict.fromkeys(CNNS, (0.923, 0.973, 0.975))}
+SEVERAL: dict[str, tuple[float | None, ...]] = {
+    "H-svm": (0.86, None, 0.92),
+    **dict.fromkeys(CNNS, (0.923, 0.973, 0.975)),
+}
 """Fig. 13: one, two, three sweeps."""
 
 
-def short(method: str) -> str:
-    """A name that fits beside a bar."""
-    return f"–{MEANS_OUT[1:]}" if method.endswith(MEANS_OUT) else method
+def display_name(method: str) -> str:
+    """A method's name for readers."""
+    return method.replace(CENTRED, ", centred")
+
+
+def short_name(method: str) -> str:
+    """A name that fits beside a bar and above a panel."""
+    return "centred" if method.endswith(CENTRED) else method

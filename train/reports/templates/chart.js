@@ -5,13 +5,15 @@ const $ = (id) => document.getElementById(id);
 const START = { x: "ms_p50", y: Object.keys(accuracies)[0], xlog: "1", ylog: "0", sort: "accuracy", off: "" };
 const SIDES = [[-7, -8, "end"], [0, -11, "middle"], [9, 4, "start"], [-9, 4, "end"], [8, 16, "start"], [0, 19, "middle"],
   [8, -8, "start"], [-8, 16, "end"]];  // where a name may stand beside its dot, the best first
-const LEFT = 44, RIGHT = 16, TOP = 12, BOTTOM = 30, NEAR = 30, LEAST_ERROR = 0.0005;
+const LEFT = 48, RIGHT = 16, TOP = 12, BOTTOM = 30, NEAR = 30, LEAST_ERROR = 0.0005;
 let chosen = { ...START };  // as in the address
 let spots = [];  // what is seen: {i, x, y: figures, px, py: places, best}, cheapest first
-let current = -1;  // number of the dot that the tip tells of
+let current = -1;  // index of the dot that the tip describes
 let marks = [];  // one element for each dot, there or not
 
-const share = (v) => (v >= 0.9995 ? "1.00" : v.toFixed(3).replace(/^0/, ""));
+const percents = (v) => (100 * v).toFixed(1);
+const share = (v) => `${percents(v)} %`;
+const interval = (a) => `${percents(a.low)} – ${percents(a.high)} %`;
 const digits = (v) => Number(v.toPrecision(3)).toLocaleString("en", { maximumFractionDigits: 6 });
 const number = (v) => (v >= 1e6 ? `${digits(v / 1e6)} M` : v >= 1e4 ? `${digits(v / 1e3)} k` : digits(v));
 const figure = (dot, key) => (costs[key].unit ? digits : number)(dot[key]);
@@ -20,7 +22,7 @@ const filters = () => [...document.querySelectorAll("#precision input, #family i
 const hidden = () => new Set(chosen.off.split(",").filter(Boolean));
 const safe = (text) => text.replace(/[&<>"]/g, (c) => `&#${c.charCodeAt(0)};`);
 
-// Which of the points {x: cost, y: accuracy} no other dominates, as train/front.py says.
+// Which of the points {x: cost, y: accuracy} no other dominates, as pareto.py has it.
 function front(points) {
   return points.map((p) => !points.some((o) => o.x <= p.x && o.y >= p.y && (o.x !== p.x || o.y !== p.y)));
 }
@@ -38,8 +40,8 @@ function seen() {
 function scale(values, log, pad) {
   let [low, high] = [Math.min(...values), Math.max(...values)];
   const to = log ? Math.log10 : (v) => v;
-  const room = (to(high) - to(low)) * pad || (log ? 0.2 : high * 0.2 || 1);
-  const [a, b] = [to(low) - room, to(high) + room];
+  const margin = (to(high) - to(low)) * pad || (log ? 0.2 : high * 0.2 || 1);
+  const [a, b] = [to(low) - margin, to(high) + margin];
   const third = (b - a) / 3, ten = 10 ** Math.floor(Math.log10(third)), step = ten * [5, 2, 1].find((k) => k * ten <= third);
   const ticks = [];
   if (log) for (let k = Math.floor(a); k <= b; k++) for (const m of b - a > 1.6 ? [1, 3] : [1, 2, 3, 5]) ticks.push(m * 10 ** k);
@@ -88,11 +90,11 @@ function stop_at(i) {
 
 function grid(xs, ys, px, py, width, height) {
   const unit = costs[chosen.x].unit, bottom = height - BOTTOM;
-  const room = Math.max(1, Math.ceil(xs.ticks.length / (width / 62)));
-  const across = xs.ticks.map((t, k) => `<line x1="${px(t)}" x2="${px(t)}" y1="${TOP}" y2="${bottom}"/>` + (k % room ? ""
+  const every = Math.max(1, Math.ceil(xs.ticks.length / (width / 62)));
+  const across = xs.ticks.map((t, k) => `<line x1="${px(t)}" x2="${px(t)}" y1="${TOP}" y2="${bottom}"/>` + (k % every ? ""
     : `<text x="${px(t)}" y="${bottom + 20}" text-anchor="middle">${number(t)}${unit && " " + unit}</text>`));
-  const up = ys.ticks.map((t) => `<line y1="${py(t)}" y2="${py(t)}" x1="${LEFT}" x2="${width - RIGHT}"/>
-    <text x="${LEFT - 8}" y="${py(t) + 4}" text-anchor="end">${share(t).replace(/0$/, "")}</text>`);
+  const up = ys.ticks.map((t, k) => `<line y1="${py(t)}" y2="${py(t)}" x1="${LEFT}" x2="${width - RIGHT}"/>
+    <text x="${LEFT - 8}" y="${py(t) + 4}" text-anchor="end">${digits(100 * t)}${k === ys.ticks.length - 1 ? " %" : ""}</text>`);
   return across.join("") + up.join("");
 }
 
@@ -115,9 +117,9 @@ function place(spot, py) {
   mark.setAttribute("aria-label", `${dots[spot.i].name}: ${share(spot.y)}, ${cost(dots[spot.i], chosen.x)}`);
 }
 
-// Names beside the dots, those of the front first, each once; where there is no room there is none.
+// Names beside the dots, those of the front first, each once; a name that fits nowhere is left out.
 function names(width) {
-  const best = spots.filter((s) => s.best), told = new Set();
+  const best = spots.filter((s) => s.best), named = new Set();
   const taken = spots.map((s) => [s.px - 6, s.py - 6, s.px + 6, s.py + 6]);
   best.forEach((s, k) => {  // the stairs
     const [end, up] = k + 1 < best.length ? [best[k + 1].px, best[k + 1].py] : [width, s.py];
@@ -126,9 +128,9 @@ function names(width) {
   const leading = new Set(best.map((s) => dots[s.i].label));
   const rest = spots.filter((s) => !s.best && !leading.has(dots[s.i].label)).sort((a, b) => b.y - a.y);
   return [...best, ...rest].map((s) => {
-    const { label, family } = dots[s.i], spot = told.has(label) ? null : free(s, label.length * 7, width, taken);
+    const { label, family } = dots[s.i], spot = named.has(label) ? null : free(s, label.length * 7, width, taken);
     if (!spot) return "";
-    told.add(label);
+    named.add(label);
     taken.push(spot.box);
     const kinds = (s.best ? "best" : "") + (family === "Palpate" ? " ours" : "");
     return `<text class="${kinds}" x="${spot.x}" y="${spot.y}" text-anchor="${spot.side}">${safe(label)}</text>`;
@@ -153,7 +155,7 @@ function show(i) {
   const spot = spots.find((s) => s.i === i), tip = $("tip");
   tip.hidden = !spot;
   if (!spot) return;
-  tip.innerHTML = told(spot);
+  tip.innerHTML = description(spot);
   const width = $("plot").clientWidth, { offsetWidth: w, offsetHeight: h } = tip;
   const left = spot.px + 16 + w < width ? spot.px + 16 : spot.px - 16 - w;
   const beside = left >= 0;
@@ -161,15 +163,15 @@ function show(i) {
   tip.style.transform = `translate(${beside ? left : Math.max(Math.min(spot.px - w / 2, width - w), 0)}px, ${top}px)`;
 }
 
-function told(spot) {
+function description(spot) {
   const dot = dots[spot.i], a = dot.accuracy[chosen.y];
   const better = spots.find((o) => o.x <= spot.x && o.y >= spot.y && (o.x !== spot.x || o.y !== spot.y));
   const line = (name, value) => `<dt>${safe(name)}</dt><dd>${safe(value)}</dd>`;
   const rows = [line(accuracies[chosen.y].short + (a.name ? `, ${a.name}` : ""), share(a.mean)),
-    line("95 %, of " + a.n, `${share(a.low)} – ${share(a.high)}`),
+    line("95 %, of " + a.n, interval(a)),
     ...Object.keys(costs).map((key) => line(costs[key].short, cost(dot, key)))];
   return `<b>${safe(dot.name)}</b><br>${safe(dot.family)}${dot.runs_on_box ? "" : " · cannot run on the box"}<br>`
-    + (better ? `behind ${safe(dots[better.i].name)}` : "on the front") + `<dl>${rows.join("")}</dl>`;
+    + (better ? `behind ${safe(dots[better.i].name)}` : "on the Pareto front") + `<dl>${rows.join("")}</dl>`;
 }
 
 function table() {
@@ -184,18 +186,18 @@ function table() {
     + others.map((key) => `<th scope="col">${title(key)}</th>`).join("");
   const body = rows.map((s) => {
     const dot = dots[s.i], a = dot.accuracy[chosen.y];
-    const cells = [share(a.mean), `${share(a.low)} – ${share(a.high)}`, ...[chosen.x, ...others].map((key) => figure(dot, key))];
+    const cells = [share(a.mean), interval(a), ...[chosen.x, ...others].map((key) => figure(dot, key))];
     return `<tr data-i="${s.i}" class="${s.best ? "best" : ""} ${dot.family === "Palpate" ? "ours" : ""}"><th scope="row">`
       + `${dot.runs_on_box ? "" : "○ "}${safe(dot.name)}</th>${cells.map((c) => `<td>${c}</td>`).join("")}</tr>`;
   });
-  $("table").innerHTML = `<table><caption>${spots.length} of ${dots.length} models; bold: on the front</caption>
-    <thead><tr>${head}</tr></thead><tbody>${body.join("")}</tbody></table>`;
+  $("table").innerHTML = `<div class="wide"><table><caption>${spots.length} of ${dots.length} models; bold: on the Pareto front</caption>
+    <thead><tr>${head}</tr></thead><tbody>${body.join("")}</tbody></table></div>`;
 }
 
 function choose(change) {
   chosen = { ...chosen, ...change };
-  const told = Object.entries(chosen).filter(([key, value]) => value !== START[key]);
-  history.replaceState(null, "", "#" + new URLSearchParams(told));
+  const changed = Object.entries(chosen).filter(([key, value]) => value !== START[key]);
+  history.replaceState(null, "", "#" + new URLSearchParams(changed));
   show_choice();
 }
 
@@ -208,9 +210,9 @@ function show_choice() {
 }
 
 function read_address() {
-  const said = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
+  const given = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
   chosen = { ...START };
-  for (const key of Object.keys(START)) if (key in said) chosen[key] = said[key];
+  for (const key of Object.keys(START)) if (key in given) chosen[key] = given[key];
   if (!Object.hasOwn(costs, chosen.x)) chosen.x = START.x;
   if (!Object.hasOwn(accuracies, chosen.y)) chosen.y = START.y;
   show_choice();

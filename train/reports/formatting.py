@@ -1,0 +1,37 @@
+"""Numbers as pages, pictures and the terminal show them. In: shares, differences and times. Out: text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def percent(share: float, places: int = 1) -> str:
+    """A share as per cent: 0.973 is "97.3 %"."""
+    return f"{100 * share:.{places}f} %"
+
+
+def exact_percent(share: float) -> str:
+    """A share as per cent with no more decimals than it has: 0.86 is "86 %", 0.923 is "92.3 %"."""
+    return f"{round(100 * share, 6):g} %"
+
+
+def interval(ends: Sequence[float], places: int = 1) -> str:
+    """Two shares as per cent: "81.0 – 90.3 %"."""
+    low, high = ends
+    return f"{100 * low:.{places}f} – {100 * high:.{places}f} %"
+
+
+def estimate(shares: Sequence[float], places: int = 1) -> str:
+    """A share with the ends of its interval: (0.864, 0.81, 0.903) is "86.4 % [81.0, 90.3]"."""
+    mean, low, high = shares
+    return f"{percent(mean, places)} [{100 * low:.{places}f}, {100 * high:.{places}f}]"
+
+
+def points(difference: float, sign: bool = False) -> str:
+    """A difference of shares in percentage points: "2.3", "−0.4"; sign: also a plus."""
+    return f"{100 * difference:{'+' if sign else ''}.1f}".replace("-", "−")
+
+
+def seconds(value: float) -> str:
+    """A duration: "12 min", "31 s", "0.25 s"."""
+    return f"{value / 60:.0f} min" if value >= 600 else f"{value:.0f} s" if value >= 10 else f"{value:.2g} s"
