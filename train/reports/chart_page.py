@@ -33,7 +33,7 @@ def html(dots: Sequence[Dot], picture: str, quick: bool = False, left_out: Mappi
         quick=quick,
         head=head,
         rows=rows,
-        **{key: " and ".join(sorted({str(dot[key]) for dot in dots})) for key in ("commit", "machine", "set")},
+        origin={key: " and ".join(sorted({str(dot[key]) for dot in dots})) for key in ("commit", "machine", "set")},
         seeds=", ".join(map(str, sorted({seed for dot in dots for seed in dot["seeds"]}))),
         left_out=left_out or {},
         data=Markup(data.replace("<", "\\u003c")),  # no name of a model can end the script

@@ -1,14 +1,14 @@
-"""The room of the command `chart`: speed against accuracy. In: what to compare. Out: chart.json, a picture and a page.
+"""The command `chart`: speed against accuracy. In: what to compare. Out: chart.json, a picture and a page.
 
-Accuracy comes from evaluate and stress, whose finished work is kept; every dot's costs are measured at once, in one
-run. An interrupted command goes on where it was.
+Accuracy comes from evaluate and stress, whose finished work is kept; the costs of all dots are measured in one run. An
+interrupted command goes on where it was.
 """
 
 from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.storage import put
 from train.data import sets
+from train.data.sets import Dataset
 from train.evaluation import evaluate, parallel, robustness
 from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Plan, Where
@@ -51,20 +52,20 @@ TARGETS = {
     "lost": (("lost", 0.05),),
     "shift": (("shift-rows", 1.0), ("shift-grid", 1.0)),
 }
-"""Stresses and severities that the project has set itself limits for; of several the worst counts."""
+"""Stresses and severities with a limit that the project has set; of several the worst counts."""
 
 
 @dataclass(frozen=True)
 class ChartPart:
-    """An axis of accuracy. sets: joined; with real, files in the folder of real sweeps. only: of each set."""
+    """An axis of accuracy. sets: are joined; real: they are files in the folder of real sweeps. only: of each set."""
 
     sets: tuple[str, ...]
     protocol: str
     only: tuple[str, ...] = ()
     real: bool = False
 
-    def load(self, data: Path | None) -> sets.Dataset | None:
-        """Its sweeps; None where they are real and nobody said where."""
+    def load(self, data: Path | None) -> Dataset | None:
+        """Its sweeps; None where they are real and no folder is given."""
         if self.real and data is None:
             return None
         named = [str(data / name) if self.real and data else name for name in self.sets]
@@ -75,7 +76,7 @@ class ChartPart:
 class Chart:
     """What is compared. train, trial: of the stress; the bundles are trained on `train` too.
 
-    named: methods that belong there; others: those that join where an earlier run has left results. rounds: of timing.
+    named: methods of the chart; others: those that join where an earlier run has left results. rounds: of timing.
     """
 
     parts: dict[str, ChartPart]
@@ -87,7 +88,7 @@ class Chart:
     rounds: int = measure.ROUNDS
 
 
-RUNGS = ("compact", *(f"compact-{size}" for size in ARCHITECTURES))
+COMPACT = ("compact", *(f"compact-{size}" for size in ARCHITECTURES))
 FULL = Chart(
     {
         "hard": ChartPart(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1"),
@@ -97,7 +98,7 @@ FULL = Chart(
     },
     "sim:T-REAL:1",
     "sim:T-REAL:2:2",
-    (*RUNGS, "L-gauss", "L-knn", "L-svm", "H-knn", "H-svm", "minirocket", "tactnet2", "paper-cnn-centred"),
+    (*COMPACT, "L-gauss", "L-knn", "L-svm", "H-knn", "H-svm", "minirocket", "tactnet2", "paper-cnn-centred"),
     ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm", "st-hmp", "recurrent"),
 )
 QUICK = Chart(
@@ -129,21 +130,21 @@ class Charting:
 
     def dots(self) -> list[Json]:
         """All of them, as chart.json lists them."""
-        held = self.accuracy()
-        with tempfile.TemporaryDirectory() as aside:
-            made = list(self.packed({method for method, _ in held}, self.where.cache or Path(aside)))
+        accuracy = self.accuracy()
+        with tempfile.TemporaryDirectory() as work:
+            made = list(self.packed({method for method, _ in accuracy}, self.where.cache or Path(work)))
             self.log(f"{len(made)} models take turns")
             train = sets.load(self.chart.train).select(self.chart.only)
             costs = model_forms.measured(made, train.samples, self.chart.rounds)
         known = {"seeds": list(self.seeds), "set": train.source} | score.provenance()
-        return [self._dot(one, told, held.get((one.method, one.form), {})) | known
-                for one, told in zip(made, costs, strict=True)]  # fmt: skip
+        return [self._dot(one, cost, accuracy.get((one.method, one.form), {})) | known
+                for one, cost in zip(made, costs, strict=True)]  # fmt: skip
 
-    def _dot(self, one: Packed, told: Json, accuracy: Json) -> Json:
-        """Costs and accuracy of one; touch time is what deciding early has left of it, for the method itself."""
+    def _dot(self, one: Packed, costs: Json, accuracy: Json) -> Json:
+        """Costs and accuracy of one; touch time is the mean part of the window that early exit needs, of the method itself."""
         share = self.touch.get(one.method, 1.0) if not one.form else 1.0
         family = FAMILIES.get(methods.module_of(one.method), OTHERS)
-        return told | {"touch_s": round(one.window_s * share, 3), "family": family, "accuracy": accuracy}
+        return costs | {"touch_s": round(one.window_s * share, 3), "family": family, "accuracy": accuracy}
 
     def accuracy(self) -> Accuracy:
         """Of all methods and their forms, by protocol."""
@@ -165,7 +166,7 @@ class Charting:
         if sweeps is None:
             self.left_out[protocol] = "real sweeps; name their folder with --data or PALPATE_DATA"
             return
-        told: dict[tuple[str, str], list[Json]] = {}
+        by_form: dict[tuple[str, str], list[Json]] = {}
         plan = Plan(names, (part.protocol,), self.seeds, part.real, self.effort)
         for result in evaluate.evaluate(sweeps, plan, where, self.log):
             if result.refused:
@@ -173,12 +174,12 @@ class Charting:
                 continue
             figures = result.json()
             for form, one in {"": figures, **figures.get("forms", {})}.items():
-                told.setdefault((result.method, form), []).append(one | {"seed": result.seed})
-        for named, results in told.items():
+                by_form.setdefault((result.method, form), []).append(one | {"seed": result.seed})
+        for named, results in by_form.items():
             found.setdefault(named, {})[protocol] = joined(results)
 
     def _stressed(self, found: Accuracy, names: Sequence[str], where: Where) -> None:
-        """Add accuracies under stress of the methods themselves; stress.py does not test their other forms."""
+        """Add accuracies under stress of the methods themselves; robustness does not test their other forms."""
         train, trial = sets.load(self.chart.train).select(self.chart.only), EvaluationSweeps.simulated(self.chart.trial)
         result = robustness.run(names, train, trial, where, seeds=self.seeds, effort=self.effort, log=self.log)
         for name, entry in result["methods"].items():
@@ -208,45 +209,47 @@ class Charting:
 
 
 def joined(results: Sequence[Json]) -> Json:
-    """Several seeds' results of one protocol as one: means of their accuracies, and of the ends of their intervals."""
+    """Results of several seeds of one protocol as one: means of accuracies and of the ends of intervals."""
     shares = [(r["window"]["right"] / r["window"]["total"], *r["interval"]) for r in results]
     seeds = sorted(r["seed"] for r in results)
-    return _entry(*np.mean(shares, axis=0), results[0]["window"]["total"], seeds)
+    return _entry(np.mean(shares, axis=0), results[0]["window"]["total"], seeds)
 
 
 def under_stress(entry: Json) -> dict[str, Json]:
-    """Accuracies under stress from an entry of stress.merge: "stress", the worst's mean over severities, and TARGETS."""
+    """Accuracies under stress from an entry of robustness.merge: "stress", the worst one's mean over severities, and TARGETS."""
     curves, seeds = entry["curves"], entry["seeds"]
     n = next(iter(curves.values()))["total"] // len(seeds)
     mean = {name: [float(np.mean(c[k][1:])) for k in ("accuracy", "low", "high")] for name, c in curves.items()}
     worst = min(mean, key=lambda name: (mean[name][0], name))
-    told = {"stress": _entry(*mean[worst], n, seeds) | {"name": worst}}
+    entries = {"stress": _entry(mean[worst], n, seeds) | {"name": worst}}
     for key, those in TARGETS.items():
         there = [_at(curves[name], severity) for name, severity in those if name in curves]
         if there:
-            told[f"stress:{key}"] = _entry(*min(there), n, seeds)
-    return told
+            entries[f"stress:{key}"] = _entry(min(there), n, seeds)
+    return entries
 
 
 def _at(curve: Json, severity: float) -> tuple[float, ...]:
-    """Accuracy and its interval at a severity, on the line between two that were measured."""
+    """Accuracy and its interval at a severity, interpolated between two that were measured."""
     return tuple(float(np.interp(severity, curve["severities"], curve[k])) for k in ("accuracy", "low", "high"))
 
 
-def _entry(mean: float, low: float, high: float, n: int, seeds: Sequence[int]) -> Json:
-    return {"mean": round(mean, 4), "low": round(low, 4), "high": round(high, 4), "n": n, "seeds": list(seeds)}
+def _entry(shares: Iterable[float], n: int, seeds: Sequence[int]) -> Json:
+    """shares: accuracy, lower and upper end of its interval."""
+    ends = zip(("mean", "low", "high"), shares, strict=True)
+    return {name: round(float(share), 4) for name, share in ends} | {"n": n, "seeds": list(seeds)}
 
 
 def touch_shares(paths: Sequence[Path]) -> dict[str, float]:
-    """Mean share of the sweep that each method needs where it decides early, of what `palpate-train certainty` wrote.
+    """Mean share of the sweep that each method needs with early exit, from files of `palpate-train certainty`.
 
-    Raises FormatError where a file is none of these.
+    Raises FormatError where a file has another content.
     """
     shares = {}
     for path in paths:
         try:
-            told = json.loads(path.read_bytes())
-            shares[told["method"]] = float(told["early"]["share"])
+            figures = json.loads(path.read_bytes())
+            shares[figures["method"]] = float(figures["early"]["share"])
         except (ValueError, KeyError, TypeError) as e:
             raise FormatError(f"{path.name}: not what palpate-train certainty wrote: {e!r}") from e
     return shares

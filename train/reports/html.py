@@ -17,7 +17,7 @@ from train.reports import formatting
 from train.reports.plot_style import DARK_ROLES, FONT, ROLES
 
 TEMPLATES = Path(__file__).with_name("templates")
-PERCENT = {
+PERCENT: dict[str, Callable[..., str]] = {
     "percent": formatting.percent,
     "exact_percent": formatting.exact_percent,
     "interval": formatting.interval,

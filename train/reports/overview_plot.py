@@ -76,7 +76,9 @@ def _finger(page: Axes, samples: NDArray[Any]) -> None:
         page.add_patch(
             Rectangle(at, side * 0.88, side * 0.88, fc=ACCENT, alpha=0.15 + 0.85 * float(shade[row, column]), ec="none")
         )
-    page.add_patch(FancyArrowPatch((0.55, 0.38), (2.65, 0.38), arrowstyle="-|>", mutation_scale=14, color=BLACK, lw=1.5))
+    page.add_patch(
+        FancyArrowPatch((0.55, 0.38), (2.65, 0.38), arrowstyle="-|>", mutation_scale=14, color=BLACK, lw=1.5)
+    )
     write(page, 1.6, 0.16, "two seconds along a tube", GREY, SMALL)
 
 
@@ -115,6 +117,12 @@ def _answer(page: Axes, verdict: Verdict) -> None:
         page.add_patch(Rectangle((left + 1.05, y - 0.07), width, 0.14, fc=FAINT, ec="none"))
         page.add_patch(Rectangle((left + 1.05, y - 0.07), width * float(probability), 0.14, fc=ACCENT, ec="none"))
         write(
-            page, left + 1.05 + width + 0.08, y, f"{100 * probability:.1f} %", BLACK if i == 0 else GREY, SMALL, ha="left"
+            page,
+            left + 1.05 + width + 0.08,
+            y,
+            f"{100 * probability:.1f} %",
+            BLACK if i == 0 else GREY,
+            SMALL,
+            ha="left",
         )
     write(page, left, 0.3, "on a serial line and on GPIO lines", GREY, SMALL, ha="left")

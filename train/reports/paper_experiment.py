@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from appliance.core.storage import put
 from appliance.inference.classifier import LEAST_PROBABILITY, fuse, softmax
 from train.data import sets
+from train.data.sets import Dataset
 from train.evaluation.evaluate import Plan, Result, Where, evaluate
 from train.evaluation.parallel import spoken
 from train.metrics import score
@@ -53,7 +54,7 @@ class PaperPart:
     folds: int
     only: tuple[str, ...] = ()
 
-    def load(self, world: int) -> sets.Dataset:
+    def load(self, world: int) -> Dataset:
         """Its sweeps."""
         last = ATTACHMENTS * world
         names = [name.format(w=world, a=last - ATTACHMENTS + 1, b=last) for name in self.sets]
@@ -146,7 +147,7 @@ class Outcome:
     @property
     def right(self) -> Array:
         """bool [n], which were named rightly."""
-        return self.logits.argmax(1) == self.labels
+        return np.asarray(self.logits.argmax(1) == self.labels)
 
 
 def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effort: Effort = FULL_EFFORT) -> Path:
@@ -262,7 +263,8 @@ def _fused(outcome: Outcome, n: int, rule: str) -> Array:
     """bool [n], whether the first `n` sweeps of each exploration give its material."""
     scores = softmax(outcome.logits)
     drawn = outcome.explorations[:, :n]
-    return np.array([fuse([scores[i] for i in row], rule).argmax() for row in drawn]) == outcome.labels
+    named = np.array([fuse([scores[i] for i in row], rule).argmax() for row in drawn])
+    return np.asarray(named == outcome.labels)
 
 
 def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:

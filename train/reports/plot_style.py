@@ -123,9 +123,9 @@ def write(axes: Axes, x: float, y: float, text: str, colour: str = BLACK, size: 
     Of several lines the last one is there and the others stand above it, each a text of its own, so that they stay in
     line in a reader's own font.
     """
-    style = {"color": colour, "size": size, "va": "center", "ha": "center", "annotation_clip": False} | style
+    given: dict[str, Any] = {"color": colour, "size": size, "va": "center", "ha": "center", "annotation_clip": False}
     for up, line in enumerate(reversed(text.split("\n"))):
-        axes.annotate(line, (x, y), (0, 1.2 * size * up), textcoords="offset points", **style)
+        axes.annotate(line, (x, y), (0, 1.2 * size * up), textcoords="offset points", **given | style)
 
 
 def to_svg(figure: Figure, about: str) -> str:

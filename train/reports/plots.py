@@ -291,8 +291,9 @@ def _corruption(axes: Axes, name: str, curves: Mapping[str, Any], looks: Mapping
         set_ticks(axes.xaxis, [x[0], x[-1]], f"% {unit.removeprefix('share').strip()}".strip(), 100)
     else:
         set_ticks(axes.xaxis, [x[0], x[-1]], unit)
-    for label, side in zip(axes.get_xticklabels(), ("left", "right"), strict=True):
-        label.set_horizontalalignment(side)
+    first, last = axes.get_xticklabels()
+    first.set_horizontalalignment("left")
+    last.set_horizontalalignment("right")
 
 
 def _ease(protocol: str) -> int:

@@ -120,7 +120,7 @@ def _labels(axes: Axes, spots: Sequence[Spot], stairs: NDArray[Any]) -> None:
         if text in named or (text in leading and not spots[i][3]):
             continue
         for dx, dy, side in PLACES:
-            box = _box(*at[i], dx, dy, side, LETTER * size * len(text), size)
+            box = _box(at[i][0], at[i][1], dx, dy, side, LETTER * size * len(text), size)
             if _inside(box, frame) and not any(_meet(box, other) for k, other in enumerate(taken) if k != i):
                 taken.append(box)
                 named.add(text)

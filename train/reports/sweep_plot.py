@@ -217,14 +217,14 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
     low, up = shown.min(), shown.max()
     head = NUMBER * rows / (0.88 * (SKIN[1] - SKIN[0]))  # share of a plot that is free for its taxel's number
     margins = max(up - low, 1) * np.array([0.08, 1.08 * head / (1 - head)])
-    times, counts = _ticks(*sweep.time_s[[0, -1]], 4), _ticks(low, up, 3)
+    times, counts = _ticks(sweep.time_s[0], sweep.time_s[-1], 4), _ticks(low, up, 3)
     for row, column in np.ndindex(rows, columns):
         left, above = LEFT + column * wide, top - row * high
         axes = add_axes(figure, left, left + 0.94 * wide, above, above - 0.88 * high)
         sweep.span(axes)
         axes.set_ylim(low - margins[0], up + margins[1])
         if sweep.tare is not None:
-            axes.axhline(sweep.tare[row, column], color=GREY, linewidth=0.8)
+            axes.axhline(float(sweep.tare[row, column]), color=GREY, linewidth=0.8)
         axes.plot(*_thinned(sweep.time_s, taxels[:, row * columns + column]), color=ACCENT, linewidth=0.7)
         axes.grid(color=FAINT, linewidth=0.6)
         write(axes, 1, 1 - head / 2, f"{row + 1},{column + 1}", GREY, SMALL - 1, ha="right", xycoords="axes fraction")
@@ -244,7 +244,7 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
     axes.pcolormesh(ends_s, lines / columns, means.T, cmap=SHADES, rasterized=True)
     sweep.span(axes)
     axes.set_ylim(rows, 0)
-    set_ticks(axes.xaxis, _ticks(*ends_s[[0, -1]], 8))
+    set_ticks(axes.xaxis, _ticks(ends_s[0], ends_s[-1], 8))
     first = np.arange(0, rows, -(-rows // 10))
     set_categories(axes.yaxis, first + 0.5, [f"row {row + 1}" for row in first])
     return f", from light, {means.min():.4g}, to dark, {means.max():.4g}; in each row its {columns} taxels"
