@@ -88,7 +88,7 @@ def _sums(sums: Sequence[Json]) -> list[list[str]]:
         *((f"answered {name}", lambda s, n=name: f"{s['statuses'].get(n, 0):,}") for name in statuses),
         ("other than the network by itself", lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}"),
         ("frames received", lambda s: f"{s['received']:,}"),
-        ("frames lost, as the box reports them", lambda s: f"{s['lost']:,}"),
+        ("frames lost, reported by the box", lambda s: f"{s['lost']:,}"),
         ("not accounted for", lambda s: f"{s['unaccounted']:,}"),
         ("bytes of no packet", lambda s: f"{s['garbage']:,}"),
         ("enumerations", lambda s: f"{s['enumerations']}"),
