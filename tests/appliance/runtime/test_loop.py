@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pynmea2
@@ -13,7 +14,9 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.core import config
-from appliance.core.types import Status
+from appliance.core.health import Health
+from appliance.core.observer import Observer
+from appliance.core.types import Status, Sweep, Verdict
 from appliance.io.robot_link import StdoutPort
 from appliance.runtime import assembly
 from appliance.sim import devices, rig, script, skin
@@ -321,3 +324,38 @@ def test_trouble_is_logged_once(rigged: Callable[..., Rigged], logged: list[str]
     assert skin_lines[0] == "skin: streaming"
     assert skin_lines[-1] == "skin: streaming"
     assert 3 <= len(skin_lines) <= 4
+
+
+class EffectLog(Observer):
+    """Notes what it is called with, under its name."""
+
+    def __init__(self, name: str, effects: list[str]) -> None:
+        self._name, self._effects = name, effects
+
+    def answered(self, verdict: Verdict) -> None:
+        """Note it."""
+        self._effects.append(f"{self._name} answered {verdict.sweep}")
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Note it."""
+        self._effects.append(f"{self._name} sweep {sweep.id} {circumstances['source']}")
+
+    def turn(self, health: Health) -> None:
+        """Note it, where a sweep was answered in this turn."""
+        if self._effects and "turn" not in self._effects[-1]:
+            self._effects.append(f"{self._name} turn {health.answered}")
+
+
+def test_observers_are_called_in_order_and_sweeps_after_all_answers(rigged: Callable[..., Rigged]):
+    """Two answers in one turn: both are out, at the port and at each observer, before any sweep is passed on; then health."""
+    effects: list[str] = []
+    box = rigged(quiet(), observers=[EffectLog("a", effects), EffectLog("b", effects), Observer()])
+    box.seconds(0.5)
+    for after_ms, level in ((100, True), (101, False), (102, True), (103, False)):
+        box.edge(devices.STOP, after_ms / 1000, level)
+    box.seconds(0.5)
+    assert effects == [
+        "a answered 1", "b answered 1", "a answered 2", "b answered 2", "a sweep 1 sim", "b sweep 1 sim",
+        "a sweep 2 sim", "b sweep 2 sim", "a turn 2",
+    ]  # fmt: skip
+    assert [a.status for a in answers(box)] == ["no-start", "no-start"]
