@@ -30,8 +30,8 @@ pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]
 SCRIPTS = ROOT / "systemd"
 
 
-def desk(code: str) -> str:
-    """What a piece of Python prints that imports the scripts: they change this process too much to be imported here."""
+def run_here(code: str) -> str:
+    """Output of Python code that imports the scripts. gevent would change this process too much to import them here."""
     done = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(SCRIPTS)}, capture_output=True, text=True
     )
@@ -48,7 +48,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
     """Two bare hosts, of which the second stays bare, and a desktop that may log in there."""
     if os.environ.get("PALPATE_SYSTEMD") != "1":
         pytest.skip("installs on real hosts take minutes; run make systemd")
@@ -57,31 +57,31 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
 
 
 @pytest.fixture(scope="session")
-def installed(place: hosts.Hosts, wheel: Path) -> str:
-    """The host after `make install`, as a bare user over loopback; what that said."""
-    (place.work / "signers").write_text(deliveries.line(deliveries.key(place.work / "keys")))
-    done = place.desktop(
+def installed(site: hosts.Hosts, wheel: Path) -> str:
+    """Installs the first host over loopback, as a user without a profile; the output of that."""
+    (site.work / "signers").write_text(deliveries.line(deliveries.key(site.work / "keys")))
+    done = site.desktop(
         "install", "--host", f"{hosts.USER}@127.0.0.1", "--wheel", wheel, "--board", "rpi5",
-        "--signers", place.work / "signers", inside=place.hosts[0],
+        "--signers", site.work / "signers", inside=site.hosts[0],
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 @pytest.fixture
-def host(place: hosts.Hosts, installed: str) -> hosts.Host:
+def host(site: hosts.Hosts, installed: str) -> hosts.Host:
     """The installed host."""
-    return place.hosts[0]
+    return site.hosts[0]
 
 
 @pytest.fixture
 def at(host: hosts.Host) -> tuple[str, str]:
-    """The options that name it."""
+    """The options that name this host."""
     return ("--host", f"{hosts.USER}@{host.address}:22")
 
 
 def changed(wheel: Path, folder: Path, name: str, text: str) -> Path:
-    """The wheel with another file in it, or more text at the end of one: another release."""
+    """Another release: the wheel with a new file, or with more text at the end of one."""
     made = folder / wheel.name
     with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(made, "w") as new:
         texts = {member: old.read(member) for member in old.namelist()}
@@ -92,12 +92,12 @@ def changed(wheel: Path, folder: Path, name: str, text: str) -> Path:
 
 
 def release(host: hosts.Host) -> str:
-    """What the link leads to."""
+    """The release that the link leads to."""
     return host.machine.get("readlink", "/opt/palpate")
 
 
 def start_again(host: hosts.Host) -> None:
-    """As after a power cut: what was read is forgotten, and the unit that the disk has starts what the disk has."""
+    """As after a power cut: systemd reads the unit on the disk again and starts the release on the disk."""
     if host.service["MainPID"] != "0":
         host.service.kill("SIGKILL")
     host.machine.get("systemctl", "daemon-reload")
@@ -119,10 +119,10 @@ def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: st
     assert host.machine.get("find", f"/home/{hosts.USER}", "-name", ".palpate*") == ""
 
 
-def test_a_second_install_changes_nothing(place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
-    """The same again: the process goes on, settings and signers stay."""
+def test_a_second_install_changes_nothing(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
+    """The same command again: the process goes on, settings and signers stay."""
     pid, name = host.service["MainPID"], release(host)
-    done = place.desktop("install", *at, "--wheel", wheel, "--board", "rpi4", "--signers", place.work / "signers")
+    done = site.desktop("install", *at, "--wheel", wheel, "--board", "rpi4", "--signers", site.work / "signers")
     assert (done.returncode, done.stdout.partition(": ")[2].strip()) == (
         0,
         f"{name.removeprefix('palpate-')} runs already",
@@ -132,39 +132,39 @@ def test_a_second_install_changes_nothing(place: hosts.Hosts, host: hosts.Host, 
 
 
 def test_signers_are_never_overwritten(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
 ):
-    """Another file of signers is refused, in words; the box believes whom it believed."""
+    """Another signers' file is refused with a reason; the box keeps its own."""
     (tmp_path / "others").write_text(deliveries.line(deliveries.key(tmp_path)))
     before = host.machine.get("cat", "/etc/palpate/allowed_signers")
-    done = place.desktop("install", *at, "--wheel", wheel, "--signers", tmp_path / "others")
+    done = site.desktop("install", *at, "--wheel", wheel, "--signers", tmp_path / "others")
     assert done.returncode == 1
     assert "FAILED: users, folders and settings: /etc/palpate/allowed_signers is another one there" in done.stdout
     assert host.machine.get("cat", "/etc/palpate/allowed_signers") == before
 
 
-def test_a_box_without_packages_and_mirror_is_told_so(place: hosts.Hosts, wheel: Path):
-    """Nothing is begun there before they are to be had."""
-    machine = place.hosts[1].machine
+def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: Path):
+    """Nothing is changed there before the packages can be installed."""
+    machine = site.hosts[1].machine
     machine.get("find", "/var/cache/apt/archives", "-name", "*.deb", "-delete")
-    done = place.desktop("install", "--host", f"{hosts.USER}@{place.hosts[1].address}", "--wheel", wheel, limit_s=120)
+    done = site.desktop("install", "--host", f"{hosts.USER}@{site.hosts[1].address}", "--wheel", wheel, limit_s=120)
     assert done.returncode == 1
     assert "FAILED: python3-venv libusb-1.0-0 cannot be installed: apt-get: E: " in done.stdout
     assert "give the box a way to Debian's mirrors" in done.stdout
     assert machine.get("ls", "/opt") == ""
 
 
-def test_what_a_person_put_there_stays(place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
-    """Settings of their own go before the release's, and are named; a program in the way ends it, before anything else."""
+def test_what_a_person_put_there_stays(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
+    """A settings file of theirs is kept and named; a file in the way of the program ends the install before anything else."""
     settings, program, pid = "/etc/palpate/sensor.toml", "/usr/local/bin/palpate", host.service["MainPID"]
     for path in (settings, program):
         host.machine.get("rm", path)
         host.machine.put(path, "# mine\n")
-    done = place.desktop("install", *at, "--wheel", wheel)
+    done = site.desktop("install", *at, "--wheel", wheel)
     assert done.returncode == 1
     assert f"FAILED: users, folders and settings: {program} is a file there, not a link; move it away" in done.stdout
     host.machine.get("rm", program)
-    done = place.desktop("install", *at, "--wheel", wheel)
+    done = site.desktop("install", *at, "--wheel", wheel)
     assert done.returncode == 0
     assert f"{settings} stays as it is there" in done.stderr
     assert host.machine.get("cat", settings) == "# mine"
@@ -174,35 +174,35 @@ def test_what_a_person_put_there_stays(place: hosts.Hosts, host: hosts.Host, at:
 
 @pytest.fixture(scope="session")
 def upgraded(
-    place: hosts.Hosts, installed: str, wheel: Path, tmp_path_factory: pytest.TempPathFactory
+    site: hosts.Hosts, installed: str, wheel: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> list[tuple[str, str]]:
-    """The host after two more releases: each with what the command said."""
-    folder, told = tmp_path_factory.mktemp("releases"), [(release(place.hosts[0]), installed)]
-    at = ("--host", f"{hosts.USER}@{place.hosts[0].address}")
+    """Installs two more releases on the host; each with the output of the command."""
+    folder, outputs = tmp_path_factory.mktemp("releases"), [(release(site.hosts[0]), installed)]
+    at = ("--host", f"{hosts.USER}@{site.hosts[0].address}")
     for i in range(2):
-        done = place.desktop("install", *at, "--wheel", changed(wheel, folder, "appliance/more.py", f"# {i}\n"))
-        told.append((release(place.hosts[0]), done.stdout + done.stderr))
-    return told
+        done = site.desktop("install", *at, "--wheel", changed(wheel, folder, "appliance/more.py", f"# {i}\n"))
+        outputs.append((release(site.hosts[0]), done.stdout + done.stderr))
+    return outputs
 
 
 def test_an_upgrade_swaps_everything_at_once(host: hosts.Host, upgraded: list[tuple[str, str]]):
     """Another release runs; the one before is kept, those before that are gone."""
     releases = [name for name, _ in upgraded]
     assert len({*releases}) == 3
-    for _, said in upgraded[1:]:
-        assert re.search(r"is READY [0-9.]+ s after the command, [0-9.]+ s without classifying\n", said), said
+    for _, output in upgraded[1:]:
+        assert re.search(r"is READY [0-9.]+ s after the command, [0-9.]+ s without classifying\n", output), output
     there = host.machine.get("sh", "-c", "ls -d /opt/palpate-*").split()
     assert there == sorted(f"/opt/{name}" for name in releases[1:])
     assert host.machine.get("readlink", "/opt/palpate.previous") == releases[1]
 
 
 def test_a_release_that_does_not_start_gives_way_to_the_old_one(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
 ):
-    """It passes its self-test and then does not come up: the link is swapped back, and the old one classifies."""
+    """It passes its self-test and then does not start: the link is swapped back, and the old release classifies."""
     before = release(host)
     broken = changed(wheel, tmp_path, "appliance/service/notify.py", "\ndel Manager.turn\n")
-    done = place.desktop("install", *at, "--wheel", broken)
+    done = site.desktop("install", *at, "--wheel", broken)
     assert done.returncode == 1
     assert (
         "FAILED: the service does not come up: AttributeError: 'Manager' object has no attribute 'turn'" in done.stdout
@@ -212,12 +212,12 @@ def test_a_release_that_does_not_start_gives_way_to_the_old_one(
 
 
 def test_a_release_that_fails_its_self_test_is_never_swapped_in(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
 ):
     """The process that classifies is not touched."""
     before, pid = release(host), host.service["MainPID"]
     broken = changed(wheel, tmp_path, "appliance/inference/classifier.py", "\nraise OSError('not on this box')\n")
-    done = place.desktop("install", *at, "--wheel", broken)
+    done = site.desktop("install", *at, "--wheel", broken)
     assert done.returncode == 1
     assert "FAILED: self-test: OSError: not on this box" in done.stdout
     assert (release(host), host.service["MainPID"]) == (before, pid)
@@ -225,23 +225,23 @@ def test_a_release_that_fails_its_self_test_is_never_swapped_in(
 
 @pytest.mark.parametrize(("said", "after_s"), [("copying", 0.3), ("building", 0.5), ("building", 4.0)])
 def test_an_install_that_is_cut_is_finished_by_the_next(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path, said: str, after_s: float
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path, said: str, after_s: float
 ):
-    """The desktop dies while it copies, or the box builds: the old release starts, and the same command again finishes."""
+    """The desktop dies during the copy, or while the box builds: the old release starts, and a second command finishes."""
     new, before = changed(wheel, tmp_path, "appliance/more.py", f"# {said} {after_s}\n"), release(host)
-    place.cut("install", *at, "--wheel", new, said=said, after_s=after_s)
+    site.cut("install", *at, "--wheel", new, said=said, after_s=after_s)
     assert release(host) == before
     start_again(host)
-    done = place.desktop("install", *at, "--wheel", new)
+    done = site.desktop("install", *at, "--wheel", new)
     assert done.returncode == 0, done.stdout + done.stderr
     assert release(host) != before
     assert host.service["ActiveState"] == "active"
 
 
 def test_a_swap_that_is_cut_leaves_old_or_new(host: hosts.Host, upgraded: list[tuple[str, str]]):
-    """The box dies before the N-th command of the swap, each N: it starts with the one release or the other, whole."""
+    """The box dies before the N-th command of the swap, for each N: it starts with one release or the other, complete."""
     new, old = (host.machine.get("readlink", link) for link in ("/opt/palpate", "/opt/palpate.previous"))
-    script = desk(f"import install; print(install.swap('/opt/{old}', '{new}'))")
+    script = run_here(f"import install; print(install.swap('/opt/{old}', '{new}'))")
     found = []
     for n in range(1, 20):
         cut = f"n=0; trap 'n=$((n+1)); [ $n -lt {n} ] || kill -KILL $$' DEBUG\n{script}"
@@ -265,14 +265,14 @@ class Sender:
     def made(self, counter: int = 0, key: Path | None = None) -> Path:
         """A bundle's folder."""
         self.counter += not counter
-        place = self.folder / f"{len([*self.folder.glob('*')])}"
-        return deliveries.put(place, deliveries.files(counter or self.counter, key or self.key))
+        folder = self.folder / f"{len([*self.folder.glob('*')])}"
+        return deliveries.put(folder, deliveries.files(counter or self.counter, key or self.key))
 
 
 @pytest.fixture(scope="session")
-def sender(place: hosts.Hosts, installed: str, tmp_path_factory: pytest.TempPathFactory) -> Sender:
-    """Somebody whom the host believes."""
-    return Sender(tmp_path_factory.mktemp("bundles"), place.work / "keys" / "key")
+def sender(site: hosts.Hosts, installed: str, tmp_path_factory: pytest.TempPathFactory) -> Sender:
+    """A sender whose key the host trusts."""
+    return Sender(tmp_path_factory.mktemp("bundles"), site.work / "keys" / "key")
 
 
 def sha(folder: Path) -> str:
@@ -282,13 +282,13 @@ def sha(folder: Path) -> str:
 
 def listed(host: hosts.Host) -> dict[str, str]:
     """The roles of the box's bundles by sha256."""
-    said = host.machine.get("setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups",
+    output = host.machine.get("setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups",
                             PALPATE, "bundles", "--json")  # fmt: skip
-    return {entry["sha"]: entry["role"] for entry in json.loads(said)}
+    return {entry["sha"]: entry["role"] for entry in json.loads(output)}
 
 
 def serves(host: hosts.Host) -> str:
-    """The id of the bundle that the running program has."""
+    """The id of the bundle that runs."""
     end_s = time.monotonic() + WAIT_S
     while (done := host.machine.run("cat", "/run/palpate/status.json")).returncode:
         assert time.monotonic() < end_s, done.stderr
@@ -297,33 +297,33 @@ def serves(host: hosts.Host) -> str:
 
 
 def test_a_bundle_is_delivered_and_runs_on_trial(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
 ):
-    """READY with the new bundle, on trial, nothing left behind; a second time nothing happens."""
+    """READY with the new bundle, on trial, no files left behind; a second delivery changes nothing."""
     bundle = sender.made()
-    done = place.desktop("deploy", *at, bundle, "--signers", place.work / "signers", "--json", tmp_path / "told.json")
+    done = site.desktop("deploy", *at, bundle, "--signers", site.work / "signers", "--json", tmp_path / "report.json")
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"is READY [0-9.]+ s after the command; [0-9.]+ s without classifying; on trial: ", done.stdout)
-    (told,) = json.loads((tmp_path / "told.json").read_text())["boxes"].values()
-    assert told["lost_s"] <= told["ready_s"]
+    (figures,) = json.loads((tmp_path / "report.json").read_text())["boxes"].values()
+    assert figures["lost_s"] <= figures["ready_s"]
     assert listed(host)[sha(bundle)] == "on trial"
     assert serves(host) == sha(bundle)[:8]
     assert host.machine.get("ls", "-A", "/var/lib/palpate/incoming", f"/home/{hosts.USER}").count(".palpate") == 0
     pid = host.service["MainPID"]
-    done = place.desktop("deploy", *at, bundle)
+    done = site.desktop("deploy", *at, bundle)
     assert (done.returncode, done.stdout.strip().endswith("runs already")) == (0, True)
     assert host.service["MainPID"] == pid
 
 
-def test_a_bundle_of_a_stranger_is_refused(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
+def test_a_bundle_with_an_unknown_key_is_refused(
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
 ):
-    """Here where the signers are named, there in any case; the process that classifies is not touched."""
+    """By the desktop where it is given the signers, by the box always; the process that classifies goes on."""
     bundle = sender.made(99, deliveries.key(tmp_path))
     before, pid = serves(host), host.service["MainPID"]
-    done = place.desktop("deploy", *at, bundle, "--signers", place.work / "signers")
+    done = site.desktop("deploy", *at, bundle, "--signers", site.work / "signers")
     assert (done.returncode, done.stdout) == (78, "")
-    done = place.desktop("deploy", *at, bundle)
+    done = site.desktop("deploy", *at, bundle)
     assert done.returncode == 1
     assert "FAILED: checking it there: bundle is signed by none of those" in done.stdout
     assert (serves(host), host.service["MainPID"]) == (before, pid)
@@ -342,27 +342,27 @@ def test_a_bundle_of_a_stranger_is_refused(
     ],
 )
 def test_a_delivery_that_is_cut_leaves_old_or_new(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, said: str, after_s: float
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, said: str, after_s: float
 ):
-    """The desktop dies at any time and the box is started again: it serves the one or the other; then the same again."""
+    """The desktop dies at any time and the box restarts: it runs the old or the new bundle; a second delivery finishes."""
     bundle, before = sender.made(), serves(host)
-    place.cut("deploy", *at, bundle, "--verbose", said=said, after_s=after_s)
+    site.cut("deploy", *at, bundle, "--verbose", said=said, after_s=after_s)
     start_again(host)
     assert serves(host) in (before, sha(bundle)[:8])
-    done = place.desktop("deploy", *at, bundle)
+    done = site.desktop("deploy", *at, bundle)
     assert done.returncode == 0, done.stdout + done.stderr
     assert serves(host) == sha(bundle)[:8]
 
 
-def test_without_a_skin_the_bundle_is_accepted_and_ready_waits(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
+def test_without_a_skin_the_bundle_is_installed_and_ready_waits(
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
 ):
-    """That is told well before the deadline, and is no failure of the bundle; with the skin it is READY."""
+    """It is reported well before the deadline, and is no failure of the bundle; with the skin it is READY."""
     host.machine.put("/opt/palpate/cable.py", CABLE)
     host.service.configure(CABLED)
     bundle = sender.made()
     try:
-        done = place.desktop("deploy", *at, bundle, limit_s=60)
+        done = site.desktop("deploy", *at, bundle, limit_s=60)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "on trial" in done.stdout
         assert "READY waits: skin absent: no skin 1209:7ac7 on USB" in done.stdout
@@ -374,25 +374,23 @@ def test_without_a_skin_the_bundle_is_accepted_and_ready_waits(
         start_again(host)
 
 
-def test_a_candidate_is_delivered_beside(place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender):
-    """With --shadow the old bundle goes on to answer."""
+def test_a_candidate_is_delivered_beside(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender):
+    """With --shadow the old bundle still answers."""
     bundle, before = sender.made(), serves(host)
-    done = place.desktop("deploy", *at, bundle, "--shadow")
+    done = site.desktop("deploy", *at, bundle, "--shadow")
     assert done.returncode == 0, done.stdout + done.stderr
     assert (listed(host)[sha(bundle)], serves(host)) == ("candidate", before)
 
 
-def test_boxes_that_fail_do_not_stop_the_others(place: hosts.Hosts, host: hosts.Host, sender: Sender, tmp_path: Path):
-    """One refuses, one never speaks, one hangs, one has no Palpate: each has its reason, and the good one is READY."""
+def test_boxes_that_fail_do_not_stop_the_others(site: hosts.Hosts, host: hosts.Host, sender: Sender, tmp_path: Path):
+    """One refuses the connection, one never answers, one hangs, one has no Palpate: each has its reason, the good one is READY."""
     with socket.create_server(("127.0.0.1", 0)) as dumb, stalling(host) as hangs:
-        shared = {"ssh_user": hosts.USER, "ssh_key": str(place.work / ".ssh/id_ed25519")}
+        shared = {"ssh_user": hosts.USER, "ssh_key": str(site.work / ".ssh/id_ed25519")}
         there = {"refuses": 1, "dumb": dumb.getsockname()[1], "hangs": hangs}
         boxes = [(name, {"ssh_hostname": "127.0.0.1", "ssh_port": port}) for name, port in there.items()]
-        boxes += [
-            (name, {"ssh_hostname": one.address}) for name, one in zip(("good", "bare"), place.hosts, strict=True)
-        ]
+        boxes += [(name, {"ssh_hostname": one.address}) for name, one in zip(("good", "bare"), site.hosts, strict=True)]
         (tmp_path / "fleet.py").write_text(f"boxes = ({boxes!r}, {shared!r})\n")
-        done = place.desktop("deploy", "--hosts", tmp_path / "fleet.py", sender.made(), "--limit", "40", limit_s=100)
+        done = site.desktop("deploy", "--hosts", tmp_path / "fleet.py", sender.made(), "--limit", "40", limit_s=100)
     assert done.returncode == 1
     lines = dict(line.split(": ", 1) for line in done.stdout.splitlines() if ": " in line)
     assert "is READY" in lines["good"]
@@ -406,7 +404,7 @@ def test_boxes_that_fail_do_not_stop_the_others(place: hosts.Hosts, host: hosts.
 
 @contextmanager
 def stalling(host: hosts.Host, most: int = 6000) -> Iterator[int]:
-    """A port that leads to the host's sshd and stalls after so many bytes from it: past the login."""
+    """A port that forwards to the host's sshd and stops after `most` bytes from it, which is after the login."""
 
     def carry(source: socket.socket, sink: socket.socket, left: float) -> None:
         with suppress(OSError):
@@ -426,33 +424,33 @@ def stalling(host: hosts.Host, most: int = 6000) -> Iterator[int]:
         yield door.getsockname()[1]
 
 
-def test_a_user_who_needs_a_password_for_sudo_is_told(
-    place: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
+def test_a_user_who_needs_a_password_for_sudo_is_refused(
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
 ):
-    """At once and in words, instead of a prompt that nobody answers."""
+    """At once and with a reason, instead of a prompt that nobody answers."""
     host.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) ALL\n")
     try:
-        done = place.desktop("deploy", *at, sender.made(), limit_s=30)
+        done = site.desktop("deploy", *at, sender.made(), limit_s=30)
         assert done.returncode == 1
         assert "FAILED: sudo wants a password there; let the user in without" in done.stdout
     finally:
         host.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) NOPASSWD: ALL\n")
 
 
-def test_another_system_is_told_what_is_needed():
-    """Not Debian, another architecture, an /opt of its own, an old Python: a line that says what to do."""
+def test_another_system_is_refused_with_what_is_needed():
+    """Not Debian, another architecture, /opt on its own file system, an old Python: a line says what is needed."""
     code = """
 import install
 class Box:
-    def __init__(self, **said): self.said = {"looking at its system": "Debian\\namd64", "looking at /opt": "/"} | said
-    def run(self, what, command, **how): return self.said.get(what, "")
+    def __init__(self, **outputs): self.outputs = {"looking at its system": "Debian\\namd64", "looking at /opt": "/"} | outputs
+    def run(self, what, command, **options): return self.outputs.get(what, "")
     def report(self, text): pass
-for said in ({"looking at its system": "Alpine Linux v3.19\\n"}, {"looking at its system": "Raspbian 11\\narmhf"},
+for outputs in ({"looking at its system": "Alpine Linux v3.19\\n"}, {"looking at its system": "Raspbian 11\\narmhf"},
              {"looking at /opt": "/opt"}, {"asking for Python": "3.9.2"}):
-    try: install.install(Box(**said), None, "", "")
+    try: install.install(Box(**outputs), None, "", "")
     except install.Failed as e: print(e)
 """
-    assert desk(code).splitlines() == [
+    assert run_here(code).splitlines() == [
         "its system is Alpine Linux v3.19, not Debian; Palpate needs Debian 12 for arm64 or amd64",
         "its system is Raspbian 11, armhf; Palpate needs Debian 12 for arm64 or amd64",
         "/opt is a file system of its own there; it must be part of the root file system",
@@ -461,21 +459,21 @@ for said in ({"looking at its system": "Alpine Linux v3.19\\n"}, {"looking at it
 
 
 def test_a_box_is_named_as_for_ssh():
-    """USER@HOST:PORT, user and port as one likes; what is no name is none."""
+    """USER@HOST:PORT, where user and port may be missing; anything else is refused."""
     code = """
 import fleet
 for text in ("pi@box", "Box.lab:2222", "pi@[fe80::1]:22", "pi@", "a@b@c"):
     found = fleet.NAME.fullmatch(text)
     print(found and "|".join(value or "" for value in found.groups()))
 """
-    assert desk(code).splitlines() == ["pi|box|", "|Box.lab|2222", "pi|[fe80::1]|22", "None", "None"]
+    assert run_here(code).splitlines() == ["pi|box|", "|Box.lab|2222", "pi|[fe80::1]|22", "None", "None"]
 
 
 def test_the_lock_is_read_for_the_box_not_for_the_desktop():
-    """Markers are those of the box's Python: numpy's version differs from 3.11 to 3.12; hashes stay with their names."""
+    """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay with their packages."""
     for python, numpy in (("3.11.2", "2.4"), ("3.13.5", "2.5")):
         code = f"import release; print(release.locked(release.LOCK.read_text(), {python!r}, 'aarch64'))"
-        lock = desk(code)
+        lock = run_here(code)
         (line,) = re.findall(r"^numpy==(\S+) \\$", lock, re.MULTILINE)
         assert line.startswith(numpy)
         assert ";" not in lock

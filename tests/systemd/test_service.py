@@ -1,4 +1,4 @@
-"""The unit under a real systemd, in a container: start, notify, watchdog, restart, exit codes, stop, rights, journal."""
+"""The unit under a real systemd, in a container: start, notify, watchdog, restart, exit codes, stop, privileges, journal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 
 def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, before: list[bool]):
-    """User, groups and folders, with owners and modes; none of it was there before, and twice is as good as once."""
+    """User, groups and folders, with owners and modes; none of them existed before, and a second run changes nothing."""
     assert before == [False, False, False]
     for _ in range(2):
         assert set(machine.get("id", "-nG", "palpate").split()) == {"palpate", "dialout", "gpio", "plugdev"}
@@ -30,7 +30,7 @@ def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, befo
 
 
 def test_the_unit_is_sound_and_hardened(machine: Machine, before: list[bool]):
-    """systemd finds nothing to complain about and knows its times; the exposure is 1.5 of 10 at most."""
+    """systemd reports no problem and reads the times as meant; the exposure is at most 1.5 of 10."""
     done = machine.run("systemd-analyze", "verify", nspawn.PLACES["palpate.service"])
     assert (done.returncode, done.stderr) == (0, "")
     shown = dict(line.split("=", 1) for line in machine.get("systemctl", "show", "palpate").splitlines())
@@ -45,12 +45,12 @@ def test_the_unit_is_sound_and_hardened(machine: Machine, before: list[bool]):
 
 
 def test_the_udev_rules_are_sound(machine: Machine, before: list[bool]):
-    """udev reads them and finds nothing to complain about: each key, operator and group is known to it."""
+    """udev reads them without a complaint: it knows each key, operator and group."""
     rules = "70-palpate.rules"
     machine.put(f"/etc/udev/rules.d/{rules}", (ROOT / "firmware_config" / rules).read_text())
-    said = machine.run("udevadm", "test", "/sys/class/mem/null").stderr
-    assert f"Reading rules file: /etc/udev/rules.d/{rules}" in said
-    assert f"{rules}:" not in said
+    output = machine.run("udevadm", "test", "/sys/class/mem/null").stderr
+    assert f"Reading rules file: /etc/udev/rules.d/{rules}" in output
+    assert f"{rules}:" not in output
 
 
 def test_the_boot_does_not_wait_for_a_skin(machine: Machine, service: Service):
@@ -67,7 +67,7 @@ def test_the_boot_does_not_wait_for_a_skin(machine: Machine, service: Service):
 
 
 def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, service: Service):
-    """Without a skin it is starting for as long as that takes, and says why; with one active, and stays so without it."""
+    """Without a skin it stays in its start and says why; with one it becomes active, and stays active without it."""
     service.configure(CABLED + "TimeoutStartSec=2\nWatchdogSec=2")
     machine.get("systemctl", "start", "--no-block", "palpate")
     absent = r"skin absent: no skin 1209:7ac7 on USB .* check cable, power and udev rule\. Sweeps answered: \d"
@@ -93,7 +93,7 @@ def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, servic
 
 
 def test_a_start_that_hangs_is_begun_again(machine: Machine, service: Service):
-    """Before READY no watchdog looks; but a start that takes no turns any more runs out of time."""
+    """Before READY there is no watchdog, but a start whose loop hangs times out."""
     service.configure(CABLED + "TimeoutStartSec=2\nWatchdogSec=2\nRestartSec=100ms")
     machine.get("systemctl", "start", "--no-block", "palpate")
     service.until("StatusText", "skin absent.*")
@@ -103,7 +103,7 @@ def test_a_start_that_hangs_is_begun_again(machine: Machine, service: Service):
 
 
 def test_a_process_that_stands_still_is_killed_and_started_again(service: Service):
-    """SIGSTOP: the watchdog finds it within its time; the service comes back by itself and answers on."""
+    """SIGSTOP: the watchdog finds it in time; the service restarts by itself and answers."""
     first = service.start(SIM + "WatchdogSec=3")
     begin = time.monotonic()
     service.kill("SIGSTOP")
@@ -116,21 +116,21 @@ def test_a_process_that_stands_still_is_killed_and_started_again(service: Servic
 
 
 def test_a_turn_that_hangs_is_found_and_named(machine: Machine, service: Service):
-    """A bus that never comes back: killed by the watchdog, and the journal says where it hung."""
+    """A read that never returns: the watchdog kills the program, and the journal shows where it hung."""
     machine.put("/run/skin", "")
     service.start(CABLED + "WatchdogSec=3\nRestartSec=100ms")
     machine.put("/run/hang", "")
     service.until("NRestarts", "1")
     machine.get("rm", "/run/hang")
     service.until("ActiveState", "active")
-    said = service.journal()
-    assert "Fatal Python error: Aborted" in said
-    assert any("sensor.py" in line and line.endswith(" in read") for line in said)
+    journal = service.journal()
+    assert "Fatal Python error: Aborted" in journal
+    assert any("sensor.py" in line and line.endswith(" in read") for line in journal)
 
 
 @pytest.mark.parametrize("signal", ["SIGKILL", "SIGSEGV"])
 def test_a_killed_process_is_started_again(machine: Machine, service: Service, signal: str):
-    """However it dies, two seconds later it is there again; in between its lines, of the same settings, are lowered."""
+    """However it dies, it restarts two seconds later; in between the lines of the same settings are lowered."""
     machine.put(SITE, "[output]\nready = 'GPIO23'\n")  # the simulated skin has lines of its own and ignores it
     first = service.start()
     service.kill(signal)
@@ -143,7 +143,7 @@ def test_a_killed_process_is_started_again(machine: Machine, service: Service, s
 
 
 def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service):
-    """Exit 78: named once, and no start after it; mended, it starts."""
+    """Exit 78: the reason is logged once, and there is no restart; once it is corrected, it starts."""
     service.start()
     machine.put(SITE, "[sweep]\nmax_duration_s = 'for ever'\n")
     service.kill("SIGKILL")
@@ -158,7 +158,7 @@ def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service)
 
 
 def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, service: Service):
-    """Exit 69: no GPIO chip; a start each two seconds for as long as that takes, each with its one line."""
+    """Exit 69: no GPIO chip; a start every two seconds until there is one, each with one line in the journal."""
     machine.put(SITE, "[trigger]\nstart = 'GPIO17'\nstop = 'GPIO27'\n")
     service.configure("")
     machine.get("systemctl", "start", "--no-block", "palpate")
@@ -173,11 +173,11 @@ def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, servic
 
 
 def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
-    """The sweep that is open is answered `aborted`, and the program ends by itself and well in time."""
+    """The open sweep is answered `aborted`, and the program ends by itself well within the limit."""
     service.start()
     end = time.monotonic() + WAIT_S
-    while not (told := service.status()).get("sweeping") or not told["answered"]:
-        assert time.monotonic() < end, told
+    while not (status := service.status()).get("sweeping") or not status["answered"]:
+        assert time.monotonic() < end, status
     begin = time.monotonic()
     machine.get("systemctl", "stop", "palpate")
     assert time.monotonic() - begin < 10
@@ -188,7 +188,7 @@ def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
 
 
 def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
-    """The skin, and each sweep in words; no sentence, nothing once a second; the lost skin is a warning."""
+    """It has the skin's state and a line for each sweep; no sentences, nothing periodic; the lost skin is a warning."""
     machine.put("/run/skin", "")
     service.start(CABLED)
     end = time.monotonic() + WAIT_S
@@ -197,9 +197,9 @@ def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
         time.sleep(0.2)
     machine.get("rm", "/run/skin")
     service.until("StatusText", "skin absent.*")
-    told = service.told()
-    assert [line for line in told if not line.startswith(("sweep ", "skin: "))] == []
-    assert told[0] == "skin: streaming"
+    lines = service.told()
+    assert [line for line in lines if not line.startswith(("sweep ", "skin: "))] == []
+    assert lines[0] == "skin: streaming"
     assert re.fullmatch(r"sweep 1: [a-z ]+, [0-9.]+ % \([0-9.]+ ms\)", service.answers()[0])
     warned = service.told("-p", "warning")
     assert warned[-1].startswith("skin: no skin 1209:7ac7 on USB")
@@ -207,7 +207,7 @@ def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
 
 
 def test_every_user_may_ask_how_it_is(machine: Machine, service: Service):
-    """`palpate status` of a user without rights: running, skin away (exit 69), stopped (exit 1)."""
+    """`palpate status` by a user without privileges: running, skin away (exit 69), stopped (exit 1)."""
     ask = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", PALPATE, "status")
     machine.put("/run/skin", "")
     pid = service.start(CABLED)
@@ -228,7 +228,7 @@ def test_every_user_may_ask_how_it_is(machine: Machine, service: Service):
 
 
 def test_systemctl_says_how_it_is(machine: Machine, service: Service):
-    """A person who asks `systemctl status` reads it in words; the watchdog looks, ten seconds long."""
+    """`systemctl status` shows it in words; the watchdog is armed with ten seconds."""
     service.start()
     assert service["WatchdogUSec"] == "10s"
     service.until("StatusText", STREAMS)
@@ -246,22 +246,22 @@ def test_it_is_nobody_in_particular(machine: Machine, service: Service):
     assert {int(status[name], 16) for name in ("CapPrm", "CapEff", "CapBnd", "CapAmb")} == {0}
     assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
     machine.put(SITE, "")
-    as_it = ("nsenter", "-t", str(pid), "-m", "setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups")
-    assert machine.run(*as_it, "cat", SITE).returncode == 0
+    as_palpate = ("nsenter", "-t", str(pid), "-m", "setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups")
+    assert machine.run(*as_palpate, "cat", SITE).returncode == 0
     for path in (SITE, "/etc/palpate/new", "/opt/palpate/new", "/root/new"):
-        assert machine.run(*as_it, "touch", path).returncode != 0
+        assert machine.run(*as_palpate, "touch", path).returncode != 0
         assert "Read-only" in machine.run("nsenter", "-t", str(pid), "-m", "touch", path).stderr  # not even root could
-    machine.get(*as_it, "touch", "/var/lib/palpate/new")
+    machine.get(*as_palpate, "touch", "/var/lib/palpate/new")
 
 
 def test_what_it_can_write_it_cannot_execute(machine: Machine, service: Service):
-    """In its own view of the files; Python and ssh-keygen it can, and libusb is found."""
+    """It can execute nothing in folders that it can write; Python and ssh-keygen it can, and libusb is found."""
     pid = service.start()
-    as_it = ("nsenter", "-t", str(pid), "-m", "--")
-    for place in ("/var/lib/palpate", "/run/palpate", "/tmp", "/var/tmp", "/dev/shm"):
-        machine.get(*as_it, "cp", "/bin/true", f"{place}/own")
-        assert machine.run(*as_it, f"{place}/own").stderr.endswith("Permission denied\n"), place
-        machine.get(*as_it, "rm", f"{place}/own")
-    assert "ssh-keygen" in machine.run(*as_it, "ssh-keygen", "-Y", "help").stderr
+    as_palpate = ("nsenter", "-t", str(pid), "-m", "--")
+    for folder in ("/var/lib/palpate", "/run/palpate", "/tmp", "/var/tmp", "/dev/shm"):
+        machine.get(*as_palpate, "cp", "/bin/true", f"{folder}/own")
+        assert machine.run(*as_palpate, f"{folder}/own").stderr.endswith("Permission denied\n"), folder
+        machine.get(*as_palpate, "rm", f"{folder}/own")
+    assert "ssh-keygen" in machine.run(*as_palpate, "ssh-keygen", "-Y", "help").stderr
     look = "import usb.backend.libusb1 as b; print(b.get_backend().lib)"
-    assert "libusb" in machine.get(*as_it, "/opt/palpate/bin/python", "-c", look)
+    assert "libusb" in machine.get(*as_palpate, "/opt/palpate/bin/python", "-c", look)

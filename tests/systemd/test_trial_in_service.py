@@ -49,7 +49,7 @@ LEFT = "has failed its trial, and "
 
 
 class Store:
-    """The store on the machine, as whoever deploys sees it. a: the sha256 of bundle A's manifest."""
+    """The store on the machine, for a person who deploys to it. a: the sha256 of bundle A's manifest."""
 
     def __init__(self, machine: Machine, folder: Path) -> None:
         self.machine, self._folder, self._counters = machine, folder, itertools.count(1)
@@ -65,8 +65,8 @@ class Store:
         """A command of the box, as its user."""
         return self.machine.get(*AS_PALPATE, *command)
 
-    def deploy(self, *how: str, **changes: Any) -> str:
-        """Copy a new bundle, A with changes to its manifest, to the box and have it installed; its sha256."""
+    def deploy(self, *options: str, **changes: Any) -> str:
+        """Copy a new bundle, A with changes to its manifest, to the box and install it; its sha256."""
         counter = next(self._counters)
         made = self._folder / f"b{counter}"
         made.mkdir()
@@ -80,7 +80,7 @@ class Store:
             tar.add(made, arcname=made.name)
         unpack = "base64 -d | tar -x -C /var/lib/palpate/incoming"
         self.machine.get("sh", "-c", unpack, say=base64.b64encode(packed.getvalue()).decode())
-        self.do("install", *how, f"/var/lib/palpate/incoming/{made.name}")
+        self.do("install", *options, f"/var/lib/palpate/incoming/{made.name}")
         return hashlib.sha256((made / "manifest.json").read_bytes()).hexdigest()
 
     @property
@@ -90,7 +90,7 @@ class Store:
 
     @property
     def ledger(self) -> dict[str, Any]:
-        """What the box knows of its bundles."""
+        """The content of ledger.json: what the box knows of its bundles."""
         return dict(json.loads(self.machine.get("cat", "/var/lib/palpate/ledger.json")))
 
     def starts(self, sha: str) -> int:
@@ -106,7 +106,7 @@ def stored(machine: Machine, before: list[bool], tmp_path_factory: pytest.TempPa
 
 @pytest.fixture
 def store(stored: Store, service: Service) -> Iterator[Store]:
-    """The same, back to A after the test."""
+    """The same store, which goes back to A after the test."""
     yield stored
     stored.machine.get("systemctl", "stop", "palpate")
     stored.machine.run("rm", "-f", "/run/cursed")
@@ -126,7 +126,7 @@ def serves(service: Service, sha: str) -> None:
 
 
 def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Service, store: Store):
-    """On trial at its first start, which `palpate status` tells; after its sweeps committed, with a line in the journal."""
+    """On trial at its first start, which `palpate status` shows; committed after its sweeps, with a line in the journal."""
     new = store.deploy()
     machine.put(SITE, "[store]\ntrial_sweeps = 1\n")
     service.start(RUN)
@@ -135,8 +135,8 @@ def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Ser
     while store.starts(new) or not store.ledger["standings"][new]["committed"]:
         assert time.monotonic() < end, service.journal()
         time.sleep(0.2)
-    told = [line for line in service.told() if line.startswith("bundle ")]
-    assert told == [
+    lines = [line for line in service.told() if line.startswith("bundle ")]
+    assert lines == [
         f"bundle {new[:8]} is on trial, start 1 of 3",
         f"bundle {new[:8]} has stood its trial and is committed",
     ]
@@ -149,7 +149,7 @@ def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Ser
 def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
     machine: Machine, service: Service, store: Store, does: str, more: str
 ):
-    """Each start READY and then a fault, or the watchdog: after three nobody's help is needed, A serves again."""
+    """Each start becomes READY and then fails or hangs: after three starts A serves again, without help."""
     new = store.deploy()
     machine.put("/run/cursed", f"{new} {does}")
     begin = time.monotonic()
@@ -169,20 +169,20 @@ def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
 def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
     machine: Machine, service: Service, store: Store
 ):
-    """Altered on the card after it was installed: A serves with this very start, no restart."""
+    """Altered on the card after it was installed: A serves in the same start, without a restart."""
     new = store.deploy()
     model = f"/var/lib/palpate/bundles/{new}/model.onnx"
     machine.get("sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc")
     service.start(RUN)
     serves(service, store.a)
     assert (service["NRestarts"], store.current) == ("0", store.a)
-    told = [line for line in service.told() if LEFT in line]
-    assert len(told) == 1
-    assert "model.onnx was altered" in told[0]
+    lines = [line for line in service.told() if LEFT in line]
+    assert len(lines) == 1
+    assert "model.onnx was altered" in lines[0]
 
 
 def test_a_bundle_that_does_not_fit_the_settings_is_left(machine: Machine, service: Service, store: Store):
-    """Settings that the new bundle cannot serve and A can: left in that start."""
+    """The new bundle does not fit the settings and A does: A serves in the same start."""
     new = store.deploy(early=None)
     machine.put(SITE, "[classifier]\nearly = true\n")
     service.start(RUN)
@@ -194,7 +194,7 @@ def test_a_bundle_that_does_not_fit_the_settings_is_left(machine: Machine, servi
 def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
     machine: Machine, service: Service, store: Store
 ):
-    """Exit 78, no loop, and the journal says what to do; `palpate rollback` and a start, and A serves."""
+    """Exit 78, no restarts, and the journal says what to do; after `palpate rollback` and a start, A serves."""
     new = store.deploy()
     store.do("commit")
     model = f"/var/lib/palpate/bundles/{new}/model.onnx"
@@ -238,7 +238,7 @@ def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(machine: Machine, ser
 
 
 def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) -> None:
-    """Wait for something that should come in a second or two."""
+    """Wait for something that should take a second or two."""
     end = time.monotonic() + limit_s
     while not done():
         assert time.monotonic() < end, service.journal()
@@ -246,8 +246,8 @@ def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) ->
 
 
 def test_a_candidate_classifies_beside_and_becomes_the_one(machine: Machine, service: Service, store: Store):
-    """Deployed as a candidate, it shadows from the next start on; `palpate status` and `palpate bundles` say how it does;
-    promoted, it is on trial, and its shadow is over."""
+    """Deployed as a candidate, it classifies in the shadow from the next start on; `palpate status` and `palpate bundles` show
+    its figures; once promoted it is on trial, and no longer in the shadow."""
     new = store.deploy("--shadow")
     assert store.current == store.a
     service.start(RUN)

@@ -1,4 +1,4 @@
-"""The page that shows how the skin is placed: what its server gives and refuses, and the page in a headless browser."""
+"""The page of `palpate align`: what its server answers and refuses, and the page in a headless browser."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def page() -> Iterator[Page]:
 
 
 def port(page: Page) -> int:
-    """Where it listens."""
+    """The port it listens on."""
     return int(page.address.rsplit(":", 1)[1])
 
 
@@ -56,37 +56,37 @@ def connected(page: Page) -> socket.socket:
     return socket.create_connection(("127.0.0.1", port(page)), timeout=WAIT_S)
 
 
-def heard(one: socket.socket) -> bytes:
+def received_by(one: socket.socket) -> bytes:
     """All that comes until the other side ends."""
-    said = b""
+    received = b""
     with suppress(ConnectionResetError):
         while more := one.recv(65536):
-            said += more
-    return said
+            received += more
+    return received
 
 
-def asked(page: Page, path: str = "/state", method: str = "GET", host: str = "localhost", more: str = "") -> bytes:
-    """What it answers to one request, head and body."""
+def ask(page: Page, path: str = "/state", method: str = "GET", host: str = "localhost", more: str = "") -> bytes:
+    """Its answer to one request, head and body."""
     with connected(page) as one:
         one.sendall(f"{method} {path} HTTP/1.1\r\nHost: {host}\r\n{more}\r\n".encode())
-        return heard(one)
+        return received_by(one)
 
 
 def test_the_state_is_the_newest_view(page: Page):
-    """As JSON, every field; the next View takes its place at once."""
-    head, _, body = asked(page).partition(b"\r\n\r\n")
+    """JSON with every field; the next View replaces it at once."""
+    head, _, body = ask(page).partition(b"\r\n\r\n")
     assert head.startswith(b"HTTP/1.0 200 ")
     assert b"Content-Type: application/json" in head
     assert json.loads(body) == json.loads(json.dumps(VIEW.json()))
     page.show(replace(VIEW, number=8, centre=None, place=None))
-    held = json.loads(asked(page).partition(b"\r\n\r\n")[2])
-    assert (held["number"], held["centre"], held["place"]) == (8, None, None)
+    state = json.loads(ask(page).partition(b"\r\n\r\n")[2])
+    assert (state["number"], state["centre"], state["place"]) == (8, None, None)
 
 
 @pytest.mark.parametrize("path", ["/", "/state", "/nothing"])
 def test_every_answer_says_what_a_browser_may_do(page: Page, path: str):
-    """Nothing kept, nothing framed, nothing loaded from elsewhere; no version is told; errors too."""
-    head = asked(page, path).partition(b"\r\n\r\n")[0].decode()
+    """No caching, no frames, nothing loaded from elsewhere, and no version of the server; in errors, too."""
+    head = ask(page, path).partition(b"\r\n\r\n")[0].decode()
     for line in (
         "Cache-Control: no-store",
         "X-Frame-Options: DENY",
@@ -116,10 +116,10 @@ def test_every_answer_says_what_a_browser_may_do(page: Page, path: str):
     ],
 )
 def test_two_paths_for_this_machine_and_no_more(page: Page, path: str, method: str, host: str, answer: int):
-    """GET of `/` and `/state` under this machine's own names; all else is refused by its number."""
-    said = asked(page, path, method, host, "Content-Length: 5\r\n")
-    assert int(said.split()[1]) == answer
-    assert (b"doctype" in said.lower()) or answer != 200
+    """GET of `/` and `/state` under this machine's names; anything else is refused with its HTTP status."""
+    reply = ask(page, path, method, host, "Content-Length: 5\r\n")
+    assert int(reply.split()[1]) == answer
+    assert (b"doctype" in reply.lower()) or answer != 200
 
 
 def test_it_listens_on_this_machine_alone(page: Page):
@@ -138,12 +138,12 @@ def test_a_port_that_is_taken_is_named(page: Page):
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)])
 def test_half_a_request_ends_at_the_deadline(page: Page, sent: bytes, monkeypatch: pytest.MonkeyPatch):
-    """However it began: no answer and a closed connection, also where bytes drip in meanwhile; others are served."""
+    """It gets no answer and a closed connection, even if bytes keep coming one by one; others are served."""
     monkeypatch.setattr(web, "DEADLINE_NS", 300_000_000)
     with connected(page) as slow, connected(page) as dripping:
         slow.sendall(sent)
         dripping.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
-        assert b" 200 " in asked(page)
+        assert b" 200 " in ask(page)
         ended = threading.Event()
 
         def drip() -> None:
@@ -154,39 +154,39 @@ def test_half_a_request_ends_at_the_deadline(page: Page, sent: bytes, monkeypatc
         thread = threading.Thread(target=drip)
         thread.start()
         try:
-            assert heard(slow) == b""
-            assert heard(dripping) == b""
+            assert received_by(slow) == b""
+            assert received_by(dripping) == b""
         finally:
             ended.set()
             thread.join()
 
 
 def test_an_endless_head_is_not_read_on(page: Page):
-    """Over MOST_HEAD bytes without an empty line: closed at once, long before the deadline of a patient one."""
+    """After MOST_HEAD bytes without an empty line the connection is closed at once, long before the deadline."""
     with connected(page) as one:
         with suppress(OSError):
             one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * MOST_HEAD)
-        assert heard(one) == b""
+        assert received_by(one) == b""
 
 
 def test_too_many_connections_are_turned_away(page: Page, monkeypatch: pytest.MonkeyPatch):
-    """MOST_OPEN wait for their deadline; the next is closed at once; when they are gone there is room again."""
+    """MOST_OPEN wait for their deadline; the next one is closed at once; when they are gone, new ones are served."""
     monkeypatch.setattr(web, "DEADLINE_NS", 700_000_000)
     with ExitStack() as stack:
         open_ones = [stack.enter_context(connected(page)) for _ in range(MOST_OPEN)]
-        assert asked(page) == b""
-        assert [heard(one) for one in open_ones] == [b""] * MOST_OPEN
-    until(lambda: b" 200 " in asked(page))
+        assert ask(page) == b""
+        assert [received_by(one) for one in open_ones] == [b""] * MOST_OPEN
+    until(lambda: b" 200 " in ask(page))
 
 
 def test_one_who_reads_nothing_holds_nobody_up(page: Page, monkeypatch: pytest.MonkeyPatch):
-    """A browser that asks and never reads: its thread ends at the deadline, and others are served meanwhile."""
+    """A browser asks and never reads: its thread ends at the deadline, and others are served meanwhile."""
     monkeypatch.setattr(web, "DEADLINE_NS", 300_000_000)
     page._server.content["/"] = "text/html", b"x" * 50_000_000
     before = threading.active_count()
     with connected(page) as one:
         one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        assert b" 200 " in asked(page)
+        assert b" 200 " in ask(page)
         until(lambda: threading.active_count() == before)
 
 
@@ -199,7 +199,7 @@ def until(done: Any) -> None:
 
 
 def test_the_page_holds_everything_it_shows():
-    """One file: no address but the picture's namespace, no src, no import; nothing that could be sent."""
+    """It is one file: no address but the namespace of SVG, no src, no import, and nothing that could send data."""
     text = web.PAGE.read_text(encoding="utf-8")
     assert set(re.findall(r"https?://[^\"' ]+", text)) == {"http://www.w3.org/2000/svg"}
     assert not re.search(r"\bsrc=|@import|url\(|<form|<a |innerHTML|eval\(|localStorage", text)
@@ -218,7 +218,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """The command itself, with the simulated skin and its page; where that is."""
+    """The running command with the simulated skin, and the address of its page."""
     command = [sys.executable, "-m", "appliance", "align", "--sim", "rest", "--web", "0"]
     with subprocess.Popen([*command, "--set", f"classifier.bundle={folder}"], stdout=subprocess.PIPE) as run:
         address = run.stdout.readline().decode().removeprefix("page: ").strip()
@@ -229,7 +229,7 @@ def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser of the system's, else the one that playwright has installed."""
+    """A browser of this system, else the one that playwright has installed."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (make test installs it)")
     with api.sync_playwright() as tool:
         path = next(filter(None, map(shutil.which, BROWSERS)), tool.chromium.executable_path)
@@ -241,13 +241,13 @@ def browser() -> Iterator[Any]:
 
 
 class Seen:
-    """The page as somebody sees it. troubles: what the browser complained of. asked: addresses that it asked for."""
+    """The page as a person sees it. errors: messages of the browser. requests: addresses that it asked for."""
 
     def __init__(self, context: Any, address: str) -> None:
-        self.page, self.troubles, self.asked = context.new_page(), [], []
-        self.page.on("console", lambda said: self.troubles.append(said.text))
-        self.page.on("pageerror", lambda error: self.troubles.append(str(error)))
-        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page, self.errors, self.requests = context.new_page(), [], []
+        self.page.on("console", lambda message: self.errors.append(message.text))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(address)
 
     def state(self, wanted: str) -> None:
@@ -255,12 +255,12 @@ class Seen:
         until(lambda: self.page.evaluate("document.body.dataset.state") == wanted)
 
     def text(self, where: str) -> str:
-        """What stands there, with plain spaces."""
+        """The text of an element, with plain spaces."""
         return str(self.page.inner_text(where)).replace("\xa0", " ")
 
 
 def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
-    """The real command: the page waits for contact, advises, follows the next touch; ended, it says no connection."""
+    """The real command: the page waits for contact, advises, follows the next touch; when it ends, "no connection"."""
     run, address = box
     context = browser.new_context(viewport={"width": 820, "height": 1180})
     seen = Seen(context, address)
@@ -276,17 +276,17 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     assert seen.page.locator("#centre").evaluate("e => getComputedStyle(e).visibility") == "hidden"
     assert set(seen.page.locator(".count").all_text_contents()) <= {"0", "1"}
     seen.state("off")
-    assert seen.troubles == []
+    assert seen.errors == []
     run.send_signal(signal.SIGINT)
     assert run.wait(timeout=WAIT_S) == 0
     seen.state("no-connection")
     assert seen.text("#message") == "no connection"
-    assert {url.removeprefix(address) for url in seen.asked} == {"/", "/state"}
+    assert {url.removeprefix(address) for url in seen.requests} == {"/", "/state"}
     context.close()
 
 
 def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
-    """Loads by darkness and digits, places where they are, what is said in large letters and to those who hear it."""
+    """Loads as shades and numbers, points at their coordinates, the message in large letters and for screen readers."""
     context = browser.new_context(viewport={"width": 1180, "height": 820})
     seen = Seen(context, page.address)
     seen.state("off")
@@ -314,7 +314,7 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
     seen.state("no-positions")
     assert seen.page.locator(".tile").count() == 6
     assert "0.5, column 1.0 taxels" in seen.text("#figures")
-    assert seen.troubles == []
+    assert seen.errors == []
     context.close()
 
 
@@ -326,7 +326,7 @@ def circles(seen: Seen, which: str) -> list[dict[str, float]]:
 
 
 def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
-    """The server still answers, but its loop hangs: after a while the page says so instead of showing an old picture."""
+    """The server still answers, but its loop hangs: after a while the page shows that instead of an old picture."""
     context = browser.new_context()
     seen = Seen(context, page.address)
     seen.state("off")
@@ -338,15 +338,15 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
 
 
 def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypatch: pytest.MonkeyPatch):
-    """It takes the question and never answers: the page does not wait for it."""
-    context, held = browser.new_context(), threading.Event()
+    """It accepts the request and never answers: the page does not wait for it."""
+    context, ended = browser.new_context(), threading.Event()
     seen = Seen(context, page.address)
     seen.state("off")
-    monkeypatch.setattr(web.PageHandler, "do_GET", lambda self: held.wait(3 * WAIT_S))
+    monkeypatch.setattr(web.PageHandler, "do_GET", lambda self: ended.wait(3 * WAIT_S))
     try:
         seen.state("no-connection")
     finally:
-        held.set()
+        ended.set()
     assert "tunnel" in seen.text("#hint")
     context.close()
 
@@ -354,7 +354,7 @@ def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypa
 @pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, height: int, scheme: str):
-    """All of it on one screen, without scrolling, by day and by night; the words can be read on their ground."""
+    """Everything on one screen without scrolling, in the light and the dark scheme; the text has enough contrast."""
     page.show(replace(VIEW, message="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"))
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     seen = Seen(context, page.address)
@@ -382,7 +382,7 @@ def luminance(seen: Seen, what: str, colour: str) -> float:
 
 
 def contrast(seen: Seen, what: str) -> float:
-    """Of a text on the page's ground (WCAG 2.1)."""
+    """Contrast of a text with the page's background (WCAG 2.1)."""
     dark, light = sorted((luminance(seen, what, "color"), luminance(seen, "body", "backgroundColor")))
     return (light + 0.05) / (dark + 0.05)
 

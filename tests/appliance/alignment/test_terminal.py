@@ -60,7 +60,7 @@ def views_of(simulated: devices.SimDevices, model: Bundle) -> Callable[[float], 
 
 
 def resting(seed: int = 1) -> devices.SimDevices:
-    """The simulated finger that rests on the tube while the skin is placed."""
+    """The simulated finger that rests on the tube while a person aligns the skin."""
     return devices.build(skin.FORMAT, script.named("rest", skin.FORMAT, seed)[0], rig.VirtualClock(), "sim")
 
 
@@ -70,7 +70,7 @@ def states(views: list[View]) -> list[str]:
 
 
 def test_views_follow_the_touches(model: Bundle):
-    """Finger off, then four touches, each nearer: what is said goes with it, to the last one that is in place."""
+    """Finger off, then four touches, each nearer: the message follows, up to the last one, which is in place."""
     views = views_of(resting(), model)
     seen = views(17)
     assert states(seen)[:4] == ["wait", "no-contact", "off", "no-contact"]
@@ -94,7 +94,7 @@ def pressed(*loads: float) -> devices.SimDevices:
 
 
 def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
-    """Until each taxel was unloaded once nothing is advised; then the touch is seen as it is."""
+    """No advice until each taxel was unloaded once; then the load is right."""
     views = views_of(pressed(80, 95, 2, 80), model)
     seen = views(4)
     assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
@@ -103,8 +103,8 @@ def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
     assert seen[-1].load[3][3] == 0
 
 
-def test_an_unplugged_skin_is_told_and_waited_for(model: Bundle):
-    """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is read anew."""
+def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
+    """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is measured anew."""
     simulated = resting()
     views = views_of(simulated, model)
     views(2)
@@ -119,7 +119,7 @@ def test_an_unplugged_skin_is_told_and_waited_for(model: Bundle):
 
 
 def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
-    """It says that it has none, and what to do; the centre is in taxels."""
+    """The View says that there are none, and what to do; the centre is in taxels."""
     without = replace(default_bundle, manifest=replace(default_bundle.manifest, place=None))
     views = views_of(resting(), without)
     last = [v for v in views(14.5) if v.centre][-1]
@@ -130,7 +130,7 @@ def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
 
 
 def test_another_skin_shape(model: Bundle):
-    """A skin of 2 x 3 taxels and float digits, some of which are no numbers."""
+    """A skin of 2 x 3 taxels with floating-point counts, some of which are NaN."""
     fmt = replace(model.format, rows=2, cols=3, dtype="float32")
     other = replace(
         model,
@@ -152,7 +152,7 @@ VIEW = View(7, "sim", "default 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far
 
 
 def test_a_pipe_gets_one_plain_line_a_second():
-    """No control characters; the words, the centre, and that it is simulated."""
+    """No control characters; message, centre, and that it is simulated."""
     out, clock = io.StringIO(), rig.VirtualClock()
     begin_ns = clock.now_ns()
     with Screen(out, clock, "http://127.0.0.1:8137") as screen:
@@ -167,7 +167,7 @@ def test_a_pipe_gets_one_plain_line_a_second():
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (132, 50), (40, 16), (20, 5), (1, 1)])
 @pytest.mark.parametrize("signs", [BLOCKS, ASCII])
 def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
-    """No line is longer and none is too many; at 80 x 24 all digits, both places, words and the key are there."""
+    """It has no more and no longer lines than fit; at 80 x 24 all numbers, both points, texts and the key are there."""
     lines = Canvas(VIEW, signs, width, height, "http://127.0.0.1:8137").lines(False)
     plain = [re.sub(r"\033\[[0-9;]*m", "", line) for line in lines]
     assert len(lines) == height
@@ -196,7 +196,7 @@ def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
 
 
 def test_a_place_beside_the_skin_is_shown_at_its_edge():
-    """However far: a bundle may name any number."""
+    """However far it is: a bundle may name any number."""
     far = replace(VIEW, place=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
     lines = Canvas(far, ASCII, 80, 24, "").lines(False)
     assert [
@@ -213,7 +213,7 @@ def test_only_a_terminal_that_knows_colours_gets_them():
 
 
 def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """Views come as fast as VIEW_NS allows, not one for each frame; `stopped` ends it and the skin is let go."""
+    """There is a View every VIEW_NS, not one for each frame; `stopped` ends it and the skin is released."""
     simulated, out = resting(), io.StringIO()
     end_ns = simulated.clock.now_ns() + 5 * SECOND
     monkeypatch.setattr("appliance.alignment.terminal.LINE_NS", 0)
@@ -226,7 +226,7 @@ def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyP
 
 
 def test_a_denied_skin_is_named(model: Bundle):
-    """What keeps the skin from being read is said with its remedy, and is no end."""
+    """The View says why the skin cannot be read and what helps; the command goes on."""
     simulated = idle_devices()
     simulated.backend.errors["open"] = errno.EACCES
     alignment = Alignment(SensorConfig(), model, simulated)
@@ -249,7 +249,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, int]]:
-    """A terminal of 80 x 24: its far end and the one that programs get."""
+    """A terminal of 80 x 24: the far end, and the end for programs."""
     far, near = os.openpty()
     fcntl.ioctl(near, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     yield far, near
@@ -258,7 +258,7 @@ def terminal() -> Iterator[tuple[int, int]]:
 
 @pytest.mark.parametrize("kind", ["xterm-256color", "dumb"])
 def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal: tuple[int, int], kind: str):
-    """The command itself in a terminal: exit code 0; a screen of its own, left at the end; none where it is dumb."""
+    """The command in a terminal: exit code 0; the alternate screen is left at the end; a dumb terminal gets none."""
     far, near = terminal
     command = [sys.executable, "-m", "appliance", "align", "--sim", "rest", "--set", f"classifier.bundle={folder}"]
     with subprocess.Popen(command, stdout=near, env=os.environ | {"TERM": kind}) as run:

@@ -1,4 +1,4 @@
-"""The room of the shadow: what a candidate says beside the bundle in service, and that the robot notices nothing of it."""
+"""Shadow mode: how a candidate is compared with the bundle in service, and that it cannot affect the robot."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Side:
         )  # fmt: skip
 
     def judge(self, *sweeps: Sweep) -> None:
-        """Have both judge, each sweep with the end of its turn."""
+        """Let both judge each sweep, with the end of its turn."""
         for one in sweeps:
             self.shadow.sweep(one, self.current(one), {"tare": self.tare.tolist()})
             self.turn()
@@ -54,7 +54,7 @@ class Side:
             self.shadow.turn(health)
 
     def written(self) -> shadow.Agreement:
-        """What lies on the disk."""
+        """The agreement on the disk."""
         found = shadow.read(self.folder)
         assert found
         return found
@@ -73,7 +73,7 @@ def renamed(old: Bundle, name: str = "aaaaaaaa") -> Bundle:
 
 @pytest.fixture
 def side(tmp_path: Path) -> Callable[..., Side]:
-    """Makes a toy bundle with a candidate beside it: the same one, or what `change` makes of it."""
+    """Makes a toy bundle with a candidate: the same bundle, or what `change` returns for it."""
 
     def make(change: Callable[[Bundle], Bundle] = lambda b: replace(b, id="bbbbbbbb"), **how: Any) -> Side:
         current = toy_bundle.load(tmp_path / "toy", known=None)
@@ -86,7 +86,7 @@ A, B = toy_bundle.sweep(0, 0), toy_bundle.sweep(6, 0, 2)
 
 
 def test_two_that_agree_are_counted_and_nothing_is_kept(side):
-    """Written after a minute and at the end, not with each sweep; in words with a Wilson interval."""
+    """They are written after a minute and at the end, not with each sweep; the text has a Wilson interval."""
     pair = side()
     pair.judge(A, B)
     assert pair.written().compared == 0
@@ -102,7 +102,7 @@ def test_two_that_agree_are_counted_and_nothing_is_kept(side):
 
 
 def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
-    """At the end of its turn sweep and counts are on the disk; the sweep gives both verdicts again, bit for bit."""
+    """Sweep and counts are on the disk at the end of the turn; judged again, the sweep gives both verdicts bit for bit."""
     pair = side(renamed)
     pair.judge(A)
     (path,) = pair.kept()
@@ -118,7 +118,7 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
 
 
 def test_another_status_is_another_answer(side):
-    """The same label, but the robot is told to sweep once more: that is a difference."""
+    """The label is the same, but the robot is asked to sweep once more: that counts as a difference."""
     pair = side(
         lambda b: replace(b, manifest=replace(b.manifest, thresholds=replace(toy_bundle.LIMITS, unsure=0.9999999)))
     )
@@ -127,7 +127,7 @@ def test_another_status_is_another_answer(side):
 
 
 def test_nothing_is_written_while_a_sweep_is_open(side):
-    """Only counted then; with the sweep over, one thing a turn."""
+    """Then sweeps are only counted; when the sweep is over, one thing is written in each turn."""
     pair = side(renamed)
     for one in (A, B):
         pair.shadow.sweep(one, pair.current(one), {"tare": pair.tare.tolist()})
@@ -139,7 +139,7 @@ def test_nothing_is_written_while_a_sweep_is_open(side):
 
 
 def test_no_more_are_kept_than_its_limit(side, monkeypatch: pytest.MonkeyPatch):
-    """A candidate that is always wrong fills no disk; the counts go on."""
+    """A candidate that is always wrong does not fill the disk; counting goes on."""
     monkeypatch.setattr(shadow, "KEPT", 2)
     pair = side(renamed)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 6)))
@@ -147,7 +147,7 @@ def test_no_more_are_kept_than_its_limit(side, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_it_fuses_by_the_same_rule(side):
-    """Sweeps of one object are fused by the candidate, too: neither asks for a third one."""
+    """The candidate, too, fuses sweeps of one object: neither asks for a third one."""
     pair = side(min_probability=0.9)
     pair.judge(
         toy_bundle.sweep(2.5, 0, 1, object=1),
@@ -159,7 +159,7 @@ def test_it_fuses_by_the_same_rule(side):
 
 
 def test_it_judges_with_the_box_s_tare(side):
-    """What the robot has tared away is no contact for the candidate either."""
+    """A load that the robot has tared is no contact for the candidate either."""
     pair = side()
     pair.tare = np.full((2, 2), 1e4)
     pair.current.tare = pair.tare
@@ -168,14 +168,14 @@ def test_it_judges_with_the_box_s_tare(side):
 
 
 def test_what_has_no_window_is_not_compared(side):
-    """A sweep that the recorder refused says nothing about a bundle."""
+    """A sweep without a window tells nothing about a bundle, so it is not counted."""
     pair = side()
     pair.judge(replace(A, status=Status.SHORT, frames=types.Frames.empty(toy_bundle.FORMAT)))
     assert pair.shadow.agreement.compared == 0
 
 
 def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Path):
-    """One that has no heads for it, or would wait for more, is not compared but counted."""
+    """If the candidate has no heads for it, or would wait for more, the sweep is counted but not compared."""
     files = {"outputs": ("logits", "early"), "known": None}
     eager, slow = (
         toy_bundle.load(tmp_path / name, early=Early((least,) * 3, 1), **files)
@@ -211,7 +211,7 @@ def strange() -> None:
 
 
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: list[str]):
-    """Three failures in a row: told once, not asked any more; a success between begins the row anew."""
+    """Three failures in a row are logged once, and the candidate is not asked any more; a success starts the count anew."""
     pair = side()
     pair.shadow._classifier = Broken(pair.shadow._classifier, lambda s: s.id != 3, strange)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 10)))
@@ -226,7 +226,7 @@ def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: l
 
 
 def test_a_candidate_that_is_too_slow_has_failed(side, logged: list[str]):
-    """A tenth of a second is the most that frames may wait."""
+    """Frames may wait a tenth of a second at most."""
     pair = side()
     slow = lambda: pair.clock.sleep_until(pair.clock.now_ns() + SECOND // 5)  # noqa: E731
     pair.shadow._classifier = Broken(pair.shadow._classifier, lambda s: True, slow)
@@ -236,7 +236,7 @@ def test_a_candidate_that_is_too_slow_has_failed(side, logged: list[str]):
 
 
 def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path: Path):
-    """The same pair goes on; another candidate, or another current bundle, takes the old counts and sweeps away."""
+    """The same pair continues its counts; for another candidate, or another current bundle, counts and sweeps start anew."""
     pair = side(renamed)
     pair.judge(A)
     pair.shadow.stopping()
@@ -254,7 +254,7 @@ def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, t
 
 
 def test_a_candidate_that_kills_the_program_stays_away(side):
-    """Three starts without an end in order, none a minute old: no fourth; an end in order, or a minute, forgives them."""
+    """After three starts without an orderly end within a minute there is no fourth; an orderly end, or a minute, resets the count."""
 
     def start(judged_s: float) -> Shadow:
         pair = side()
@@ -276,7 +276,7 @@ def test_a_candidate_that_kills_the_program_stays_away(side):
 
 
 def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
-    """Told once; verdicts go on being compared."""
+    """It is logged once; verdicts are still compared."""
     pair = side(renamed)
 
     def full(*_: object, **options: object) -> None:
@@ -290,7 +290,7 @@ def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
-    """Another format, golden sweeps that come out otherwise, a folder that is a file: each an error, with what to try."""
+    """Another format, golden sweeps with other results, a folder that is a file: each is an error that says what to try."""
     with pytest.raises(BundleError, match="wants 4x4 uint8"):
         side(lambda b: default_bundle)
     with pytest.raises(BundleError, match="golden sweeps"):
@@ -304,7 +304,7 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_b
 
 @pytest.mark.parametrize("text", ["", "[]", '{"candidate": "x"}', '{"candidate": "x", "current": "y", "schema": 2}'])
 def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str, logged: list[str]):
-    """It is named in the log, and the counts begin with this start."""
+    """The log names it, and the counts begin with this start."""
     (tmp_path / "shadow").mkdir()
     (tmp_path / "shadow" / shadow.FILE).write_text(text)
     pair = side()
@@ -313,7 +313,7 @@ def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str, logged:
 
 
 def test_the_interval_is_wilson_s():
-    """As scipy has it."""
+    """It is the one of scipy."""
     stats = pytest.importorskip("scipy.stats", reason="scipy comes with the desktop's tools (make test)")
     for k, n in ((0, 1), (118, 120), (7, 9), (20, 20)):
         want = stats.binomtest(k, n).proportion_ci(method="wilson")
@@ -321,7 +321,7 @@ def test_the_interval_is_wilson_s():
 
 
 def test_the_robot_notices_nothing(rigged, default_bundle: Bundle, tmp_path: Path):
-    """On the rig, with a candidate that is always wrong: the same sentences, and each sweep kept."""
+    """With a candidate that is always wrong, the simulated box sends the same sentences, and each sweep is kept."""
     heard = []
     for beside in (False, True):
         clock = rig.VirtualClock()

@@ -1,4 +1,4 @@
-"""Signatures: whom a box believes, and what it says where it does not or cannot tell."""
+"""Signatures: which signers a box trusts, and the errors where a signature is wrong or cannot be checked."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MESSAGE = b'{"name": "any manifest"}\n'
 
 
 class Signers:
-    """Two keys, and a file that believes the first."""
+    """Two keys, and a signers' file with the first."""
 
     def __init__(self, folder: Path) -> None:
         self.ours, self.theirs = deliveries.key(folder, "ours"), deliveries.key(folder, "theirs")
@@ -28,23 +28,23 @@ class Signers:
         self.write(line(self.ours))
 
     def write(self, *lines: str) -> None:
-        """Have the file hold these lines."""
+        """Write these lines to the file."""
         self.file.write_text("".join(lines))
 
     def verify(self, signed: bytes | None = None, message: bytes = MESSAGE) -> str:
-        """Who signed; by default our key."""
+        """The name of the signer; signs with the first key by default."""
         return signature.verify(message, signed or signature.sign(MESSAGE, self.ours), self.file)
 
 
 @pytest.fixture
 def signers(tmp_path: Path) -> Signers:
-    """Two keys, and a file that believes the first."""
+    """Two keys, and a signers' file with the first."""
     return Signers(tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["ed25519", "rsa", "ecdsa"])
 def test_a_signer_is_named(tmp_path: Path, kind: str):
-    """Of several, in a file with comments, empty lines and the namespace in an option."""
+    """The file has several signers, comments, empty lines, and the namespace in an option."""
     own, other = deliveries.key(tmp_path, "own", kind), deliveries.key(tmp_path, "other")
     file = tmp_path / "signers"
     file.write_text("# who may\n\n" + line(other, "ben") + line(own, "anna", 'namespaces="git,palpate-bundle" '))
@@ -52,8 +52,8 @@ def test_a_signer_is_named(tmp_path: Path, kind: str):
     assert signature.verify(MESSAGE, signature.sign(MESSAGE, other), file) == "ben"
 
 
-def test_what_is_not_signed_by_one_who_is_believed_is_refused(signers: Signers):
-    """Another's key, another namespace, another message, cut, empty or huge: each with its reason."""
+def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
+    """Another key, namespace or message, a cut, empty or huge signature: each is refused with its reason."""
     good = signature.sign(MESSAGE, signers.ours)
     other = subprocess.run(
         ["ssh-keygen", "-q", "-Y", "sign", "-n", "git", "-f", signers.ours], input=MESSAGE, stdout=-1, check=True
@@ -71,8 +71,8 @@ def test_what_is_not_signed_by_one_who_is_believed_is_refused(signers: Signers):
     assert signers.verify(good) == SIGNER
 
 
-def test_a_key_for_something_else_is_not_believed(signers: Signers):
-    """The option `namespaces` of the file of signers is kept to."""
+def test_a_key_for_another_purpose_is_not_trusted(signers: Signers):
+    """The option `namespaces` of the signers' file is respected."""
     signers.write(line(signers.ours, SIGNER, 'namespaces="git" '))
     with pytest.raises(BundleError, match="not permitted for use in signature namespace"):
         signers.verify()
@@ -102,7 +102,7 @@ def test_a_key_for_something_else_is_not_believed(signers: Signers):
     ],
 )
 def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(signers: Signers, text: str, why: str):
-    """What ssh-keygen would pass over in silence, or would want the time for, is named with its line."""
+    """A line that ssh-keygen would skip without a message, or would need the time for, is named."""
     key = line(signers.ours).removeprefix(f"{SIGNER} ")
     text = text.replace("{key}", key).replace("{line}", line(signers.ours)).replace("{blob}", key.split()[1])
     signers.file.write_bytes(text.encode(errors="surrogateescape"))
@@ -111,14 +111,14 @@ def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(signers: Si
 
 
 def test_a_missing_file_of_signers_is_named(signers: Signers):
-    """And what belongs there."""
+    """The error says what belongs there."""
     signers.file.unlink()
     with pytest.raises(ConfigError, match=r"No such file.*put a line `NAME KEY` there"):
         signers.verify()
 
 
 def test_a_box_without_ssh_keygen_says_what_to_install(signers: Signers, monkeypatch: pytest.MonkeyPatch):
-    """And one whose ssh-keygen hangs does not hang with it."""
+    """If ssh-keygen hangs, the box does not."""
     good = signature.sign(MESSAGE, signers.ours)
     monkeypatch.setenv("PATH", str(signers.file.parent))
     with pytest.raises(ConfigError, match="apt install openssh-client"):
@@ -132,7 +132,7 @@ def test_a_box_without_ssh_keygen_says_what_to_install(signers: Signers, monkeyp
 
 
 def test_a_key_that_cannot_sign_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
-    """A file that is none."""
+    """A file that is no key."""
     with pytest.raises(ConfigError, match="none does not sign"):
         signature.sign(MESSAGE, tmp_path / "none")
     assert "No such file" in capfd.readouterr().err

@@ -1,4 +1,4 @@
-"""The store: what a box takes, what it runs, what it goes back to."""
+"""The store: which bundles a box installs, which one it runs, and which one it goes back to."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery,
 
 
 def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
-    """What was packaged is what was before, in a trial and by hand, and by hand forward again."""
+    """A failed trial and a rollback lead to the packaged bundle, a second rollback to the installed one again."""
     one = box.installed(1)
     assert box.store.rollback() == PACKAGED == box.start()
     assert box.installed(1) == one
@@ -70,7 +70,7 @@ def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
 
 
 def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
-    """The fourth start runs what was committed before, says so in one line, and `bundles` says why."""
+    """The fourth start runs the committed bundle and logs one line; `palpate bundles` has the reason."""
     one, two = box.committed(1), box.installed(2)
     assert [box.start() for _ in range(MOST_STARTS)] == [two] * MOST_STARTS
     logged.clear()
@@ -84,7 +84,7 @@ def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
 
 
 def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
-    """Not to the first trial, which nobody had committed."""
+    """It does not go back to the first trial, which was never committed."""
     one, two, three = box.committed(1), box.installed(2), box.installed(3)
     assert box.start() == three
     assert box.store.rollback() == one
@@ -94,7 +94,7 @@ def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
 
 
 def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
-    """What the committed bundle goes back to is still there, however many were tried in between."""
+    """The bundle before the committed one is still there, however many were tried in between."""
     one, two = box.committed(1), box.committed(2)
     box.installed(3)
     box.installed(4)
@@ -103,7 +103,7 @@ def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
 
 
 def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
-    """Committed once, left by hand, deployed again and failed: going back from the other one does not end there."""
+    """A bundle was committed, rolled back by hand, deployed again and failed: a rollback does not lead to it."""
     one, two = box.committed(1), box.committed(2)
     assert box.store.rollback() == one
     assert box.installed(2) == two
@@ -113,7 +113,7 @@ def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
 
 
 def test_deploying_again_what_runs_changes_nothing(box: Delivery):
-    """A committed bundle stays committed; one on trial gets its three starts anew."""
+    """A committed bundle stays committed; one on trial gets three new starts."""
     one = box.committed(1)
     assert box.installed(1) == one
     assert box.store.state.of(one).committed
@@ -124,7 +124,7 @@ def test_deploying_again_what_runs_changes_nothing(box: Delivery):
 
 
 def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
-    """It is current and committed as before; what was on trial is left."""
+    """It is current and committed as before; the bundle on trial is given up."""
     one, two = box.committed(1), box.installed(2)
     assert box.installed(1) == one
     assert box.store.current == one
@@ -133,7 +133,7 @@ def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
 
 
 def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
-    """The counter must be above what was ever committed, also after going back; the newest itself may come again."""
+    """The counter must be above all committed ones, also after a rollback; the newest bundle itself may be installed again."""
     one, two = box.committed(1), box.committed(2)
     box.store.rollback()
     for counter in (1, 2):
@@ -145,7 +145,7 @@ def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
 
 
 def test_a_trial_does_not_raise_the_least_counter(box: Delivery):
-    """What was never committed may be replaced by one with a lower counter."""
+    """A bundle that was never committed may be replaced by one with a lower counter."""
     box.committed(1)
     box.installed(9)
     assert box.start() != box.installed(2) == box.start()
@@ -215,7 +215,7 @@ BAD: dict[str, tuple[Ways, str]] = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
-    """Refused with its reason; the current bundle, the ledger and the folder of bundles are as before."""
+    """Refused with its reason; the current bundle, the state and the folder of bundles are as before."""
     one = PACKAGED if name == "never counted" else box.committed(1)  # which is also below that one
     before = box.store.state
     make, why = BAD[name]
@@ -226,7 +226,7 @@ def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
 
 
 def test_what_else_lies_there_is_not_taken(box: Delivery):
-    """A file that the manifest does not name stays where it is."""
+    """A file that the manifest does not name is not copied."""
     folder = box.made(1)
     (folder / "extra").write_bytes(b"x")
     sha = box.store.install(folder)
@@ -235,7 +235,7 @@ def test_what_else_lies_there_is_not_taken(box: Delivery):
 
 
 def test_what_was_checked_is_what_is_written(box: Delivery):
-    """A folder whose owner changes it after the check: the bundle on the shelf is the one that was checked."""
+    """A folder whose owner changes it after the check: the installed bundle is the one that was checked."""
     folder = box.made(1)
 
     def change(held: Bundle) -> None:
@@ -257,7 +257,7 @@ def test_what_was_checked_is_what_is_written(box: Delivery):
     ids=["dies", "asks for memory", "raises"],
 )
 def test_a_model_that_kills_its_runtime_is_refused(tmp_path: Path, does: Callable[[Bundle], object], why: str):
-    """It is tried apart: this process lives on, and says what the other one died of."""
+    """It is tried in a child process: this process goes on, and reports what the child died of."""
     box = Delivery(tmp_path, does)
     with pytest.raises(BundleError, match=why):
         box.installed(1)
@@ -277,7 +277,7 @@ def test_a_model_that_hangs_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: Delivery, logged: list[str]):
-    """Its files have rotted, or the golden sweeps differ, or it does not fit the settings: what was before runs."""
+    """Damaged files, other results for the golden sweeps, or unfit settings: the committed bundle runs."""
     one = box.committed(1)
     two = box.installed(2)
     (box.store.bundles.at(two) / bundle.MODEL).write_bytes(b"rotten")
@@ -294,7 +294,7 @@ def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: D
 
 
 def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
-    """Nothing is guessed: the error names the way back, and that way works."""
+    """No other bundle is chosen by itself: the error names the way back, and that way works."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
     with pytest.raises(BundleError, match="committed; `palpate rollback` goes back"):
@@ -303,7 +303,7 @@ def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
 
 
 def test_another_bundle_in_a_bundles_place_is_refused(box: Delivery):
-    """Whole and signed as it is, it is not the one that the link names."""
+    """It is complete and signed, but not the one that the link names."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
     shutil.copytree(box.store.bundles.at(one), box.store.bundles.at(two))
@@ -312,7 +312,7 @@ def test_another_bundle_in_a_bundles_place_is_refused(box: Delivery):
 
 
 def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
-    """Also the current one: its folder is exchanged for a whole one."""
+    """This holds for the current one, too: its folder is replaced by a complete one."""
     one = box.committed(1)
     (box.store.bundles.at(one) / bundle.MODEL).write_bytes(b"rotten")
     assert [e.role for e in bundle_commands.entries(box.store)] == ["previous", "damaged"]
@@ -320,8 +320,8 @@ def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
     assert os.listdir(box.store.bundles.folder) == [one]
 
 
-def test_leftovers_and_old_bundles_go_at_the_next_accept(box: Delivery):
-    """What an interruption left, and bundles that nothing goes back to."""
+def test_leftovers_and_old_bundles_go_at_the_next_install(box: Delivery):
+    """Incomplete folders are removed, and bundles that nothing goes back to."""
     shas = [box.committed(n) for n in range(1, 5)]
     left = box.store.bundles.folder / f".{shas[0]}-abc"
     left.mkdir()
@@ -333,7 +333,7 @@ def test_leftovers_and_old_bundles_go_at_the_next_accept(box: Delivery):
 
 
 def test_a_candidate_waits_and_is_promoted(box: Delivery):
-    """It changes nothing about what runs; promoted it is on trial."""
+    """It does not change which bundle runs; once promoted it is on trial."""
     one = box.committed(1)
     two = box.store.install(box.made(2), shadow=True)
     assert box.start() == one
@@ -353,7 +353,7 @@ def test_a_candidate_waits_and_is_promoted(box: Delivery):
 
 
 def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
-    """Another one is waited for, not for ever; and nobody but the folder's owner changes it."""
+    """A second command waits for a limited time; and only the owner of the folder may change it."""
     monkeypatch.setattr(store, "LOCK_S", 0.1)
     box.installed(1)
     with box.store._locked(), pytest.raises(ApplianceError, match="in use by another command"):
@@ -366,7 +366,7 @@ def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
 def test_a_disk_that_takes_no_note_runs_what_was_committed(
     box: Delivery, monkeypatch: pytest.MonkeyPatch, logged: list[str]
 ):
-    """A start that cannot be counted is none of a bundle on trial: a loop of crashes could not be told."""
+    """A bundle on trial is not started if the start cannot be counted: a loop of crashes would go unnoticed."""
 
     def full(path: Path, data: bytes) -> None:
         raise OSError(28, "No space left on device", str(path))
@@ -384,8 +384,8 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(
 @pytest.mark.parametrize(
     "text", ["{", "[]", '{"standings": {}, "floor": 1}', '{"standings": {"": {"starts": "many"}}}']
 )
-def test_a_ledger_that_cannot_be_read_is_named(box: Delivery, text: str):
-    """What it said is not guessed."""
+def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
+    """Its content is not guessed."""
     box.installed(1)
     Path(box.how.folder, "ledger.json").write_text(text)
     with pytest.raises(BundleError, match=r"ledger\.json cannot be read"):
@@ -393,7 +393,7 @@ def test_a_ledger_that_cannot_be_read_is_named(box: Delivery, text: str):
 
 
 def test_a_link_out_of_the_store_is_refused(box: Delivery):
-    """Somebody has set it by hand."""
+    """Such a link can only have been set by hand."""
     Path(box.how.folder, "current").symlink_to("/etc")
     with pytest.raises(BundleError, match="leads to '/etc'"):
         box.start()

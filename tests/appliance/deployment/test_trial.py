@@ -1,4 +1,4 @@
-"""A bundle on trial: which starts count, what ends the trial, and that no trouble with the disk ends the classifying."""
+"""A bundle on trial: which starts count, what ends the trial, and that classifying goes on whatever the disk does."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SECOND = 1_000_000_000
 
 
 def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
-    """How the box is at this time."""
+    """Health of the box at this time."""
     return Health(
         time_ns=round(time_s * SECOND), skin="streaming" if streams else "absent", trouble="", streams=streams,
         sweeping=sweeping, answered=0, frames=0, lost_frames=0, garbage_bytes=0, enumerations=1, dropped=0,
@@ -47,14 +47,14 @@ class Trying(Delivery):
         self.one, self.two = self.committed(1), self.installed(2)
 
     def tried(self) -> Trial:
-        """One more start: its trial."""
+        """The trial of one more start."""
         trial = self.store.choose().trial
         assert trial
         return trial
 
     @property
     def standing(self) -> Standing:
-        """What the ledger says of the bundle on trial."""
+        """The recorded state of the bundle on trial."""
         return self.store.state.of(self.two)
 
 
@@ -65,7 +65,7 @@ def box(tmp_path: Path) -> Trying:
 
 
 def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
-    """One that dies leaves its count behind; an orderly end takes it back, once."""
+    """A start that crashes stays counted; an orderly end takes the count back, once."""
     trial = box.tried()
     assert box.standing.starts == 1
     trial.stopping()
@@ -78,7 +78,7 @@ def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
 
 
 def test_a_skin_that_is_unplugged_never_counts(box: Trying):
-    """However often the box is started without it; and once it streams, the start counts."""
+    """They do not count, however many there are; once the skin streams, the start counts."""
     for _ in range(3 * MOST_STARTS):
         trial = box.tried()
         assert box.standing.starts == 1
@@ -92,7 +92,7 @@ def test_a_skin_that_is_unplugged_never_counts(box: Trying):
 
 
 def test_nothing_is_written_while_nothing_is_new(box: Trying):
-    """A turn comes each millisecond or so; the card has a file written only where a fact has changed."""
+    """There is a turn about every millisecond; a file is written only when a fact has changed."""
     trial = box.tried()
     trial.turn(health(0))
     book = Path(box.how.folder, "ledger.json")
@@ -103,7 +103,7 @@ def test_nothing_is_written_while_nothing_is_new(box: Trying):
 
 
 def test_enough_sweeps_commit(box: Trying, logged: list[str]):
-    """Those that got a label, and not while a sweep is open; from then on older bundles are refused."""
+    """Sweeps with a label count, and no commit comes while a sweep is open; afterwards older bundles are refused."""
     trial = box.tried()
     for _ in range(box.how.trial_sweeps - 1):
         trial.answered(verdict())
@@ -125,7 +125,7 @@ def test_enough_sweeps_commit(box: Trying, logged: list[str]):
 
 
 def test_enough_time_commits(box: Trying):
-    """Time during which the skin streamed, not the time between."""
+    """Only the time counts during which the skin streams."""
     trial = box.tried()
     for t in range(0, 400):
         trial.turn(health(t))
@@ -140,7 +140,7 @@ def test_enough_time_commits(box: Trying):
 
 
 def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
-    """A robot that is switched off each evening commits its bundle all the same; what dies has shown nothing."""
+    """A robot that is switched off each evening commits its bundle as well; progress of a crashed start is lost."""
     for n in range(2):
         trial = box.tried()
         trial.turn(health(0))
@@ -161,7 +161,7 @@ def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
     ids=repr,
 )
 def test_what_ends_the_program_decides_whether_the_start_counts(box: Trying, error: BaseException | None, counts: int):
-    """Missing hardware and a person do not; what may be the bundle's doing does."""
+    """Missing hardware and a person who stops the program do not count; an error that the bundle may have caused does."""
     with suppress(type(error)), box.tried():
         if error:
             raise error
@@ -169,7 +169,7 @@ def test_what_ends_the_program_decides_whether_the_start_counts(box: Trying, err
 
 
 def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
-    """Nothing raises; the commit comes when there is room again."""
+    """Nothing is raised; the commit comes when the disk can be written again."""
     trial = box.tried()
     calls: list[float] = []
 
@@ -196,7 +196,7 @@ def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pyte
 
 
 def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
-    """The loop goes on; what was to be written is written later."""
+    """The loop goes on, and the write is repeated later."""
     trial = box.tried()
     with box.store._locked():
         trial.turn(health(0, streams=False))
@@ -207,7 +207,7 @@ def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
 
 
 def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
-    """Another was deployed, or a person went back, while this one still runs."""
+    """Another bundle was deployed, or a person rolled back, while this one still runs."""
     for way in (lambda: box.installed(3), box.store.rollback):
         trial = box.tried()
         way()
@@ -221,7 +221,7 @@ def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
 
 
 def test_a_person_may_commit_while_it_runs(box: Trying):
-    """The program notes it and says nothing of it; its end changes nothing."""
+    """The program notices it and logs nothing; its end changes nothing."""
     trial = box.tried()
     assert box.store.commit()
     trial.turn(health(0, streams=False))
@@ -232,7 +232,7 @@ def test_a_person_may_commit_while_it_runs(box: Trying):
 
 
 def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
-    """The whole way on the rig: five sweeps of the simulated robot, each with its answer."""
+    """On the simulated box: five sweeps of the simulated robot, each with its answer."""
     trial = box.tried()
     simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
     running = rigged(simulated, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
@@ -241,7 +241,7 @@ def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
 
 
 def test_a_box_without_a_skin_takes_its_start_back(box: Trying, rigged: Callable[..., Rigged]):
-    """The whole way on the rig, with nothing on the bus."""
+    """On the simulated box, with nothing on the bus."""
     trial = box.tried()
     simulated = idle_devices()
     simulated.backend.unplug()

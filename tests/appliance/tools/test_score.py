@@ -26,8 +26,8 @@ def act(label: str, *, new_object: bool = False) -> Act:
 def test_only_ok_with_the_right_label_counts():
     """Another label, and the right one that is unsure, are wrong; percentages have their intervals."""
     score = Score()
-    said = [answer(1, "wood"), answer(2, "wood"), answer(3, "wood", Status.UNSURE), answer(4, "wood", share=0.5)]
-    right = [score.add(act(name), one) for name, one in zip(("wood", "paper", "wood", "wood"), said, strict=True)]
+    answers = [answer(1, "wood"), answer(2, "wood"), answer(3, "wood", Status.UNSURE), answer(4, "wood", share=0.5)]
+    right = [score.add(act(name), one) for name, one in zip(("wood", "paper", "wood", "wood"), answers, strict=True)]
     assert right == [True, False, False, True]
     assert score.table()[1:] == [
         "  paper               0 / 1",
