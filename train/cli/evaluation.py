@@ -142,7 +142,7 @@ def run_stress(args: argparse.Namespace) -> None:
         effort=options.effort(args),
         log=options.Log(),
     )
-    told["box"] = robustness.box_trouble(bundle.load(bundle.DEFAULT))
+    told["box"] = robustness.box_answers(bundle.load(bundle.DEFAULT))
     told |= {"train": train.source, "digest": sets.digest(train), "format": str(train.format)} | score.provenance()
     table = robustness.table(told)
     put(args.out / "results.json", (json.dumps(told) + "\n").encode(), parents=True)

@@ -1,8 +1,8 @@
-"""The room of stresses: the ways in which a sweep goes wrong. In: test sweeps. Out: the same sweeps with one thing wrong.
+"""Corruptions: the ways in which a sweep goes wrong. In: test sweeps. Out: the same sweeps with one thing wrong.
 
-Each stress is one entry of STRESSES and goes from none to severe. What can be physical is: simulated sweeps are drawn
-anew with the skin, the force or the window elsewhere, each from its own random stream. The rest is done to the digits,
-which are digitized again. What is drawn does not depend on the severity, so that a stress only grows.
+Each corruption is one entry of CORRUPTIONS, in steps from none to severe. What can be physical is: simulated sweeps are
+drawn anew with the skin, the force or the window elsewhere, each from its own random stream. The rest is done to the raw
+counts, which are digitized again. What is drawn does not depend on the severity: a corruption only grows with it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.random import Generator
@@ -27,11 +27,11 @@ from train.data.sets import Dataset
 Array = NDArray[Any]
 HUM_HZ = 50.0
 NOISY = 4.0
-"""Noise of a noisy taxel, in the set's deviations."""
+"""Noise of a noisy taxel, in deviations of the set."""
 GAIN_LAW = 0.25
-"""Of the shifted grid: gains are spread evenly by this much, on a logarithmic scale, at the severest shift."""
+"""Of the shifted grid: gains are drawn evenly within this range each way, on a logarithmic scale, at the severest shift."""
 USUAL_SWEEPS = 120
-"""Test sweeps of a file that are put under stress; more make a point surer and everything slower."""
+"""Test sweeps of a file that are corrupted; more narrow the intervals and slow everything down."""
 REST_S = 0.1
 """How long the simulated finger rests before and after the slide, which is as long as the window."""
 
@@ -40,7 +40,7 @@ REST_S = 0.1
 class SimulatedScene:
     """Simulated sweeps that can be drawn anew, each from the random stream that it had.
 
-    materials: text [N]. places: where the skin sat in each. worlds: seed of the set that each is of.
+    materials: text [N]. places: where the skin sat in each sweep. worlds: seed of the set that each sweep is of.
     """
 
     materials: tuple[str, ...]
@@ -53,7 +53,10 @@ class SimulatedScene:
         world: skin.World = skin.WORLD,
         late_ms: Array | float = 0.0,
     ) -> Array:
-        """Digits uint8 [N, 1500, 4, 4]; late_ms (a number or [N], at most 100 each way): start of window minus slide's."""
+        """Raw counts uint8 [N, 1500, 4, 4] of the sweeps with changed placements or in a changed world.
+
+        late_ms: a number or [N], at most 100 either way: start of the window minus start of the slide.
+        """
         form, rest = skin.FORMAT, round(REST_S * skin.FORMAT.rate_hz)
         late = np.rint(np.broadcast_to(late_ms, len(self.places)) * form.rate_hz / 1000).astype(int)
         drawn = np.empty((len(self.places), form.window, form.rows, form.cols), form.digits)
@@ -67,14 +70,14 @@ class SimulatedScene:
 
 @dataclass(frozen=True)
 class EvaluationSweeps:
-    """What is put under stress: test sweeps and, where they are simulated, the scene that draws them anew."""
+    """Test sweeps that can be corrupted and, where they are simulated, the scene that draws them anew."""
 
     sweeps: Dataset
     scene: SimulatedScene | None = None
 
     @classmethod
     def of(cls, sweeps: Dataset, most: int = USUAL_SWEEPS, seed: int = 0) -> EvaluationSweeps:
-        """About `most` of the `sweeps`, as many of each material as there are."""
+        """About `most` of the `sweeps`, equally many of each material as far as there are."""
         order = np.random.default_rng(seed).permutation(len(sweeps))
         rank = np.empty(len(sweeps), int)
         for label in np.unique(sweeps.labels):
@@ -84,34 +87,36 @@ class EvaluationSweeps:
 
     @classmethod
     def simulated(cls, spec: str, seed: int = 0) -> EvaluationSweeps:
-        """The sweeps of the scene "sim:NAME[:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest before and after each.
+        """Sweeps as in the set "sim:NAME[:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest before and after each.
 
-        They are others than those of the set of that name, at the same places. Raises FormatError as `sets.load`.
+        They are drawn at the same places as those of that set, with other noise. Raises FormatError as `sets.load` does.
         """
         base = sets.load(spec, seed)
         found = sets.SIMULATED.fullmatch(spec)
         if not found:
-            raise FormatError(f"set {spec!r} is no simulated one; use sim:NAME, or EvaluationSweeps.of for a file")
+            raise FormatError(f"set {spec!r} is not a simulated one; use sim:NAME, or EvaluationSweeps.of for a file")
         first = int(found["seed"] or seed)
+        name = cast("skin.SetName", found["name"])
         worlds = range(first, int(found["last"] or first) + 1)
-        all_places = [(world, place) for world in worlds for place in skin.placements(found["name"], world)]
+        all_places = [(world, place) for world in worlds for place in skin.placements(name, world)]
         own, places = zip(*(all_places[i] for i in base.group("position")), strict=True)
         scene = SimulatedScene(tuple(base.materials[k] for k in base.labels), places, own)
         return cls(replace(base, samples=scene.draw()), scene)
 
     @cached_property
     def deviation(self) -> Array:
-        """Standard deviation in digits [R, C] within a sweep, rms over sweeps."""
-        return np.sqrt(self.sweeps.samples.var(axis=1, dtype=np.float64).mean(axis=0))
+        """Standard deviation in raw counts [R, C] within a sweep, root mean square over sweeps."""
+        deviation: Array = np.sqrt(self.sweeps.samples.var(axis=1, dtype=np.float64).mean(axis=0))
+        return deviation
 
     @cached_property
     def rms(self) -> float:
-        """The deviation of all taxels together, in digits."""
+        """The deviation of all taxels together, in raw counts."""
         return float(np.sqrt(np.mean(self.deviation**2)))
 
     @cached_property
     def load(self) -> float:
-        """Full load in digits: the 99.9 percentile of their magnitude. The very largest may be an accident."""
+        """Full load in raw counts: the 99.9th percentile of their magnitude. The very largest may be an accident."""
         return float(np.percentile(np.abs(self.sweeps.samples.astype(np.float32)), 99.9))
 
 
@@ -122,8 +127,8 @@ Change = Callable[[Array, float, Generator, EvaluationSweeps], Array]
 class Corruption:
     """One thing that goes wrong.
 
-    unit: of `severities`, which rise from 0 = none. change: (float32 [N, T, R, C], severity, rng, trial) -> the same
-    shape, not yet digitized. only: "simulated" where a scene is needed, "files" for what stands in for one.
+    unit: of `severities`, which rise from 0 = none. change: (float32 [N, T, R, C], severity, rng, test) -> the same
+    shape, not yet digitized. only: "simulated" where a scene is needed, "files" for what replaces it without one.
     """
 
     name: str
@@ -133,158 +138,176 @@ class Corruption:
     change: Change
     only: str = ""
 
-    def apply(self, trial: EvaluationSweeps, severity: float, seed: int) -> Array:
-        """The trial's digits [N, T, R, C] under stress, of the same type; at severity 0 as they are.
+    def apply(self, test: EvaluationSweeps, severity: float, seed: int) -> Array:
+        """The raw counts [N, T, R, C] of `test`, corrupted, of the same type; unchanged at severity 0.
 
         The same seed draws the same taxels, signs and noise for every severity.
-        Raises FormatError for a severity out of range, and where the stress needs a scene and the trial has none.
+        Raises FormatError for a severity out of range, and where the corruption needs a scene and `test` has none.
         """
-        samples = trial.sweeps.samples
+        samples = test.sweeps.samples
         if not 0 <= severity <= self.severities[-1]:
             raise FormatError(
                 f"severity {severity:g} of stress {self.name!r} is out of range; use 0 to {self.severities[-1]:g}"
             )
-        if self.only == "simulated" and trial.scene is None:
-            raise FormatError(f"stress {self.name!r} draws sweeps anew and {trial.sweeps.source} cannot; use sim:NAME")
+        if self.only == "simulated" and test.scene is None:
+            raise FormatError(f"stress {self.name!r} draws sweeps anew and {test.sweeps.source} cannot; use sim:NAME")
         if severity == 0:
             return samples
         rng = np.random.default_rng([seed, *self.name.encode()])
-        return _digitized(self.change(samples.astype(np.float32), severity, rng, trial), samples.dtype)
+        return _digitized(self.change(samples.astype(np.float32), severity, rng, test), samples.dtype)
 
 
 def _digitized(x: Array, kind: np.dtype[Any]) -> Array:
-    """The converter: whole digits within the range of their type; float32 stays as it is."""
+    """As the converter digitizes: whole counts within the range of their type; float32 stays as it is."""
     if kind.kind == "f":
         return x.astype(kind)
     limits = np.iinfo(kind)
     return np.clip(np.rint(x), limits.min, limits.max).astype(kind)
 
 
-def _shift(x: Array, rows: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    return trial.scene.draw(lambda p: replace(p, dx_mm=p.dx_mm + rows * skin.PITCH_MM))
+def _scene(test: EvaluationSweeps) -> SimulatedScene:
+    """Of corruptions that draw anew, for which `apply` has refused sweeps without a scene."""
+    assert test.scene
+    return test.scene
 
 
-def _turn(x: Array, degrees: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    return trial.scene.draw(lambda p: replace(p, turn_deg=p.turn_deg + degrees))
+def _shift(x: Array, rows: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    return _scene(test).draw(lambda p: replace(p, dx_mm=p.dx_mm + rows * skin.PITCH_MM))
 
 
-def _force(sign: int, x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    return trial.scene.draw(world=replace(skin.WORLD, force_n=skin.WORLD.force_n * (1 + sign * share)))
+def _turn(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    return _scene(test).draw(lambda p: replace(p, turn_deg=p.turn_deg + degrees))
+
+
+def _force(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    return _scene(test).draw(world=replace(skin.WORLD, force_n=skin.WORLD.force_n * (1 + sign * share)))
 
 
 def _error_ms(x: Array, ms: float, rng: Generator) -> Array:
-    return ms * rng.choice([-1, 1], len(x))
+    late_ms: Array = ms * rng.choice([-1, 1], len(x))
+    return late_ms
 
 
-def _window(x: Array, ms: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    return trial.scene.draw(late_ms=_error_ms(x, ms, rng))
+def _window(x: Array, ms: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    return _scene(test).draw(late_ms=_error_ms(x, ms, rng))
 
 
-def _window_held(x: Array, ms: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    late = np.rint(_error_ms(x, ms, rng) * trial.sweeps.rate_hz / 1000).astype(int)
+def _window_held(x: Array, ms: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    late = np.rint(_error_ms(x, ms, rng) * test.sweeps.rate_hz / 1000).astype(int)
     at = np.clip(np.arange(x.shape[1]) + late[:, None], 0, x.shape[1] - 1)
-    return np.take_along_axis(x, at[:, :, None, None], axis=1)
+    moved: Array = np.take_along_axis(x, at[:, :, None, None], axis=1)
+    return moved
 
 
 def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator) -> Array:
-    """Taxels read between their neighbours, `rows` further on and turned; beyond its edge the grid is mirrored."""
+    """Taxels read between their neighbours, `rows` further on and turned; beyond its edge the grid is mirrored.
+
+    share: of GAIN_LAW, by which their gains spread.
+    """
     r, c = x.shape[2:]
     i, j = np.indices((r, c)) - (np.array([r, c]) - 1)[:, None, None] / 2
     place = rows + (i + 1j * j) * np.exp(1j * np.deg2rad(degrees))
     at = np.stack([place.real + (r - 1) / 2, place.imag + (c - 1) / 2])
-    one_by_one = np.eye(r * c).reshape(-1, r, c)
-    weights = np.stack([map_coordinates(one, at, order=1, mode="mirror").ravel() for one in one_by_one])
+    taxels = np.eye(r * c).reshape(-1, r, c)
+    weights = np.stack([map_coordinates(taxel, at, order=1, mode="mirror").ravel() for taxel in taxels])
     gain = np.exp(GAIN_LAW * share * rng.uniform(-1, 1, (len(x), 1, r, c)))
-    return (x.reshape(*x.shape[:2], -1) @ weights.astype(np.float32)).reshape(x.shape) * gain
+    read: Array = (x.reshape(*x.shape[:2], -1) @ weights.astype(np.float32)).reshape(x.shape) * gain
+    return read
 
 
-def _shift_grid(x: Array, rows: float, rng: Generator, trial: EvaluationSweeps) -> Array:
+def _shift_grid(x: Array, rows: float, rng: Generator, test: EvaluationSweeps) -> Array:
     return _regrid(x, rows, 0.0, rows / SHIFTS[-1], rng)
 
 
-def _turn_grid(x: Array, degrees: float, rng: Generator, trial: EvaluationSweeps) -> Array:
+def _turn_grid(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps) -> Array:
     return _regrid(x, 0.0, degrees, degrees / TURNS[-1], rng)
 
 
 def _some(x: Array, n: float, rng: Generator) -> Array:
     """`n` taxels of each sweep, or all where there are fewer: bool [N, 1, R, C]."""
     order = rng.permuted(np.tile(np.arange(x[0, 0].size), (len(x), 1)), axis=1)
-    return (order < n).reshape(len(x), 1, *x.shape[2:])
+    chosen: Array = (order < n).reshape(len(x), 1, *x.shape[2:])
+    return chosen
 
 
-def _dead(x: Array, n: float, rng: Generator, trial: EvaluationSweeps) -> Array:
+def _dead(x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
     return np.where(_some(x, n, rng), 0, x)
 
 
-def _stuck(x: Array, n: float, rng: Generator, trial: EvaluationSweeps) -> Array:
+def _stuck(x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
     return np.where(_some(x, n, rng), rng.uniform(x.min(), x.max(), (len(x), 1, *x.shape[2:])), x)
 
 
-def _noisy(x: Array, n: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    return x + _some(x, n, rng) * np.float32(NOISY * trial.rms) * rng.standard_normal(x.shape, np.float32)
+def _noisy(x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    noisy: Array = x + _some(x, n, rng) * np.float32(NOISY * test.rms) * rng.standard_normal(x.shape, np.float32)
+    return noisy
 
 
-def _gain_spread(x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
+def _gain_spread(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
     return x * (1 + share * rng.uniform(-1, 1, (len(x), 1, *x.shape[2:])))
 
 
-def _gain(sign: int, x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
+def _gain(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
     return x * (1 + sign * share)
 
 
-def _speed(sign: int, x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    return trial.scene.draw(world=replace(skin.WORLD, speed=1 + sign * share))
+def _speed(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    return _scene(test).draw(world=replace(skin.WORLD, speed=1 + sign * share))
 
 
-def _stretch(sign: int, x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    """All that happens is stretched in time about the window's middle; beyond its ends a sweep runs back."""
+def _stretch(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    """The sweep is stretched in time about the window's middle; beyond its ends it is mirrored."""
     frames = x.shape[1]
     spectrum = np.fft.rfft(np.concatenate([x[:, ::-1], x, x[:, ::-1]], axis=1), axis=1)
     n = round(3 * frames / (1 + sign * share))
     stretched = np.fft.irfft(spectrum[:, : n // 2 + 1], n, axis=1) * (n / (3 * frames))
-    return stretched[:, (n - frames) // 2 :][:, :frames]
+    middle: Array = stretched[:, (n - frames) // 2 :][:, :frames]
+    return middle
 
 
-def _drift(x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    start, end = share * trial.load * rng.uniform(-1, 1, (2, len(x), 1, *x.shape[2:]))
-    return x + start + (end - start) * np.linspace(0, 1, x.shape[1])[:, None, None]
+def _drift(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    start, end = share * test.load * rng.uniform(-1, 1, (2, len(x), 1, *x.shape[2:]))
+    drifted: Array = x + start + (end - start) * np.linspace(0, 1, x.shape[1])[:, None, None]
+    return drifted
 
 
-def _bits(x: Array, fewer: float, rng: Generator, trial: EvaluationSweeps) -> Array:
+def _bits(x: Array, fewer: float, rng: Generator, test: EvaluationSweeps) -> Array:
     low, high = float(x.min()), float(x.max())
-    step = max((high - low) / (2 ** (8 - fewer) - 1), np.finfo(np.float32).tiny)
-    return low + np.rint((x - low) / step) * step
+    step = max((high - low) / (2.0 ** (8 - fewer) - 1), float(np.finfo(np.float32).tiny))
+    coarse: Array = low + np.rint((x - low) / step) * step
+    return coarse
 
 
-def _lost(x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
+def _lost(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
     lost = rng.random(x.shape[:2]) < share
     lost[:, [0, -1]] = False  # on the box the frames around the window are there too
-    for t in range(sweep_window.MAX_GAP, x.shape[1]):  # what lacks more in a row is refused there
+    for t in range(sweep_window.MAX_GAP, x.shape[1]):  # the box refuses a sweep that lacks more in a row
         lost[:, t] &= ~lost[:, t - sweep_window.MAX_GAP : t].all(axis=1)
     number = np.arange(x.shape[1])
-    for taxels, gone in zip(x, lost, strict=True):
+    for taxels, missing in zip(x, lost, strict=True):
         frames = Frames(number.copy(), number, taxels)
-        sweep_window.interpolate(frames, np.flatnonzero(~gone), np.flatnonzero(gone))
+        sweep_window.interpolate(frames, np.flatnonzero(~missing), np.flatnonzero(missing))
     return x
 
 
-def _saturation(x: Array, share: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    top = (1 - share) * trial.load
+def _saturation(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    top = (1 - share) * test.load
     return np.clip(x, -top, top)
 
 
-def _hum(x: Array, ratio: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    turns = HUM_HZ * np.arange(x.shape[1]) / trial.sweeps.rate_hz + rng.random((len(x), 1))
-    return x + ratio * trial.rms * np.sin(2 * np.pi * turns)[:, :, None, None]
+def _hum(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    turns = HUM_HZ * np.arange(x.shape[1]) / test.sweeps.rate_hz + rng.random((len(x), 1))
+    return x + ratio * test.rms * np.sin(2 * np.pi * turns)[:, :, None, None]
 
 
-def _noise(x: Array, ratio: float, rng: Generator, trial: EvaluationSweeps) -> Array:
-    return x + (ratio * trial.deviation).astype(np.float32) * rng.standard_normal(x.shape, np.float32)
+def _noise(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    noisy: Array = x + (ratio * test.deviation).astype(np.float32) * rng.standard_normal(x.shape, np.float32)
+    return noisy
 
 
 SHIFTS, TURNS, ERRORS_MS = (0, 0.25, 0.5, 1, 1.5), (0, 5, 10, 20, 30), (0, 10, 25, 50, 100)
 HALVES, TAXELS = (0, 0.1, 0.2, 0.35, 0.5), (0, 1, 2, 3, 4)
-STRESSES = (
+CORRUPTIONS = (
     Corruption("shift-rows", "rows", SHIFTS, "skin further along the sliding, drawn anew", _shift, "simulated"),
     Corruption("turn", "degrees", TURNS, "skin turned on the finger, drawn anew", _turn, "simulated"),
     Corruption("force-down", "share", HALVES, "pressed less, drawn anew", partial(_force, -1), "simulated"),
@@ -296,7 +319,7 @@ STRESSES = (
     Corruption("turn-grid", "degrees", TURNS, "taxels read on a turned grid, edge mirrored, new gains", _turn_grid, "files"),
     Corruption("window-held", "ms", ERRORS_MS, "window too early or late, first or last frame held", _window_held, "files"),
     Corruption("dead", "taxels", TAXELS, "read 0", _dead),
-    Corruption("stuck", "taxels", TAXELS, "each at some digit of the set's range", _stuck),
+    Corruption("stuck", "taxels", TAXELS, "each at some count of the set's range", _stuck),
     Corruption("noisy", "taxels", TAXELS, f"white noise of {NOISY:g} of the set's deviations", _noisy),
     Corruption("gain-spread", "share", HALVES, "each taxel's gain off by up to this share", _gain_spread),
     Corruption("gain-down", "share", HALVES, "all gains lower", partial(_gain, -1)),
@@ -312,15 +335,15 @@ STRESSES = (
 )  # fmt: skip
 
 
-def usual(trial: EvaluationSweeps) -> tuple[Corruption, ...]:
-    """All stresses that make sense for `trial`: drawn anew where it has a scene, in the digits where it has none."""
-    without = "files" if trial.scene else "simulated"
-    return tuple(stress for stress in STRESSES if stress.only != without)
+def applicable(test: EvaluationSweeps) -> tuple[Corruption, ...]:
+    """All corruptions that apply to `test`: drawn anew where it has a scene, done to the raw counts where it has none."""
+    other = "files" if test.scene else "simulated"
+    return tuple(corruption for corruption in CORRUPTIONS if corruption.only != other)
 
 
 def find(names: Sequence[str]) -> tuple[Corruption, ...]:
-    """The stresses of these names. Raises FormatError naming one that is unknown."""
-    known = {stress.name: stress for stress in STRESSES}
+    """The corruptions of these names. Raises FormatError naming one that is unknown."""
+    known = {corruption.name: corruption for corruption in CORRUPTIONS}
     for name in names:
         if name not in known:
             raise FormatError(f"stress {name!r} is unknown; use some of {', '.join(known)}")

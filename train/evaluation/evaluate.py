@@ -1,6 +1,6 @@
-"""The room of evaluation: method x protocol x fold x seed. In: a sweep set, methods, protocols. Out: one Result each.
+"""Evaluation: method x protocol x fold x seed. In: a sweep set, methods, protocols. Out: one Result each.
 
-Every fold is one task, run where pool.py runs it and kept in a cache: what was interrupted goes on where it was.
+Every fold is one task, run by parallel.py and kept in a cache: an interrupted run continues where it was.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palp
 
 @dataclass(frozen=True)
 class Result:
-    """What a method did under a protocol with one seed. folds: in the order of the splitter. origin: the set's digest and
-    score.provenance."""
+    """The result of a method under a protocol with one seed. folds: in the order of the splitter. origin: the set's digest
+    and score.provenance."""
 
     method: str
     protocol: str
@@ -42,7 +42,7 @@ class Result:
 
     @property
     def refused(self) -> str:
-        """Why the method cannot work with this set; nothing else is known then."""
+        """Why the method cannot work with this set, else ""; there are no other results then."""
         return next((fold.refused for fold in self.folds if fold.refused), "")
 
     @property
@@ -56,40 +56,40 @@ class Result:
         return np.concatenate([fold.logits for fold in self.folds])
 
     def json(self) -> dict[str, Any]:
-        """What scripts read; every count with its 95 % interval."""
+        """The result for scripts; every count with its 95 % interval."""
         logits, sweeps = self.logits, self.sweeps
         confusion = np.zeros((len(sweeps.materials),) * 2, int)
         np.add.at(confusion, (sweeps.labels[self.test], logits.argmax(1)), 1)
-        told: dict[str, Any] = {
+        result: dict[str, Any] = {
             "method": self.method, "protocol": self.protocol, "means_removed": self.means_removed, "seed": self.seed,
         } | self._counts(logits)  # fmt: skip
         if forms := self.folds[0].forms:
-            told["forms"] = {name: self._form(name) for name in forms}
+            result["forms"] = {name: self._form(name) for name in forms}
         times = {"fit_s": round(float(np.median([f.fit_s for f in self.folds])), 3),
                  "ms_p50": round(float(np.median([f.ms for f in self.folds])), 4)}  # fmt: skip
         ran = sorted({f.ran for f in self.folds} - {""})
-        return told | times | {
+        return result | times | {
             "folds": len(self.folds), "agreement": min(f.agreement for f in self.folds), "ran": ", ".join(ran),
             "materials": list(sweeps.materials), "confusion": confusion.tolist(), "set": sweeps.source,
             "format": asdict(sweeps.format),
         } | self.origin  # fmt: skip
 
     def _counts(self, logits: Array) -> dict[str, Any]:
-        """Right answers by window, and by recording where there are such."""
+        """Right answers by window, and by recording where the set has recordings."""
         labels, recording = self.sweeps.labels[self.test], self.sweeps.group("recording")[self.test]
         clusters = Protocol(self.protocol).clusters(self.sweeps)
         clusters = None if clusters is None else clusters[self.test]
         right = logits.argmax(1) == labels
-        told: dict[str, Any] = {"window": Score.of(right).json(), "interval": interval(right, clusters)}
+        counts: dict[str, Any] = {"window": Score.of(right).json(), "interval": interval(right, clusters)}
         if "recording" in self.sweeps.groups:
             whole, first = fused(logits, recording)
             right = whole.argmax(1) == labels[first]
-            told["recording"] = Score.of(right).json()
-            told["recording_interval"] = interval(right, None if clusters is None else clusters[first])
-        return told
+            counts["recording"] = Score.of(right).json()
+            counts["recording_interval"] = interval(right, None if clusters is None else clusters[first])
+        return counts
 
     def _form(self, name: str) -> dict[str, Any]:
-        """The same models in another precision: counts, how far the answers are apart (parity.Apart), and what accuracy
+        """The same models in another precision: counts, how far the answers are apart (parity.Apart), and the accuracy that
         int8 loses against float, whichever of the two this form is (parity.Lost)."""
         logits = np.concatenate([fold.forms[name] for fold in self.folds])
         precise, int8 = (logits, self.logits) if name == "float" else (self.logits, logits)
@@ -97,24 +97,24 @@ class Result:
         lost = parity.loss(
             precise.argmax(1) == labels, int8.argmax(1) == labels, None if clusters is None else clusters[self.test]
         )
-        told = asdict(parity.compare(precise, int8)) | asdict(lost)
-        return self._counts(logits) | {key: round(value, 4) for key, value in told.items()}
+        figures = asdict(parity.compare(precise, int8)) | asdict(lost)
+        return self._counts(logits) | {key: round(value, 4) for key, value in figures.items()}
 
 
 HEADER = f"{'method':<16} {'protocol':<22} means  {'windows':<30} {'recordings':<30} {'fit s':>7} {'ms':>7}"
 
 
-def line(told: dict[str, Any]) -> str:
-    """A result of Result.json() under HEADER."""
-    means = "out" if told["means_removed"] else "in"
-    counts = [_count(told["window"], told["interval"])]
-    counts.append(_count(told["recording"], told["recording_interval"]) if "recording" in told else "")
-    times = f"{told['fit_s']:>7.2f} {told['ms_p50']:>7.3f}"
-    return f"{told['method']:<16} {told['protocol']:<22} {means:<6} {counts[0]:<30} {counts[1]:<30} {times}"
+def line(result: dict[str, Any]) -> str:
+    """What Result.json() returned, as a line under HEADER."""
+    means = "out" if result["means_removed"] else "in"
+    counts = [_count(result["window"], result["interval"])]
+    counts.append(_count(result["recording"], result["recording_interval"]) if "recording" in result else "")
+    times = f"{result['fit_s']:>7.2f} {result['ms_p50']:>7.3f}"
+    return f"{result['method']:<16} {result['protocol']:<22} {means:<6} {counts[0]:<30} {counts[1]:<30} {times}"
 
 
-def _count(tally: dict[str, int], sure: Sequence[float]) -> str:
-    return f"{tally['right']}/{tally['total']} {tally['right'] / tally['total']:.3f} [{sure[0]:.3f}, {sure[1]:.3f}]"
+def _count(count: dict[str, int], ends: Sequence[float]) -> str:
+    return f"{count['right']}/{count['total']} {count['right'] / count['total']:.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Where:
-    """Where folds run and are kept: see pool.results. cache None: nowhere. kept: none is run, those kept must do."""
+    """Where folds run and are kept: see parallel.results. cache None: nowhere. kept: run none, use only kept ones."""
 
     jobs: int = -1
     scheduler: str = ""
@@ -167,7 +167,7 @@ def folds(
 ) -> Iterator[tuple[Any, Fold]]:
     """Every task's Fold: those in the cache first, then the others as they finish.
 
-    data: digest of `sweeps`. kind: what the tasks' methods are given of them.
+    data: digest of `sweeps`. kind: the input of the tasks' methods.
     """
     paths = {name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache}
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
@@ -180,5 +180,5 @@ def folds(
         yield name, fold
 
 
-def _run(named: tuple[Any, FoldTask], sweeps: Dataset, given: Array) -> Fold:
-    return run(named[1], sweeps, given)
+def _run(named: tuple[Any, FoldTask], sweeps: Dataset, inputs: Array) -> Fold:
+    return run(named[1], sweeps, inputs)

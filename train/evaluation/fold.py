@@ -1,6 +1,6 @@
-"""The room of one fold. In: a method, sweeps to train on and sweeps to test on. Out: a Fold, with logits and times.
+"""One fold. In: a method, sweeps to train on and sweeps to test on. Out: a Fold, with logits and times.
 
-A fold is kept under a name made of all that it depends on, the data, the code and the versions too.
+A fold is kept under a fingerprint of all that it depends on: the data, the code and the versions of libraries too.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from train.models import methods
 
 Array = NDArray[Any]
 TIMED_SWEEPS = 24
-"""How many test sweeps go one by one through the box's own session, for their time and to compare their labels."""
+"""How many test sweeps go one by one through an inference session of the box, for their time and to compare their labels."""
 NOT_COUNTED = (
     "train.data.readers",
     "train.data.sets",
@@ -40,10 +40,10 @@ NOT_COUNTED = (
     "train.metrics.score",
     "train.models.methods",
 )
-"""Modules that methods use and that do not decide what a fold gives: their code may change and the fold still holds. Of
-the sets the data themselves count."""
+"""Modules that methods use and that do not change the result of a fold: it stays valid when their code changes. Of the
+sets the data themselves count."""
 COUNTED = ("train", "appliance.signal")
-"""Packages whose code may change what a fold gives. The box's other code is compared with the desktop's by `agreement`."""
+"""Packages whose code may change the result of a fold. `agreement` compares the box's other code with the desktop's."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ class FoldTask:
 
 @dataclass(frozen=True)
 class Fold:
-    """What one fold gave. logits: float32 [n, K] of its test sweeps; ms: of one sweep, features and graph, the median.
+    """The result of one fold. logits: float32 [n, K] of its test sweeps; ms: median time of one sweep, features and graph.
 
     agreement: share of the timed sweeps to which the exported graph gives the same label. ran: what was trained, where
-    the method has more to tell than its name. cost: the training's cross entropy, [iterations, 2], where it has one.
+    the method's name does not say it. cost: the training's cross entropy, [iterations, 2], where it has one.
     forms: logits float32 [n, K] of the same sweeps by the same model in other precisions.
     refused: why the method cannot work with this set; all else is empty then.
     """
@@ -80,20 +80,21 @@ class Fold:
     def save(self, path: Path) -> None:
         """Write the fold, whole or not at all."""
         packed = io.BytesIO()
-        forms = {FORM + name: logits for name, logits in self.forms.items()}
-        np.savez(packed, **{k: np.asarray(getattr(self, k)) for k in PLAIN}, **forms)
+        arrays: dict[str, Any] = {k: np.asarray(getattr(self, k)) for k in PLAIN}
+        arrays |= {FORM + name: logits for name, logits in self.forms.items()}
+        np.savez(packed, **arrays)
         put(path, packed.getvalue(), parents=True)
 
     @classmethod
     def load(cls, path: Path) -> Fold | None:
-        """What `save` wrote; None where there is nothing that can be read."""
+        """What `save` wrote; None where the file is missing or cannot be read."""
         try:
             with np.load(path, allow_pickle=False) as z:
-                held = {k: z[k] for k in PLAIN}
+                arrays = {k: z[k] for k in PLAIN}
                 forms = {k.removeprefix(FORM): z[k] for k in z.files if k.startswith(FORM)}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
-        plain = {k: v.item() if v.ndim == 0 else v for k, v in held.items()}
+        plain = {k: v.item() if v.ndim == 0 else v for k, v in arrays.items()}
         return cls(**plain, forms=forms)
 
 
@@ -101,55 +102,55 @@ FORM = "form "
 PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
 
 
-def run(task: FoldTask, sweeps: Dataset, given: Array) -> Fold:
-    """Train on one side, answer on the other. `given`: what the method's input asks for of all `sweeps`."""
+def run(task: FoldTask, sweeps: Dataset, inputs: Array) -> Fold:
+    """Train on one side, answer on the other. inputs: the method's input of all `sweeps`."""
     (method,) = methods.find([task.method], task.effort)
     start = time.perf_counter()
     try:
-        model = method.train(sweeps.take(task.train), given[task.train], task.seed)
+        model = method.train(sweeps.take(task.train), inputs[task.train], task.seed)
     except FormatError as e:
         return Fold(task.test, np.empty((0, len(sweeps.materials)), np.float32), 0.0, 0.0, 0.0, refused=str(e))
     fit_s = time.perf_counter() - start
     models = {"": model} | dict(getattr(model, "forms", {}))
-    answers = {name: np.asarray(one.logits(given[task.test]), np.float32) for name, one in models.items()}
+    answers = {name: np.asarray(one.logits(inputs[task.test]), np.float32) for name, one in models.items()}
     if not all(np.isfinite(logits).all() for logits in answers.values()):
-        raise FormatError(f"{task.method} gave a logit that is no number; please report it with the set")
+        raise FormatError(f"{task.method} gave a logit that is not finite; please report it with the set")
     logits = answers.pop("")
     some = task.test[np.linspace(0, len(task.test) - 1, min(TIMED_SWEEPS, len(task.test))).astype(int)]
-    ms, labels = _as_the_box(method, model, sweeps, some)
+    ms, labels = _timed_labels(method, model, sweeps, some)
     agreement = float(np.mean(labels == logits[np.searchsorted(task.test, some)].argmax(1)))
     cost = np.asarray(getattr(model, "cost", []), float).reshape(-1, 2)
     return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers)
 
 
-def _as_the_box(method: methods.Method, model: methods.Model, sweeps: Dataset, some: Array) -> tuple[float, Array]:
-    """Median time in ms of one sweep through features and session, and the labels [n] that come out."""
+def _timed_labels(method: methods.Method, model: methods.Model, sweeps: Dataset, some: Array) -> tuple[float, Array]:
+    """Median time in ms of one sweep through features and session, and its labels [n]."""
     graph = session(model.graph().SerializeToString())
     name, times, labels = graph.get_inputs()[0].name, [], []
-    for digits in sweeps.samples[some]:
+    for counts in sweeps.samples[some]:
         start = time.perf_counter()
-        x = kinds.graph_input(method.input, digits, sweeps.rate_hz)
+        x = kinds.graph_input(method.input, counts, sweeps.rate_hz)
         labels.append(int(graph.run(None, {name: x[None]})[0][0].argmax()))
         times.append(time.perf_counter() - start)
     return 1e3 * float(np.median(times)), np.array(labels)
 
 
 def key(task: FoldTask, data: str) -> str:
-    """A name for all that the fold depends on; data: the set's digest."""
+    """The fingerprint of all that the fold depends on. data: the set's digest."""
     (method,) = methods.find([task.method], task.effort)
     about = [data, method.name, method.effort, task.seed, task.train.tolist(), task.test.tolist()]
     return fingerprint(about, methods.module_of(method.name), "train.evaluation.fold")
 
 
 def fingerprint(about: Any, *modules: str) -> str:
-    """32 hex digits of `about` (for JSON), the code of `modules` and of all that these import here, and the libraries."""
+    """32 hex digits of a hash of `about` (for JSON), the code of `modules` and all that they import here, and the libraries."""
     versions = [version(name) for name in ("numpy", "scikit-learn", "torch")]
     return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
 
 
 @cache
 def _code(modules: tuple[str, ...]) -> bytes:
-    """SHA-256 of the code, read once: a process goes on with what it began with."""
+    """SHA-256 of the code, read once: a process continues with the code that it began with."""
     code = hashlib.sha256()
     for module in sorted(reached(modules)):
         code.update(_file(module).read_bytes())
@@ -182,7 +183,7 @@ def _imported(module: str) -> list[str]:
 
 
 def _is_module(name: str) -> bool:
-    """Whether `name` is a module and not a package or something that stands in a module."""
+    """Whether `name` is a module, not a package or an object in a module."""
     try:
         spec = find_spec(name)
     except ModuleNotFoundError:  # its parent is a module, not a package

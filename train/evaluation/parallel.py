@@ -1,8 +1,7 @@
-"""The room where many tasks run at once. In: a function and its tasks. Out: what each gave, in the order of finishing.
+"""Many tasks at once. In: a function and its tasks. Out: the result of each, in the order of finishing.
 
 joblib runs them on this machine; with the address of a Dask scheduler its workers do. There the data is copied to every
-worker first: one that dies takes nothing along but what it was computing, and that is computed again elsewhere.
-(joblib's own Dask backend waits for ever when a task cannot be run any more; so the cluster is asked directly.)
+worker first, so that one that dies loses only the task it was computing, which is computed again elsewhere.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from appliance.core.errors import FormatError
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 CONNECT_S = 10
-"""How long a scheduler may take to answer, and its first worker to come."""
+"""How long a scheduler may take to answer, and its first worker to appear."""
 
 
 def results(
@@ -29,22 +28,22 @@ def results(
 ) -> Iterator[tuple[Task, Result]]:
     """call(task, *shared) of every task, as they finish; each has one thread.
 
-    jobs: processes on this machine, -1 one for each core. scheduler: address of a Dask scheduler, whose workers then do
-    it all. What a task raises is raised here. Raises FormatError where no scheduler or no worker answers, or where
-    workers died so often that a task is given up, or where they lack this project.
+    jobs: processes on this machine, -1 one for each core. scheduler: address of a Dask scheduler, whose workers then run
+    all tasks. What a task raises is raised here. Raises FormatError where no scheduler or no worker answers, where
+    workers died so often that a task is given up, and where they lack this project.
     """
     if scheduler and tasks:
         yield from _on_cluster(call, tasks, shared, scheduler)
     elif tasks:
-        # a process whose libraries have grown is replaced; nothing is lost by it
+        # joblib replaces a process whose memory has grown and warns; no task is lost by that
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
         yield from Parallel(jobs, return_as="generator_unordered", batch_size=1)(
-            delayed(_one)(task, call, *shared) for task in tasks
+            delayed(_run)(task, call, *shared) for task in tasks
         )
 
 
-def _one(task: Task, call: Callable[..., Result], *shared: Any) -> tuple[Task, Result]:
-    with threadpool_limits(1):  # sums in one order everywhere, and no core is fought for
+def _run(task: Task, call: Callable[..., Result], *shared: Any) -> tuple[Task, Result]:
+    with threadpool_limits(1):  # sums in the same order everywhere, and no competition for cores
         return task, call(task, *shared)
 
 
@@ -52,21 +51,22 @@ def _on_cluster(
     call: Callable[..., Result], tasks: Sequence[Task], shared: Sequence[Any], scheduler: str
 ) -> Iterator[tuple[Task, Result]]:
     try:
+        # asked directly: joblib's Dask backend waits for ever when a task cannot be run any more
         from distributed import Client, KilledWorker, wait
     except ImportError as e:
         raise FormatError("--scheduler needs dask; install it with pip install 'palpate-train[dask]'") from e
     try:
-        client = Client(scheduler, timeout=CONNECT_S)
+        client: Any = Client(scheduler, timeout=CONNECT_S)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as e:
         raise FormatError(f"no scheduler answers at {scheduler!r} ({e}); start one with: dask scheduler") from e
     with client:
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
             everywhere = client.scatter(list(shared), broadcast=True) if shared else ()
-            left = {client.submit(_one, task, call, *everywhere, pure=False) for task in tasks}
+            left = {client.submit(_run, task, call, *everywhere, pure=False) for task in tasks}
             while left:
-                with suppress(TimeoutError):  # a look at who is alive
-                    done = wait(left, timeout=CONNECT_S, return_when="FIRST_COMPLETED").done
+                with suppress(TimeoutError):  # from time to time, to see below whether a worker is alive
+                    done = wait(left, timeout=CONNECT_S, return_when="FIRST_COMPLETED").done  # type: ignore[no-untyped-call]
                     yield from (future.result() for future in done)
                     left -= done
                 if left and not client.nthreads():
@@ -85,18 +85,18 @@ def _on_cluster(
 
 
 class Progress:
-    """Tells how far it is and how long it will take, if the rest goes as what has been."""
+    """Logs how many tasks are done and how long the others will take, if they take as long on average."""
 
     def __init__(self, total: int, log: Callable[[str], None]) -> None:
         self._total, self._log, self._done, self._start = total, log, 0, time.monotonic()
 
     def __call__(self, what: str) -> None:
-        """One more is done."""
+        """One more task is done: `what`."""
         self._done += 1
         left = (time.monotonic() - self._start) / self._done * (self._total - self._done)
         self._log(f"{self._done}/{self._total} done, {spoken(left)} left ({what})")
 
 
 def spoken(seconds: float) -> str:
-    """A time as one says it."""
+    """A duration for a person: in s, or in min from 100 s on."""
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

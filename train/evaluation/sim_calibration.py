@@ -1,7 +1,7 @@
-"""The room of the simulator's calibration: the paper's baselines on simulated sweeps, beside its printed accuracies.
+"""Calibration of the simulator: the paper's baselines on simulated sweeps beside its printed accuracies.
 
-In: seeds of simulated worlds. Out: the twenty accuracies of Figs. 4 to 7, how far they lie from the printed ones, and
-what they would be without each of the simulator's effects. No network is looked at: what the CNNs reach is a result.
+In: seeds of simulated worlds. Out: the twenty accuracies of Figs. 4 to 7, how far they are from the printed ones, and
+what they are without each of the simulator's effects. No network is used: what the CNNs reach is a result.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from train.models import baselines, methods
 Array = NDArray[Any]
 METHODS = tuple(baselines.ESTIMATORS)
 ATTACHMENTS = 5
-"""T-HARD is one attachment in the paper. One is luck: a seed's accuracy is the mean over so many."""
+"""T-HARD is one attachment in the paper. A single one varies much: a seed's accuracy is the mean over so many."""
 LAB, REAL, HARD = 0, 1, tuple(range(2, 2 + ATTACHMENTS))
 """The sets that `draw` joins, by their number in the group "set"."""
 
@@ -57,7 +57,8 @@ def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = N
     """
     parts = []
     hard: list[tuple[skin.SetName, int]] = [("T-HARD", ATTACHMENTS * seed + i) for i in range(ATTACHMENTS)]
-    for name, its_seed in [("T-LAB", seed), ("T-REAL", seed), *hard]:
+    named: list[tuple[skin.SetName, int]] = [("T-LAB", seed), ("T-REAL", seed), *hard]
+    for name, its_seed in named:
         samples, labels, position = skin.sweep_set(name, its_seed, per_material, world)
         groups = {"position": position}
         parts.append(sets.Dataset(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, f"{name}:{its_seed}"))
@@ -66,25 +67,26 @@ def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = N
 
 def accuracies(sweeps: sets.Dataset, seed: int) -> Array:
     """The share of right answers, float64 [figures, methods], on what `draw` drew. seed: of the random folds."""
-    given = {kind: methods.model_inputs(kind, sweeps) for kind in ("L", "H")}
+    inputs = {kind: methods.model_inputs(kind, sweeps) for kind in ("L", "H")}
     shares = np.zeros(PRINTED.shape)
     for i, figure in enumerate(FIGURES):
         inside = np.isin(sweeps.group("set"), figure.sets)
         part = sweeps.take(inside)
         folds = Protocol(figure.protocol).folds(part, seed)
         for j, name in enumerate(METHODS):
-            right = _right(baselines.ESTIMATORS[name], given[name[0]][inside], part.labels, folds)
+            right = _right(baselines.ESTIMATORS[name], inputs[name[0]][inside], part.labels, folds)
             shares[i, j] = right / sum(len(test) for _, test in folds)
     return shares
 
 
 def _right(
-    make: Callable[[], baselines.Estimator], seen: Array, labels: Array, folds: Sequence[tuple[Array, Array]]
+    make: Callable[[], baselines.Estimator], features: Array, labels: Array, folds: Sequence[tuple[Array, Array]]
 ) -> int:
-    """How many answers of all folds are right. Labels need no temperature and no graph: the bare estimator is asked."""
-    seen = seen.astype(np.float64)
+    """How many answers of all folds are right, by the estimator itself: labels need no temperature and no graph."""
+    features = features.astype(np.float64)
     return sum(
-        int((make().fit(seen[train], labels[train]).predict(seen[test]) == labels[test]).sum()) for train, test in folds
+        int((make().fit(features[train], labels[train]).predict(features[test]) == labels[test]).sum())
+        for train, test in folds
     )
 
 
@@ -133,13 +135,13 @@ def _match(ours: Array) -> dict[str, Any]:
 
 
 def _standard_error(values: Array) -> Array:
-    """Of the mean over the first axis; nothing is known of it where there is one value only, and it is 0."""
+    """Of the mean over the first axis; 0 where there is one value only, of which nothing is known."""
     error: Array = values.std(axis=0) / np.sqrt(max(len(values) - 1, 1))
     return error
 
 
 def table(result: dict[str, Any]) -> str:
-    """What `measure` gave, for reading: each accuracy as printed, ours with its spread over seeds, and the difference.
+    """What `measure` returned, for a person: each accuracy as printed, ours with its spread over seeds, and the difference.
 
     Below, where effects were switched off: by how much each accuracy changed, in hundredths.
     """
@@ -151,12 +153,14 @@ def table(result: dict[str, Any]) -> str:
             for p, o, s, d in zip(*rows, strict=True)
         ]
         text.append((name.ljust(32) + "".join(cell.ljust(20) for cell in cells)).rstrip())
-    text.append(f"{_spoken(result)}; {len(result['seeds'])} seeds, {result['attachments']} attachments of T-HARD each")
+    text.append(
+        f"{_difference(result)}; {len(result['seeds'])} seeds, {result['attachments']} attachments of T-HARD each"
+    )
     if result["without"]:
         text += ["", ("without".ljust(12) + "".join(name.ljust(28) for name in result["figures"])).rstrip()]
-    for effect, told in result["without"].items():
-        changes = "".join("".join(f"{100 * v:+4.0f}" for v in row).ljust(28) for row in told["change"])
-        text.append(f"{effect:<12}{changes}{_spoken(told)}")
+    for effect, entry in result["without"].items():
+        changes = "".join("".join(f"{100 * v:+4.0f}" for v in row).ljust(28) for row in entry["change"])
+        text.append(f"{effect:<12}{changes}{_difference(entry)}")
     return "\n".join(text)
 
 
@@ -164,5 +168,5 @@ def _short(value: float, form: str) -> str:
     return f"{value:{form}}".replace("0.", ".", 1)
 
 
-def _spoken(match: dict[str, Any]) -> str:
+def _difference(match: dict[str, Any]) -> str:
     return f"largest difference {_short(match['largest'], '.3f')}, mean {_short(match['mean'], '.3f')}"

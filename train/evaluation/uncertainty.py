@@ -1,4 +1,4 @@
-"""The room where certainty is judged. In: Cases of certainty.py. Out: figures, as results.json holds them.
+"""Uncertainty: how far probabilities can be trusted. In: Cases. Out: figures, as results.json holds them.
 
 Calibration, the sequential test, unknown materials, enrolment and early decisions, each on test sweeps that nothing was
 fitted on. Intervals are 95 %, bootstrapped over the places where the skin sat, whose sweeps fail together.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,20 +33,23 @@ from train.models.methods import Effort
 Array = NDArray[Any]
 Json = dict[str, Any]
 BINS = 10
-"""Of the reliability picture and of the calibration error."""
-SURE = (0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
+"""Of the reliability diagram and of the calibration error."""
+WANTED = (0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 MOST_SWEEPS = 5
 """After so many sweeps of an object the answer is final."""
 ENROLLED = (1, 2, 3, 5, 7, 10)
+"""Numbers of sweeps from which a material is enrolled."""
 DRAWS, ORDERS = 500, 20
-"""Of the bootstrap; of the order in which sweeps of one object, or for one enrolment, come."""
+"""Draws of the bootstrap; random orders of the sweeps of one object, or of one enrolment."""
+Trained = tuple[Case, Posthoc]
+"""One training, and what is fitted after it."""
 
 
 def run(
     sweeps: Dataset, test: Dataset | None, protocol: str, method: str, where: Where, log: Log,
     effort: Effort = methods.FULL_EFFORT, seed: int = 1,
 ) -> dict[str, Any]:  # fmt: skip
-    """All figures, as results.json holds them. test: tested on this set; else `protocol` says what is left out.
+    """All figures, as results.json holds them. test: the set that is tested on; without it `protocol` says what is left out.
 
     Raises FormatError where the sets do not fit, or the method cannot do it.
     """
@@ -56,69 +60,75 @@ def run(
     else:
         whole_set = sweeps
     folds = Protocol(protocol).folds(whole_set, seed)
-    held = cases(tasks(whole_set, folds, method, effort, seed), whole_set, where, log)
+    trained = cases(tasks(whole_set, folds, method, effort, seed), whole_set, where, log)
     log("figures")
-    told = figures(held, whole_set.materials, seed)
+    result = figures(trained, whole_set.materials, seed)
     about = {
         "set": sweeps.source, "test": test.source if test else "", "protocol": "train and test" if test else protocol,
-        "method": method, "effort": effort.share, "seed": seed, "folds": len(folds), "trainings": len(held),
+        "method": method, "effort": effort.share, "seed": seed, "folds": len(folds), "trainings": len(trained),
         "sweeps": len(whole_set), "tested": int(sum(len(test) for _, test in folds)), "digest": digest(whole_set),
         "materials": list(whole_set.materials), "format": str(whole_set.format),
         "took_s": round(time.monotonic() - start, 1),
     }  # fmt: skip
-    return about | provenance() | told
+    return about | provenance() | result
 
 
 def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
-    """All of it; what needs a material left out is missing where there are but two."""
-    done = [(case, case.posthoc()) for case in trained]
-    full = [one for one in done if one[0].left_out < 0]
-    told = {"calibration": calibration(full), "sequence": sequence(full, seed), "early": early(full)}
-    partial = [one for one in done if one[0].left_out >= 0]
-    if partial:
-        told["unknown"] = unknown(partial, materials)
-        told["enrolment"] = enrolment(full, partial, materials, seed)
-    return told
+    """All figures; those that need a material left out are missing where there are only two."""
+    fitted = [(case, case.posthoc()) for case in trained]
+    full = [one for one in fitted if one[0].left_out < 0]
+    result = {"calibration": calibration(full), "sequence": sequence(full, seed), "early": early(full)}
+    without = [one for one in fitted if one[0].left_out >= 0]
+    if without:
+        result["unknown"] = unknown(without, materials)
+        result["enrolment"] = enrolment(full, without, materials, seed)
+    return result
 
 
-def calibration(full: Sequence[tuple[Case, Posthoc]]) -> Json:
+def calibration(full: Sequence[Trained]) -> Json:
     """Expected calibration error and reliability before (LDA's own posteriors) and after the temperature."""
     labels, places = _joined(full, "labels"), _places(full)
-    told: Json = {"n": len(labels), "temperature": [round(done.temperature, 2) for _, done in full]}
-    for name, heat in (("before", True), ("after", False)):
+    result: Json = {"n": len(labels), "temperature": [round(done.temperature, 2) for _, done in full]}
+    for name, undo in (("before", True), ("after", False)):
         logits = np.concatenate(
-            [done.logits(case.new[:, -1]) * (done.temperature if heat else 1) for case, done in full]
+            [done.logits(case.new[:, -1]) * (done.temperature if undo else 1) for case, done in full]
         )
         p = softmax(logits)
-        sure, right = p.max(1), p.argmax(1) == labels
-        low, high = _spread(lambda i, s=sure, r=right: error(s[i], r[i]), places)
-        told[name] = {"error": round(error(sure, right), 4), "low": low, "high": high, "bins": reliability(sure, right)}
-    told["accuracy"] = _accuracy(right, places)
-    return told
+        confidence, right = p.max(1), p.argmax(1) == labels
+        low, high = _bootstrap(partial(_error_of, confidence, right), places)
+        result[name] = {"error": round(error(confidence, right), 4), "low": low, "high": high,
+                        "bins": reliability(confidence, right)}  # fmt: skip
+    result["accuracy"] = _accuracy(right, places)
+    return result
 
 
-def error(sure: Array, right: Array) -> float:
+def error(confidence: Array, right: Array) -> float:
     """Expected calibration error (Naeini et al. 2015): mean over sweeps of |accuracy - probability| of their bin."""
-    held = reliability(sure, right)
-    return float(sum(b["n"] * abs(b["right"] - b["said"]) for b in held) / max(sum(b["n"] for b in held), 1))
+    bins = reliability(confidence, right)
+    return float(sum(b["n"] * abs(b["right"] - b["said"]) for b in bins) / max(sum(b["n"] for b in bins), 1))
 
 
-def reliability(sure: Array, right: Array) -> list[Json]:
-    """Of each bin of the highest probability [n] that is not empty: what was said, what was right, of how many."""
-    which = np.minimum((sure * BINS).astype(int), BINS - 1)
+def _error_of(confidence: Array, right: Array, some: Array) -> float:
+    return error(confidence[some], right[some])
+
+
+def reliability(confidence: Array, right: Array) -> list[Json]:
+    """Of each bin of the highest probability [n] that is not empty: its mean (`said`), the share right, the number."""
+    which = np.minimum((confidence * BINS).astype(int), BINS - 1)
     some = [(which == b) for b in range(BINS) if (which == b).any()]
-    return [{"said": round(float(sure[i].mean()), 4), "right": round(float(right[i].mean()), 4), "n": int(i.sum())}
+    return [{"said": round(float(confidence[i].mean()), 4), "right": round(float(right[i].mean()), 4), "n": int(i.sum())}
             for i in some]  # fmt: skip
 
 
-def sequence(full: Sequence[tuple[Case, Posthoc]], seed: int) -> Json:
-    """Mean sweeps against accuracy for wanted probabilities, sweeps of one object fused until then or to MOST_SWEEPS.
+def sequence(full: Sequence[Trained], seed: int) -> Json:
+    """Mean number of sweeps against accuracy for WANTED probabilities: sweeps of one object are fused until the probability
+    is reached, or up to MOST_SWEEPS.
 
-    "same place": all sweeps of one attachment, whose errors go together; "several places": from anywhere in the test.
+    "same place": all sweeps of one attachment, whose errors are correlated; "several places": from anywhere in the test.
     """
     log_p = np.log(np.maximum(softmax(np.concatenate([d.logits(c.new[:, -1]) for c, d in full])), LEAST_PROBABILITY))
     labels, places = _joined(full, "labels"), _places(full)
-    rng, told = np.random.default_rng(seed), {}
+    rng, result = np.random.default_rng(seed), {}
     for name, objects in (("same place", labels + places * (labels.max() + 1)), ("several places", labels)):
         members = [np.flatnonzero(objects == o) for o in np.unique(objects)]
         repeat = max(ORDERS, 400 // len(members))
@@ -129,24 +139,24 @@ def sequence(full: Sequence[tuple[Case, Posthoc]], seed: int) -> Json:
         fused = softmax(log_p[order].cumsum(axis=1))  # [objects, MOST_SWEEPS, K]
         truth = labels[order[:, 0]]
         clusters = places[order[:, 0]] if name == "same place" else truth
-        told[name] = {"objects": len(order), "points": [_stopped(fused, truth, clusters, p) for p in (0.0, *SURE)]}
-    return told
+        result[name] = {"objects": len(order), "points": [_stopped(fused, truth, clusters, p) for p in (0.0, *WANTED)]}
+    return result
 
 
 def _stopped(fused: Array, truth: Array, clusters: Array, wanted: float) -> Json:
-    """What the sequential test gives where it stops at the probability `wanted`, or after the last sweep."""
+    """The sequential test's result where it stops at the probability `wanted`, or after the last sweep."""
     enough = fused.max(2) >= wanted
-    sure = enough.any(axis=1)
+    decided = enough.any(axis=1)
     enough[:, -1] = True
     stop = enough.argmax(axis=1)
     named = fused[np.arange(len(fused)), stop].argmax(1)
     right = named == truth
-    return {"wanted": wanted, "sweeps": round(float(stop.mean() + 1), 3), "decided": round(float(sure.mean()), 4),
-            "right_of_decided": round(float(right[sure].mean()), 4) if sure.any() else None,
+    return {"wanted": wanted, "sweeps": round(float(stop.mean() + 1), 3), "decided": round(float(decided.mean()), 4),
+            "right_of_decided": round(float(right[decided].mean()), 4) if decided.any() else None,
             **_accuracy(right, clusters)}  # fmt: skip
 
 
-def early(full: Sequence[tuple[Case, Posthoc]]) -> Json:
+def early(full: Sequence[Trained]) -> Json:
     """Accuracy against the mean share of the sweep: by the rules as found in training, by others, always at a tenth."""
     labels, places = _joined(full, "labels"), _places(full)
     p = np.concatenate([done.probabilities(case.new) for case, done in full])
@@ -156,7 +166,7 @@ def early(full: Sequence[tuple[Case, Posthoc]]) -> Json:
                for (_, done), p_ in zip(full, _parted(p, full), strict=True)]  # fmt: skip
     named, share = (np.concatenate(part) for part in zip(*by_rule, strict=True))
     lost = whole.astype(float) - (named == labels)
-    low, high = _spread(lambda i: float(lost[i].mean()), places)
+    low, high = _bootstrap(partial(_mean_of, lost), places)
     rules = [{"least": r.early.least[0] if r.early else None, "agree": r.early.agree if r.early else None, "why": r.why,
               "n": r.n} for r in (done.rule for _, done in full)]  # fmt: skip
     curves = {}
@@ -172,35 +182,42 @@ def early(full: Sequence[tuple[Case, Posthoc]]) -> Json:
     }  # fmt: skip
 
 
-def unknown(partial: Sequence[tuple[Case, Posthoc]], materials: Sequence[str]) -> Json:
-    """Leave one material out: AUROC of known test sweeps against those of the material, by several scores; what the
-    limit found in training keeps, and what of the unknown it lets through as known."""
-    told: Json = {"materials": {}}
+def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
+    """Leave one material out: AUROC of known test sweeps against those of the material, by several scores; the share of
+    known sweeps that the limit found in training keeps, and of unknown ones that it lets through as known."""
+    materials_of: dict[str, Json] = {}
     every: dict[str, list[float]] = {}
-    for k in sorted({case.left_out for case, _ in partial}):
-        held = [one for one in partial if one[0].left_out == k]
+    for k in sorted({case.left_out for case, _ in without}):
+        held = [one for one in without if one[0].left_out == k]
         known, places = np.concatenate([case.known() for case, _ in held]), _places(held)
-        rows = {name: np.concatenate([score(case, done) for case, done in held]) for name, score in SCORES.items()}
-        ours = rows["distance"]
-        low, high = _spread(lambda i, s=ours, m=known: auroc(s[i][m[i]], s[i][~m[i]]), places)
+        scores = {name: np.concatenate([score(case, done) for case, done in held]) for name, score in SCORES.items()}
+        ours = scores["distance"]
+        low, high = _bootstrap(partial(_auroc_of, ours, known), places)
         at = np.quantile(ours[known], 0.95)
-        told["materials"][materials[k]] = {
+        materials_of[materials[k]] = {
             "auroc": round(auroc(ours[known], ours[~known]), 4), "low": low, "high": high,
             "kept": round(float(np.mean(ours[known] <= 1)), 4), "false_known": round(float(np.mean(ours[~known] <= 1)), 4),
             "false_known_at_95": round(float(np.mean(ours[~known] <= at)), 4),
             "known": int(known.sum()), "unknown": int((~known).sum()),
         }  # fmt: skip
-        for name, row in rows.items():
+        for name, row in scores.items():
             every.setdefault(name, []).append(auroc(row[known], row[~known]))
-    rows = list(told["materials"].values())
-    told["mean"] = {name: round(float(np.mean([row[name] for row in rows])), 4)
-                    for name in ("auroc", "kept", "false_known", "false_known_at_95")}  # fmt: skip
-    told["scores"] = {name: round(float(np.mean(values)), 4) for name, values in every.items()}
-    return told
+    mean = {name: round(float(np.mean([row[name] for row in materials_of.values()])), 4)
+            for name in ("auroc", "kept", "false_known", "false_known_at_95")}  # fmt: skip
+    means = {name: round(float(np.mean(values)), 4) for name, values in every.items()}
+    return {"materials": materials_of, "mean": mean, "scores": means}
+
+
+def _auroc_of(scores: Array, known: Array, some: Array) -> float:
+    return auroc(scores[some][known[some]], scores[some][~known[some]])
+
+
+def _mean_of(values: Array, some: Array) -> float:
+    return float(values[some].mean())
 
 
 def _of_trunk(case: Case, done: Posthoc) -> Array:
-    """Squared distance in the trained features alone: all of them; the same for all where there are none."""
+    """Squared distance in the trained features alone; the same for all sweeps where there are none."""
     if not (size := case.seen.shape[2] - case.fixed):
         return np.zeros(len(case.new))
     return embed(case.seen[:, -1, :size], case.seen_labels, size).strangeness(case.new[:, -1, :size])
@@ -213,40 +230,38 @@ SCORES: dict[str, Callable[[Case, Posthoc], Array]] = {
         case.seen[:, -1], case.seen_labels).strangeness(case.new[:, -1]),
     "highest probability": lambda case, done: -softmax(done.logits(case.new[:, -1])).max(1),
 }  # fmt: skip
-"""Each grows with how little a sweep is like what was trained. Limits of several folds differ: the first is in units of
-the limit."""
+"""Each is larger for a sweep that is less like the training sweeps. Limits of several folds differ: the first score is in
+units of the limit."""
 
 
-def enrolment(
-    full: Sequence[tuple[Case, Posthoc]], partial: Sequence[tuple[Case, Posthoc]], materials: Sequence[str], seed: int
-) -> Json:
-    """Leave a material out and enrol it from some sweeps of one place: accuracy of all classes (mean of each one's)
-    there and elsewhere, as a share of what the model gets that was trained on all; what the old classes lose."""
+def enrolment(full: Sequence[Trained], without: Sequence[Trained], materials: Sequence[str], seed: int) -> Json:
+    """Leave a material out and enrol it from some sweeps of one place: balanced accuracy of all classes there and
+    elsewhere, as a share of that of the model trained on all; and the accuracy that the old classes lose."""
     whole = {case.fold: (case, done) for case, done in full}
     rows: dict[tuple[str, int], list[tuple[float, ...]]] = {}
-    for case, done in partial:
+    for case, done in without:
         rng = np.random.default_rng([seed, case.fold, case.left_out])
         for n, where, row in _enrolled(case, done, *whole[case.fold], rng):
             rows.setdefault((where, n), []).append((case.left_out, *row))
-    told: Json = {"points": []}
-    for (where, n), held in sorted(rows.items()):
-        values = np.array(held)
-        of, by_material = values[:, 1] / values[:, 2], values[:, 0].astype(int)
-        low, high = _spread(lambda i, of=of: float(of[i].mean()), by_material)
-        told["points"].append({
-            "where": where, "sweeps": n, "share": round(float(of.mean()), 4), "low": low, "high": high,
+    points: list[Json] = []
+    for (where, n), row_list in sorted(rows.items()):
+        values = np.array(row_list)
+        share, by_material = values[:, 1] / values[:, 2], values[:, 0].astype(int)
+        low, high = _bootstrap(partial(_mean_of, share), by_material)
+        points.append({
+            "where": where, "sweeps": n, "share": round(float(share.mean()), 4), "low": low, "high": high,
             "accuracy": round(float(values[:, 1].mean()), 4), "trained": round(float(values[:, 2].mean()), 4),
             "new": round(float(values[:, 3].mean()), 4), "old_lost": round(float(values[:, 4].mean()), 4),
             "draws": len(values),
-            "by_material": {materials[k]: round(float(of[by_material == k].mean()), 4) for k in np.unique(by_material)},
+            "by_material": {materials[k]: round(float(share[by_material == k].mean()), 4) for k in np.unique(by_material)},
         })  # fmt: skip
-    return told
+    return {"points": points}
 
 
 def _enrolled(
     case: Case, done: Posthoc, whole: Case, trained: Posthoc, rng: np.random.Generator
 ) -> Iterator[tuple[int, str, tuple[float, float, float, float]]]:
-    """(sweeps, where, (accuracy, that of the whole model, recall of the new one, what the old lose)) of random draws."""
+    """Of random draws: (sweeps, where, (accuracy, that of the whole model, recall of the new one, loss of the old))."""
     z, k = done.embedding(case.new[:, -1]), case.left_out
     as_trained = trained.logits(whole.new[:, -1]).argmax(1)
     names = np.append(np.delete(np.arange(case.labels.max() + 1), k), k)  # the box puts the new label last
@@ -272,8 +287,8 @@ def _enrolled(
 
 
 def enrolled_logits(embedding: Embedding, z: Array, sweeps: Array) -> Array:
-    """Logits [n, K + 1], not cooled, of embeddings z [n, r] with a label more, enrolled from `sweeps` [m, r] as the box
-    does it."""
+    """Logits [n, K + 1], before temperature scaling, of embeddings z [n, r] with one label more, enrolled from `sweeps`
+    [m, r] as the box enrols it."""
     enrolled = joined(embedding.classes(), sweeps)
     logits: Array = z @ enrolled.means.T + enrolled.bias
     return logits
@@ -283,17 +298,17 @@ def _balanced(named: Array, labels: Array) -> float:
     return float(np.mean([np.mean(named[labels == k] == k) for k in np.unique(labels)]))
 
 
-def _joined(held: Sequence[tuple[Case, Posthoc]], name: str) -> Array:
+def _joined(held: Sequence[Trained], name: str) -> Array:
     return np.concatenate([getattr(case, name) for case, _ in held])
 
 
-def _places(held: Sequence[tuple[Case, Posthoc]]) -> Array:
+def _places(held: Sequence[Trained]) -> Array:
     """Where the skin sat, from 0 on."""
     places: Array = np.unique(_joined(held, "places"), return_inverse=True)[1]
     return places
 
 
-def _parted(rows: Array, held: Sequence[tuple[Case, Posthoc]]) -> list[Array]:
+def _parted(rows: Array, held: Sequence[Trained]) -> list[Array]:
     """`rows` of all cases, case by case."""
     return np.split(rows, np.cumsum([len(case.labels) for case, _ in held])[:-1])
 
@@ -307,8 +322,8 @@ def _accuracy(right: Array, clusters: Array) -> Json:
     return {"accuracy": round(float(right.mean()), 4), "low": low, "high": high}
 
 
-def _spread(figure: Callable[[Array], float], clusters: Array) -> tuple[float, float]:
-    """The 95 % interval of `figure` (of sweep numbers) where whole clusters [n] are drawn with replacement."""
+def _bootstrap(figure: Callable[[Array], float], clusters: Array) -> tuple[float, float]:
+    """The 95 % interval of `figure` (of sweep numbers), by a bootstrap of whole clusters [n]."""
     members = [np.flatnonzero(clusters == c) for c in np.unique(clusters)]
     rng, drawn = np.random.default_rng(0), []
     for _ in range(DRAWS):

@@ -1,7 +1,7 @@
-"""The room of certainty: how sure the box may be. In: a sweep set, a protocol, a method. Out: figures, pictures, a page.
+"""Trainings for the study of uncertainty. In: a sweep set, its folds, a method. Out: Cases, kept in a cache.
 
-A Case is one training: all materials, or all but one, and what its trunk makes of every sweep, kept in a cache. All
-figures come from Cases without training again. What a rule, a limit or a temperature is found on is never tested on.
+A Case is one training, on all materials or all but one, with the features of every sweep. All figures are computed from
+Cases without training again. Sweeps that a rule, a limit or a temperature is fitted on are never tested on.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from train.evaluation.fold import fingerprint
 from train.models import methods
 from train.models.compact.fit import Fit
 from train.models.methods import Effort
-from train.onnx_tools.graph_builder import run as through
+from train.onnx_tools.graph_builder import run as run_graph
 
 Array = NDArray[Any]
 Log = Callable[[str], None]
-NOBODY = -1
-"""The material left out where none is."""
+NONE_LEFT_OUT = -1
+"""Stands for the material left out where none is."""
 
 
 @dataclass(frozen=True)
 class CaseTask:
-    """One training. train, test: numbers of sweeps; left_out: a material, or NOBODY."""
+    """One training. train, test: numbers of sweeps; left_out: a material, or NONE_LEFT_OUT."""
 
     method: str
     effort: Effort
@@ -44,16 +44,18 @@ class CaseTask:
     fold: int
     train: Array
     test: Array
-    left_out: int = NOBODY
+    left_out: int = NONE_LEFT_OUT
 
 
 @dataclass(frozen=True)
 class Case:
-    """What one training gave. left_out: the material that it did not see. fixed: so many features nobody trained, last.
+    """The result of one training. left_out: the material it did not see. fixed: number of features that were not trained;
+    they are the last ones.
 
     seen: features [N, 10, F] of the tenths of the training sweeps, whose materials are numbered `seen_labels` [N] from
     0 on without the one left out; seen_groups [N]: positions or recordings; judged: bool [N], those that the trunk did
-    not see, which may judge. copied: features [M, F] of changed copies of the others, of copied_labels and copied_groups [M].
+    not see, which may judge. copied: features [M, F] of augmented copies of the others, of copied_labels and
+    copied_groups [M].
     new, labels, places: features of test sweeps, the set's labels, and where the skin sat.
     """
 
@@ -73,22 +75,23 @@ class Case:
 
     def known(self) -> Array:
         """bool [n], the test sweeps of materials that were trained."""
-        return self.labels != self.left_out
+        known: Array = self.labels != self.left_out
+        return known
 
     def posthoc(self) -> Posthoc:
-        """What is put on the trunk of this training."""
+        """What is fitted on the trunk of this training."""
         copies = AugmentedCopies(self.copied, self.copied_labels, self.copied_groups)
         return fit_posthoc(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies)
 
     def numbered(self) -> Array:
         """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out mean nothing."""
-        if self.left_out == NOBODY:
+        if self.left_out == NONE_LEFT_OUT:
             return self.labels
         return self.labels - (self.labels > self.left_out)
 
 
 def learn(task: CaseTask, sweeps: Dataset) -> Case:
-    """Train, and look at every sweep with the trunk that came out.
+    """Train, and compute the features of every sweep with the trained trunk.
 
     Raises FormatError where the method is none of the compact family, or cannot work with this set.
     """
@@ -97,15 +100,15 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         raise FormatError(f"method {task.method!r} gives no features of tenths; use compact or one of its family")
     kept = task.train[sweeps.labels[task.train] != task.left_out]
     part = sweeps.take(kept)
-    if task.left_out != NOBODY:
+    if task.left_out != NONE_LEFT_OUT:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).made  # type: ignore[attr-defined]
-    *looked, fixed, copies = posthoc_inputs(made)
+    seen, seen_labels, seen_groups, judged, fixed, copies = posthoc_inputs(made)
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
-        task.left_out, task.fold, fixed, *looked, copies.features, copies.labels, copies.groups,
-        through(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
+        task.left_out, task.fold, fixed, seen, seen_labels, seen_groups, judged, copies.features, copies.labels, copies.groups,
+        run_graph(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
     )  # fmt: skip
 
 
@@ -113,29 +116,29 @@ def tasks(
     sweeps: Dataset, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int
 ) -> list[CaseTask]:
     """Every fold with all materials, and without each of them in turn where at least two remain."""
-    out = [NOBODY, *(range(len(sweeps.materials)) if len(sweeps.materials) > 2 else [])]
+    out = [NONE_LEFT_OUT, *(range(len(sweeps.materials)) if len(sweeps.materials) > 2 else [])]
     return [CaseTask(method, effort, seed, i, *fold, left) for left in out for i, fold in enumerate(folds)]
 
 
 def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -> list[Case]:
-    """The Case of each task in their order: kept ones from the cache, the others trained. log: is told how far it is."""
-    data, held = digest(sweeps), {}
+    """The Case of each task in their order: kept ones from the cache, the others trained. log: receives the progress."""
+    data, done = digest(sweeps), {}
     keys = [fingerprint([data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
                         methods.module_of(t.method), "train.calibration.posthoc") for t in wanted]  # fmt: skip
     for i, key in enumerate(keys):
         if where.cache and (case := _load(where.cache / f"{key}.case.npz")):
-            held[i] = replace(case, fold=wanted[i].fold)
-    left = [(i, task) for i, task in enumerate(wanted) if i not in held]
+            done[i] = replace(case, fold=wanted[i].fold)
+    left = [(i, task) for i, task in enumerate(wanted) if i not in done]
     if left and where.kept:
         raise FormatError(f"{len(left)} of {len(wanted)} trainings are not kept; run without --kept first")
     progress = parallel.Progress(len(left), log)
     for (i, task), case in parallel.results(_learn, left, (sweeps,), where.jobs, where.scheduler):
-        held[i] = case
+        done[i] = case
         if where.cache:
             _save(case, where.cache / f"{keys[i]}.case.npz")
-        out = "" if task.left_out == NOBODY else f" without {sweeps.materials[task.left_out]}"
+        out = "" if task.left_out == NONE_LEFT_OUT else f" without {sweeps.materials[task.left_out]}"
         progress(f"{task.method}, fold {task.fold + 1}{out}")
-    return [held[i] for i in range(len(wanted))]
+    return [done[i] for i in range(len(wanted))]
 
 
 def _learn(numbered: tuple[int, CaseTask], sweeps: Dataset) -> Case:
@@ -144,14 +147,15 @@ def _learn(numbered: tuple[int, CaseTask], sweeps: Dataset) -> Case:
 
 def _save(case: Case, path: Path) -> None:
     packed = io.BytesIO()
-    np.savez(packed, **{k: np.asarray(getattr(case, k)) for k in Case.__dataclass_fields__})
+    arrays: dict[str, Any] = {k: np.asarray(getattr(case, k)) for k in Case.__dataclass_fields__}
+    np.savez(packed, **arrays)
     put(path, packed.getvalue(), parents=True)
 
 
 def _load(path: Path) -> Case | None:
     try:
         with np.load(path, allow_pickle=False) as z:
-            held = {k: z[k] for k in Case.__dataclass_fields__}
+            arrays = {k: z[k] for k in Case.__dataclass_fields__}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    return Case(**{k: v.item() if v.ndim == 0 else v for k, v in held.items()})
+    return Case(**{k: v.item() if v.ndim == 0 else v for k, v in arrays.items()})

@@ -179,7 +179,7 @@ def _check(scene: Scene, told: Mapping[str, Any]) -> None:
     for name in scene.methods:
         if name not in known:
             raise FormatError(f"{file}: method {name!r} is unknown{_near(name, known)}")
-    digital = {s.name: s for s in corruptions.STRESSES if s.only != "simulated"}
+    digital = {s.name: s for s in corruptions.CORRUPTIONS if s.only != "simulated"}
     for name, severity in scene.stress.items():
         if name not in digital:
             raise FormatError(

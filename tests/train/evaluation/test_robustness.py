@@ -25,8 +25,8 @@ from train.evaluation.evaluate import Where
 from train.models import methods
 from train.models.methods import Method, model_inputs
 
-BY_NAME = {s.name: s for s in corruptions.STRESSES}
-DIGITAL = [s.name for s in corruptions.STRESSES if s.only != "simulated"]
+BY_NAME = {s.name: s for s in corruptions.CORRUPTIONS}
+DIGITAL = [s.name for s in corruptions.CORRUPTIONS if s.only != "simulated"]
 
 
 def small(kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0) -> Dataset:
@@ -126,8 +126,8 @@ def test_stresses_by_name():
         corruptions.find(["cold"])
     physical = {"shift-rows", "turn", "force-down", "force-up", "speed-down", "speed-up", "window"}
     instead = {"shift-grid", "turn-grid", "window-held", "stretch", "shorten"}
-    assert {s.name for s in corruptions.usual(scene())} == set(BY_NAME) - instead
-    assert {s.name for s in corruptions.usual(EvaluationSweeps(small()))} == set(BY_NAME) - physical
+    assert {s.name for s in corruptions.applicable(scene())} == set(BY_NAME) - instead
+    assert {s.name for s in corruptions.applicable(EvaluationSweeps(small()))} == set(BY_NAME) - physical
 
 
 def test_the_scene_is_what_the_simulator_draws():
@@ -354,7 +354,9 @@ def test_the_table_says_where_each_falls():
 
 def test_the_table_tells_what_becomes_of_sweeps_that_tell_nothing():
     """How many methods do what, and the box's status where it is known."""
-    result = robustness.merge([robustness.one(FAKE, small(), EvaluationSweeps(small()), corruptions.find(["hum"]), 0)])
+    result = robustness.merge(
+        [robustness.evaluate_method(FAKE, small(), EvaluationSweeps(small()), corruptions.find(["hum"]), 0)]
+    )
     lines = robustness.table(
         result | {"box": dict.fromkeys(("constant", "saturated"), "x") | {"one-frame": "short", "silent": "no-contact"}}
     ).splitlines()
@@ -365,8 +367,8 @@ def test_the_table_tells_what_becomes_of_sweeps_that_tell_nothing():
 def test_one_task_travels_and_counts():
     """A task can be sent away and comes back as JSON; its numbers are those counted by hand."""
     sweeps, trial = small(), EvaluationSweeps(small())
-    sent = pickle.loads(pickle.dumps((FAKE, sweeps, trial, corruptions.STRESSES, 0)))
-    done = robustness.one(*sent[:3], corruptions.find(["gain-up", "hum"]), 0)
+    sent = pickle.loads(pickle.dumps((FAKE, sweeps, trial, corruptions.CORRUPTIONS, 0)))
+    done = robustness.evaluate_method(*sent[:3], corruptions.find(["gain-up", "hum"]), 0)
     assert json.loads(json.dumps(done)) == done
     assert done["curves"]["gain-up"]["right"][0] == 12
     up = BY_NAME["gain-up"].apply(trial, 0.5, 0)
@@ -403,10 +405,10 @@ def test_all_usual_stresses_by_default():
 
     method = Method("spy", "", "L", lambda *_: Spy())
     trial = EvaluationSweeps(small())
-    done = robustness.one(method, small(), trial, None, 6)
-    assert list(done["curves"]) == [s.name for s in corruptions.usual(trial)]
+    done = robustness.evaluate_method(method, small(), trial, None, 6)
+    assert list(done["curves"]) == [s.name for s in corruptions.applicable(trial)]
     assert seen[0].shape == (12, 3)
-    first = corruptions.usual(trial)[0]
+    first = corruptions.applicable(trial)[0]
     mild = replace(small(), samples=first.apply(trial, first.severities[1], 6))
     assert (seen[1] == model_inputs("L", mild)).all()
     assert (seen[1] != seen[0]).any()
@@ -415,9 +417,11 @@ def test_all_usual_stresses_by_default():
 def test_what_cannot_be_done_is_said():
     """A set of another kind is the caller's mistake; a method that refuses its set is a result."""
     with pytest.raises(FormatError, match=r"small .*3x3 uint8.* is not of the kind of small .*3x3 int16"):
-        robustness.one(FAKE, small(), EvaluationSweeps(small("uint8")), None, 0)
+        robustness.evaluate_method(FAKE, small(), EvaluationSweeps(small("uint8")), None, 0)
     short = small(shape=(4, 10, 3, 3))
-    entry = robustness.merge([robustness.one(FAKE, short, EvaluationSweeps(short), None, 0)])["methods"]["fake"]
+    entry = robustness.merge([robustness.evaluate_method(FAKE, short, EvaluationSweeps(short), None, 0)])["methods"][
+        "fake"
+    ]
     assert entry["refused"] == "a window of 10 frames is too short; use at least 20"
     assert (entry["curves"], entry["clean"]) == ({}, None)
 
@@ -432,16 +436,16 @@ def test_an_answer_that_is_no_number_is_wrong():
             return logits
 
     model = Broken(learn(small(), small().samples, 0).means)
-    done = robustness.score(FAKE, model, EvaluationSweeps(small()), corruptions.find(["dead"]), 0)
+    done = robustness.evaluate_model(FAKE, model, EvaluationSweeps(small()), corruptions.find(["dead"]), 0)
     assert done["curves"]["dead"]["right"][0] == 9
     assert done["curves"]["dead"]["broken"] == [3] * 5
-    assert robustness.trouble(FAKE, model, EvaluationSweeps(small()))["silent"] == "not finite"
+    assert robustness.uninformative_answers(FAKE, model, EvaluationSweeps(small()))["silent"] == "not finite"
 
 
 def test_trouble_has_a_name():
     """Sound methods stay finite or refuse; what is no digit never reaches them; a crash is told, and the worst wins."""
     model = learn(small(), small().samples, 0)
-    found = robustness.trouble(FAKE, model, EvaluationSweeps(small("float32")))
+    found = robustness.uninformative_answers(FAKE, model, EvaluationSweeps(small("float32")))
     assert [found[k] for k in ("silent", "constant", "saturated")] == ["finite"] * 3
     assert found["one-frame"].startswith("refused: 3x3 float32 at 100 Hz, window 1 instead of")
     for name in ("nan", "inf"):
@@ -451,7 +455,7 @@ def test_trouble_has_a_name():
         def logits(self, given: np.ndarray) -> np.ndarray:
             raise ZeroDivisionError("no contact")
 
-    crashed = robustness.trouble(FAKE, Crash(), EvaluationSweeps(small()))
+    crashed = robustness.uninformative_answers(FAKE, Crash(), EvaluationSweeps(small()))
     assert crashed["silent"] == "crashed: ZeroDivisionError: no contact"
     assert set(crashed) == {"silent", "constant", "one-frame", "saturated"}
     both = [
@@ -463,7 +467,7 @@ def test_trouble_has_a_name():
 
 def test_the_box_answers_with_a_status(default_bundle: bundle.Bundle):
     """Through recorder and classifier: what tells nothing is refused by name, and a sound sweep is not."""
-    assert robustness.box_trouble(default_bundle) == {
+    assert robustness.box_answers(default_bundle) == {
         "silent": "no-contact", "constant": "stuck-taxel", "one-frame": "short", "saturated": "saturated",
     }  # fmt: skip
     assert robustness.answer(default_bundle, default_bundle.golden[0]).status is Status.OK
@@ -486,7 +490,7 @@ def test_a_nan_from_a_float_skin_is_never_an_answer():
     manifest = bundle.Manifest("mean", "1", form, "raw", ("a", "b"), limits, {})
     nothing = np.zeros((1, 40, 3, 3), np.float32)
     float_bundle = bundle.Bundle(manifest, "mean", model.SerializeToString(), nothing, np.zeros((1, 2), np.float32))
-    found = robustness.box_trouble(float_bundle)
+    found = robustness.box_answers(float_bundle)
     assert found["silent"] == "no-contact"
     assert found["nan"] == "dead-taxel"
     assert found["inf"] == "dead-taxel"

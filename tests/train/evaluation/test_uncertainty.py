@@ -13,7 +13,7 @@ from train.calibration.posthoc import fit_posthoc
 from train.data.sets import Dataset
 from train.evaluation import uncertainty, uncertainty_cases
 from train.evaluation.evaluate import Where
-from train.evaluation.uncertainty_cases import NOBODY, Case
+from train.evaluation.uncertainty_cases import NONE_LEFT_OUT, Case
 from train.models.methods import Effort
 from train.reports import uncertainty_report
 
@@ -31,11 +31,11 @@ def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
     return x, labels, at
 
 
-def case(left_out: int = NOBODY, apart: float = 6.0, fold: int = 0, places: int = 3) -> Case:
+def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, places: int = 3) -> Case:
     """A training on eight places and a test on others."""
     x, y, at = world(8, 20, 1, apart)
     keep = y != left_out
-    y = y - (y > left_out) * (left_out != NOBODY)
+    y = y - (y > left_out) * (left_out != NONE_LEFT_OUT)
     new, labels, there = world(places, 24, 2 + fold, apart, first=100 + 10 * fold)
     x, y, at = x[keep], y[keep], at[keep]
     seen = at % 2 == 1
@@ -46,7 +46,7 @@ def case(left_out: int = NOBODY, apart: float = 6.0, fold: int = 0, places: int 
 @pytest.fixture(scope="module")
 def told():
     """All figures of one fold, each material left out once."""
-    held = [case(k) for k in (NOBODY, 0, 1, 2, 3)]
+    held = [case(k) for k in (NONE_LEFT_OUT, 0, 1, 2, 3)]
     return json.loads(json.dumps(uncertainty.figures(held, NAMES, 1)))
 
 
@@ -137,7 +137,7 @@ def test_two_materials_leave_nobody_out():
     one = case()
     two, test = one.seen_labels < 2, one.labels < 2
     also = one.copied_labels < 2
-    one = Case(NOBODY, 0, 2, one.seen[two], one.seen_labels[two], one.seen_groups[two], one.judged[two], one.copied[also],
+    one = Case(NONE_LEFT_OUT, 0, 2, one.seen[two], one.seen_labels[two], one.seen_groups[two], one.judged[two], one.copied[also],
                one.copied_labels[also], one.copied_groups[also], one.new[test], one.labels[test], one.places[test])  # fmt: skip
     figures = uncertainty.figures([one], NAMES[:2], 1)
     assert set(figures) == {"calibration", "sequence", "early"}
