@@ -22,68 +22,81 @@ def register(add: Add) -> None:
     """fit, export, pack, parity, sign, references."""
     _add_fit(add)
     _add_bundles(add)
-    one = add(
+    parity = add(
         "parity",
         lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
-        "tell what int8 does to a model's answers, and to each tensor",
+        "show what int8 changes in a model's answers, and in each tensor",
     )
-    one.add_argument("model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form")
-    options.add_set(one)
-    one.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    one = add("sign", run_sign, "sign a bundle, so that boxes take it")
-    one.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
-    one.add_argument("--key", type=Path, required=True, metavar="KEY", help="yours: ssh-keygen -t ed25519 makes one")
-    one.add_argument(
-        "--counter", type=int, metavar="N", help="above that of all bundles that were delivered before (1 is the first)"
+    parity.add_argument("model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form")
+    options.add_set(parity)
+    parity.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    sign_command = add("sign", run_sign, "sign a bundle, so that boxes take it")
+    sign_command.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    sign_command.add_argument(
+        "--key", type=Path, required=True, metavar="KEY", help="your private key: ssh-keygen -t ed25519 makes one"
+    )
+    sign_command.add_argument(
+        "--counter", type=int, metavar="N", help="above that of every bundle delivered before (1 for the first)"
     )
 
 
 def _add_fit(add: Add) -> None:
     recipe = fit.FitRecipe()
-    one = add("fit", run_fit, "train a network on sweep sets")
-    options.add_set(one)
-    one.add_argument("--seed", type=int, required=True, help="of the training, and of simulated sets that name none")
-    one.add_argument("--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)")
-    one.add_argument("--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7")
-    one.add_argument("--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set")
-    one.add_argument("--steps", type=int, default=recipe.steps, help=f"of training (default {recipe.steps})")
-    one.add_argument("--row-shift", type=float, metavar="SHARE", dest="moved",
-                     help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
-    one.add_argument("--stretch", type=float, metavar="SHARE",
-                     help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
-    one.add_argument(
-        "--size", choices=[*ARCHITECTURES, "usual"], default="usual", help="rung of the ladder (default: as compact)"
+    command = add("fit", run_fit, "train a network on sweep sets")
+    options.add_set(command)
+    command.add_argument(
+        "--seed", type=int, required=True, help="of the training, and of simulated sets that name none"
     )
-    one.add_argument("--keep-means", action="store_true", help="show the head each taxel's mean too, for comparison")
+    command.add_argument("--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)")
+    command.add_argument("--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7")
+    command.add_argument("--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set")
+    command.add_argument("--steps", type=int, default=recipe.steps, help=f"of training (default {recipe.steps})")
+    command.add_argument("--row-shift", type=float, metavar="SHARE", dest="moved",
+                     help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
+    command.add_argument("--stretch", type=float, metavar="SHARE",
+                     help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
+    command.add_argument(
+        "--size",
+        choices=[*ARCHITECTURES, "usual"],
+        default="usual",
+        help="size of the network (default: that of compact)",
+    )
+    command.add_argument(
+        "--keep-means", action="store_true", help="give the head each taxel's mean too, for comparison"
+    )
 
 
 def _add_bundles(add: Add) -> None:
-    """The commands that make what the box runs."""
-    one = add("export", run_export, "quantize a fit and pack its bundle")
-    one.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
-    two = add("pack", run_pack, "train any method and pack its bundle")
-    options.add_set(two)
-    two.add_argument("--method", required=True, metavar="NAME", help="see palpate-train methods")
-    two.add_argument("--seed", type=int, required=True, help="of the training, and of simulated sets that name none")
-    options.add_effort(two)
-    for command in (one, two):
+    """export, pack and references: the commands that write models."""
+    export = add("export", run_export, "quantize a fit and pack its bundle")
+    export.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
+    pack_command = add("pack", run_pack, "train any method and pack its bundle")
+    options.add_set(pack_command)
+    pack_command.add_argument("--method", required=True, metavar="NAME", help="see palpate-train methods")
+    pack_command.add_argument(
+        "--seed", type=int, required=True, help="of the training, and of simulated sets that name none"
+    )
+    options.add_effort(pack_command)
+    for command in (export, pack_command):
         command.add_argument(
             "--out", type=Path, required=True, metavar="DIR", help="the bundle; replaced if it is there"
         )
         command.add_argument("--name", required=True)
         command.add_argument("--version", required=True)
-        command.add_argument("--full-scale", type=float, help="the sensor's highest digit (default: its type's)")
+        command.add_argument(
+            "--full-scale", type=float, help="the sensor's highest raw count (default: the maximum of its type)"
+        )
         command.add_argument(
             "--pitch-mm",
             type=float,
-            help="from taxel to taxel; without it `palpate align` knows no mm (a simulated skin's is known)",
+            help="from taxel to taxel; without it `palpate align` cannot show mm (known for the simulated skin)",
         )
-    three = add("references", run_references, "write the models that palpate bench times beside the bundle")
-    three.add_argument("--out", type=Path, required=True, metavar="DIR")
+    references = add("references", run_references, "write the models that palpate bench times beside the bundle")
+    references.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
 def run_fit(args: argparse.Namespace) -> None:
-    """Train, save the fit and say how it does on what was held out."""
+    """Train, save the fit and print its accuracy on the held-out sweeps."""
     if args.rest and not args.split:
         raise FormatError("--rest needs --split; without it nothing is left over")
     sweeps = options.load(args, args.seed)
@@ -95,32 +108,32 @@ def run_fit(args: argparse.Namespace) -> None:
             rest.save(args.rest)
             print(f"rest: {len(rest)} sweeps in {args.rest}")
     shape = ARCHITECTURES.get(args.size, DEFAULT)
-    asked = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
-    scene = replace(fit.usual(sweeps.format, shape), **asked)
+    changes = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
+    scene = replace(fit.usual(sweeps.format, shape), **changes)
     recipe = fit.FitRecipe(steps=args.steps, scene=scene, keep_means=args.keep_means)
     made = fit.fit(sweeps, args.seed, recipe, options.Log(), shape)
     made.save(args.out)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; held-out {made.about['held_out_by']}: "
-          f"{_spoken(made.about['validation'])}; {args.out}")  # fmt: skip
+          f"{_text(made.about['validation'])}; {args.out}")  # fmt: skip
 
 
 def run_export(args: argparse.Namespace) -> None:
-    """Pack the bundle and say how it does."""
-    _told(quantized_bundle.export(fit.Fit.load(args.fit), *_packing(args)), args.out)
+    """Pack the bundle and print its figures."""
+    _print(quantized_bundle.export(fit.Fit.load(args.fit), *_packing(args)), args.out)
 
 
 def run_pack(args: argparse.Namespace) -> None:
-    """Train, pack the bundle and say how it does."""
+    """Train, pack the bundle and print its figures."""
     (method,) = methods.find([args.method], options.effort(args))
     content = pack.trained(method, options.load(args, args.seed), args.seed)
-    _told(pack.pack(quantized_bundle.checked(content, content.reference), *_packing(args)), args.out)
+    _print(pack.pack(quantized_bundle.checked(content, content.reference), *_packing(args)), args.out)
 
 
 def run_sign(args: argparse.Namespace) -> None:
-    """Sign it, and say what was signed."""
-    made = sign.sign(args.bundle, args.key, args.counter)
+    """Sign the bundle, and print what was signed."""
+    signed = sign.sign(args.bundle, args.key, args.counter)
     print(
-        f"signed: {made.name} {made.version}, counter {made.counter}, {bundle.identity(made.json())} in {args.bundle}"
+        f"signed: {signed.name} {signed.version}, counter {signed.counter}, {bundle.identity(signed.json())} in {args.bundle}"
     )
 
 
@@ -128,16 +141,17 @@ def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | Non
     return args.out, args.name, args.version, commit(), args.full_scale, args.pitch_mm
 
 
-def _told(manifest: Manifest, out: Path) -> None:
+def _print(manifest: Manifest, out: Path) -> None:
+    """The figures of a bundle, and its size."""
     for protocol, figure in manifest.figures.items():
         if "accuracy" in figure:
-            print(f"{protocol}: {_spoken(figure)}")
+            print(f"{protocol}: {_text(figure)}")
     size = measure.sizes(out)[1]
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
 
 
 def run_references(args: argparse.Namespace) -> None:
-    """Write the references and name them."""
+    """Write the references and print their paths."""
     for path in quantized_bundle.references(args.out):
         print(path)
 
@@ -150,5 +164,5 @@ def _by_share(text: str) -> tuple[str, float]:
         raise FormatError(f"split {text!r} cannot be read; write GROUP:SHARE, e.g. recording:0.7") from None
 
 
-def _spoken(figure: dict[str, float]) -> str:
+def _text(figure: dict[str, float]) -> str:
     return f"{figure['accuracy']:.3f} [{figure['low']:.3f}, {figure['high']:.3f}] of {figure['n']}"

@@ -1,4 +1,4 @@
-"""The command choose. In: scene.toml. Out: a bundle, choice.json, and the page that says why."""
+"""The command choose. In: scene.toml. Out: a bundle, choice.json, and a page with the reasons."""
 
 from __future__ import annotations
 
@@ -39,60 +39,62 @@ def register(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Choose, pack, write why, and say it. Raises FormatError for a broken scene, NothingFits where no model fits it."""
-    asked = scene.read(args.scene)
-    sweeps, log = asked.sweeps(), options.Log()
-    choice = select.choose(sweeps, asked, options.effort(args), options.where(args), log)
-    less, change, accuracy = reduction_curves.curves(choice, asked, log)
-    told = choice.json(asked) | {"less": less, "applied": asdict(change), "left": accuracy}
-    told["bundle"] = _packed(args, asked, sweeps, told, change)
-    told |= _origin(args, asked, sweeps)
+    """Choose, pack, write and print the reasons. Raises FormatError for an invalid scene, NothingFits where no model fits."""
+    requested = scene.read(args.scene)
+    sweeps, log = requested.sweeps(), options.Log()
+    choice = select.choose(sweeps, requested, options.effort(args), options.where(args), log)
+    curves, change, accuracy = reduction_curves.curves(choice, requested, log)
+    result = choice.json(requested) | {"less": curves, "applied": asdict(change), "left": accuracy}
+    result["bundle"] = _packed(args, requested, sweeps, result, change)
+    result |= _origin(args, requested, sweeps)
     page = args.page or args.out.with_name(f"{args.out.name}-why")
-    put(page / "choice.json", (json.dumps(told, indent=1) + "\n").encode(), parents=True)
-    put(page / "index.html", selection_report.page(told).encode(), parents=True)
-    print(selection_report.text(told))
+    put(page / "choice.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
+    put(page / "index.html", selection_report.page(result).encode(), parents=True)
+    print(selection_report.text(result))
     print(f"bundle: {args.out}; why: {page / 'index.html'}")
 
 
-def _packed(args: argparse.Namespace, asked: scene.Scene, sweeps: Dataset, told: Json, change: Change) -> Json:
-    """Pack what was chosen, with less where the box can run it and will; what is in the bundle, and what it costs."""
-    (method,) = methods.find([told["chosen"]], options.effort(args))
+def _packed(args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset, result: Json, change: Change) -> Json:
+    """Pack the chosen method, on reduced sweeps where that passes the checks; the bundle's content and cost."""
+    (method,) = methods.find([result["chosen"]], options.effort(args))
     refused = ""
     if change != WHOLE:
         try:
-            return _pack(args, asked, method, change.of(sweeps), told)
+            return _pack(args, requested, method, change.of(sweeps), result)
         except pack.ExportRefused as e:
             refused = str(e)
-    return _pack(args, asked, method, sweeps, told) | {"refused_with_less": refused}
+    return _pack(args, requested, method, sweeps, result) | {"refused_with_less": refused}
 
 
-def _pack(args: argparse.Namespace, asked: scene.Scene, method: methods.Method, sweeps: Dataset, told: Json) -> Json:
+def _pack(
+    args: argparse.Namespace, requested: scene.Scene, method: methods.Method, sweeps: Dataset, result: Json
+) -> Json:
     content = pack.trained(method, sweeps, 1)
-    nested = told["honest"]
+    nested = result["honest"]
     figure = {"accuracy": nested["mean"], "n": len(sweeps), "low": nested["low"], "high": nested["high"]}
-    content = replace(content, about=content.about | {"scene": asked.path.name},
+    content = replace(content, about=content.about | {"scene": requested.path.name},
                       figures={"the choice, made without each part and tested on it": figure})  # fmt: skip
-    manifest = pack.pack(content, args.out, asked.name, asked.version, commit(), asked.full_scale or None)
+    manifest = pack.pack(content, args.out, requested.name, requested.version, commit(), requested.full_scale or None)
     (measurement,) = measure.measure_all([args.out], sweeps.samples)
-    return _described(manifest, BundleCost.of(measurement), asked)
+    return _described(manifest, BundleCost.of(measurement), requested)
 
 
-def _described(manifest: Manifest, cost: BundleCost, asked: scene.Scene) -> Json:
-    used = {k: round(v, 3) for k, v in cost.used(asked.budget).items()}
+def _described(manifest: Manifest, cost: BundleCost, requested: scene.Scene) -> Json:
+    used = {k: round(v, 3) for k, v in cost.used(requested.budget).items()}
     return {"name": manifest.name, "version": manifest.version, "format": asdict(manifest.format), "ms": cost.ms,
             "kb": cost.kb, "mb": cost.mb, "used": used, "figures": manifest.figures}  # fmt: skip
 
 
-def _origin(args: argparse.Namespace, asked: scene.Scene, sweeps: Dataset) -> Json:
-    """Where it all comes from."""
+def _origin(args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset) -> Json:
+    """The origin of the result: command, sets, scene, commit."""
     effort = options.effort(args)
     words = ["palpate-train", "choose", "--scene", str(args.scene), "--out", str(args.out)]
     words += ["--page", str(args.page)] if args.page else []
     words += ["--effort", f"{effort.share:g}"] if effort.share != 1 else []
-    budget = {k: v for k, v in vars(asked.budget).items() if v != float("inf")}
+    budget = {k: v for k, v in vars(requested.budget).items() if v != float("inf")}
     return {
-        "scene": asked.name, "command": shlex.join(words), "set": sweeps.source, "digest": digest(sweeps), "sweeps": len(sweeps),
-        "format": asdict(sweeps.format), "materials": list(sweeps.materials), "merge": dict(asked.merge),
-        "varies": list(asked.varies), "stress": dict(asked.stress), "budget": budget, "effort": effort.share,
-        "seeds": list(range(1, asked.seeds + 1)),
+        "scene": requested.name, "command": shlex.join(words), "set": sweeps.source, "digest": digest(sweeps), "sweeps": len(sweeps),
+        "format": asdict(sweeps.format), "materials": list(sweeps.materials), "merge": dict(requested.merge),
+        "varies": list(requested.varies), "stress": dict(requested.stress), "budget": budget, "effort": effort.share,
+        "seeds": list(range(1, requested.seeds + 1)),
     } | score.provenance()  # fmt: skip

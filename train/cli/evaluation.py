@@ -30,65 +30,73 @@ def register(add: Add) -> None:
     _add_evaluate(add)
     _add_stress(add)
     _add_certainty(add)
-    one = add("calibrate", run_calibrate, "compare the simulator with the twenty accuracies that the paper prints")
-    one.add_argument("--seeds", default="201-208", metavar="FIRST-LAST", help="of the simulated worlds (201-208)")
-    one.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
-    one.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    one.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
-    two = add(
-        "alignment", run_alignment, "tell whether a skin that has moved is flagged before accuracy is lost (simulated)"
+    calibrate = add(
+        "calibrate", run_calibrate, "compare the simulator with the twenty accuracies that the paper prints"
     )
-    two.add_argument("--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)")
-    two.add_argument("--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on")
-    two.add_argument("--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places")
-    two.add_argument("--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead")
-    two.add_argument("--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go")
+    calibrate.add_argument("--seeds", default="201-208", metavar="FIRST-LAST", help="of the simulated worlds (201-208)")
+    calibrate.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
+    calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    calibrate.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
+    alignment = add(
+        "alignment",
+        run_alignment,
+        "measure whether a skin that has moved is flagged before accuracy is lost (simulated)",
+    )
+    alignment.add_argument("--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)")
+    alignment.add_argument("--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on")
+    alignment.add_argument("--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places")
+    alignment.add_argument("--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead")
+    alignment.add_argument("--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go")
 
 
 def _add_evaluate(add: Add) -> None:
-    one = add("evaluate", run_evaluate, "train and test methods under a protocol")
-    options.add_set(one)
-    one.add_argument("--protocol", action="append", required=True, metavar="PROTOCOL", dest="protocols",
-                     help="random:10, leave:GROUP or split:GROUP=a,b->c; hard ones tell more")  # fmt: skip
-    one.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
-    one.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
-    one.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and random folds: 1 to N (1)")
-    one.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
-    options.add_effort(one)
-    options.add_where(one)
+    command = add("evaluate", run_evaluate, "train and test methods under a protocol")
+    options.add_set(command)
+    command.add_argument("--protocol", action="append", required=True, metavar="PROTOCOL", dest="protocols",
+                     help="random:10, leave:GROUP or split:GROUP=a,b->c; prefer those that leave groups out")  # fmt: skip
+    command.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
+    command.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
+    command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and random folds: 1 to N (1)")
+    command.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
+    options.add_effort(command)
+    options.add_where(command)
 
 
 def _add_stress(add: Add) -> None:
-    one = add("stress", run_stress, "put trained methods under what goes wrong, one thing at a time")
-    options.add_set(one)
-    one.add_argument("--test", required=True, metavar="SET", help="what is stressed; simulated, it is drawn anew")
-    one.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
-    one.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and stress: 1 to N (1)")
-    one.add_argument("--out", type=Path, required=True, metavar="DIR", help="for results.json, table.md and curves.svg")
-    one.add_argument("--strong", default="compact,minirocket", metavar="A,B", help="methods drawn with their bands")
-    options.add_effort(one)
-    options.add_where(one)
+    command = add("stress", run_stress, "test trained methods on corrupted sweeps, one corruption at a time")
+    options.add_set(command)
+    command.add_argument(
+        "--test", required=True, metavar="SET", help="the set that is corrupted; a simulated one is drawn anew"
+    )
+    command.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
+    command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)")
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="for results.json, table.md and curves.svg"
+    )
+    command.add_argument("--strong", default="compact,minirocket", metavar="A,B", help="methods drawn with their bands")
+    options.add_effort(command)
+    options.add_where(command)
 
 
 def _add_certainty(add: Add) -> None:
-    one = add(
+    command = add(
         "certainty",
         run_certainty,
-        "tell how sure a model may be: calibration, more sweeps, unknown materials, enrolment",
+        "measure how far a model's probabilities can be trusted: calibration, more sweeps, unknown materials, enrolment",
     )
-    options.add_set(one)
-    one.add_argument("--test", metavar="SET", help="test on this set")
-    one.add_argument(
+    options.add_set(command)
+    command.add_argument("--test", metavar="SET", help="test on this set")
+    command.add_argument(
         "--protocol", default="leave:position", help="what is tested on where --test is not given (leave:position)"
     )
-    one.add_argument("--method", default="compact", metavar="NAME", help="compact or one of its family (compact)")
-    one.add_argument("--seed", type=int, default=1, help="of training and draws (1)")
-    one.add_argument(
+    command.add_argument("--method", default="compact", metavar="NAME", help="compact or one of its family (compact)")
+    command.add_argument("--seed", type=int, default=1, help="of training and draws (1)")
+    command.add_argument(
         "--out", type=Path, default=Path("docs/certainty"), metavar="DIR", help="where it goes (docs/certainty)"
     )
-    one.add_argument("--kept", action="store_true", help="train nothing, tell what an earlier run has finished")
-    options.add_effort(one)
-    options.add_where(one)
+    command.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
+    options.add_effort(command)
+    options.add_where(command)
 
 
 def run_methods(args: argparse.Namespace) -> None:
@@ -99,22 +107,22 @@ def run_methods(args: argparse.Namespace) -> None:
 
 
 def run_evaluate(args: argparse.Namespace) -> None:
-    """Say each result as it comes, and write all of them."""
+    """Print each result as it is finished, and write all of them."""
     sweeps = options.load(args)
     names = options.names(args)
     plan = evaluate.Plan(names, tuple(args.protocols), options.seeds(args), args.remove_means, options.effort(args))
-    done: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
     refused: dict[str, str] = {}
     print(evaluate.HEADER)
     for result in evaluate.evaluate(sweeps, plan, options.where(args), options.Log()):
         if result.refused:
             refused[result.method] = result.refused
             continue
-        done.append(result.json() | {"only": args.only})
-        print(evaluate.line(done[-1]), flush=True)
+        results.append(result.json() | {"only": args.only})
+        print(evaluate.line(results[-1]), flush=True)
         if args.json:
-            done.sort(key=lambda r: (args.protocols.index(r["protocol"]), names.index(r["method"]), r["seed"]))
-            _write(args.json, done)
+            results.sort(key=lambda r: (args.protocols.index(r["protocol"]), names.index(r["method"]), r["seed"]))
+            _write(args.json, results)
     if refused:
         raise FormatError("; ".join(f"{name} cannot be used here: {why}" for name, why in refused.items()))
 
@@ -125,7 +133,7 @@ def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:
 
 
 def run_stress(args: argparse.Namespace) -> None:
-    """Curves as JSON and as a picture, and the table."""
+    """Write the curves as JSON and as a plot, and the table; print the table."""
     train = options.load(args)
     simulated = args.test.startswith("sim:")
     test = (
@@ -133,7 +141,7 @@ def run_stress(args: argparse.Namespace) -> None:
         if simulated
         else EvaluationSweeps.of(sets.load(args.test).select(args.only))
     )
-    told = robustness.run(
+    result = robustness.run(
         options.names(args),
         train,
         test,
@@ -142,42 +150,42 @@ def run_stress(args: argparse.Namespace) -> None:
         effort=options.effort(args),
         log=options.Log(),
     )
-    told["box"] = robustness.box_answers(bundle.load(bundle.DEFAULT))
-    told |= {"train": train.source, "digest": sets.digest(train), "format": str(train.format)} | score.provenance()
-    table = robustness.table(told)
-    put(args.out / "results.json", (json.dumps(told) + "\n").encode(), parents=True)
+    result["box"] = robustness.box_answers(bundle.load(bundle.DEFAULT))
+    result |= {"train": train.source, "digest": sets.digest(train), "format": str(train.format)} | score.provenance()
+    table = robustness.table(result)
+    put(args.out / "results.json", (json.dumps(result) + "\n").encode(), parents=True)
     put(args.out / "table.md", table.encode(), parents=True)
-    put(args.out / "curves.svg", plots.robustness(told, args.strong.split(",")).encode(), parents=True)
+    put(args.out / "curves.svg", plots.robustness(result, args.strong.split(",")).encode(), parents=True)
     print(table)
 
 
 def run_certainty(args: argparse.Namespace) -> None:
-    """All of it; the page is named at the end."""
+    """Write the figures and the page; print the page's path."""
     test = sets.load(args.test).select(args.only) if args.test else None
-    told = uncertainty.run(
+    result = uncertainty.run(
         options.load(args), test, args.protocol, args.method, options.where(args), options.Log(), options.effort(args),
         args.seed,
     )  # fmt: skip
-    print(uncertainty_report.write(told, args.out))
+    print(uncertainty_report.write(result, args.out))
 
 
 def run_calibrate(args: argparse.Namespace) -> None:
-    """The table; the figures as JSON where asked for."""
+    """Print the table; write the figures as JSON where a file is named."""
     first, _, last = args.seeds.partition("-")
     if not first.isdigit() or not (last or first).isdigit() or int(last or first) < int(first):
         raise FormatError(f"--seeds {args.seeds} cannot be read; write FIRST-LAST, e.g. 201-208")
     seeds = range(int(first), int(last or first) + 1)
-    told = sim_calibration.measure(seeds, args.ablate, options.Log(), jobs=args.jobs) | score.provenance()
+    result = sim_calibration.measure(seeds, args.ablate, options.Log(), jobs=args.jobs) | score.provenance()
     if args.json:
-        put(args.json, (json.dumps(told, indent=1) + "\n").encode(), parents=True)
-    print(sim_calibration.table(told))
+        put(args.json, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
+    print(sim_calibration.table(result))
 
 
 def run_alignment(args: argparse.Namespace) -> None:
-    """Measure, write, and say the least of it."""
+    """Measure, write the figures and the plot, and print a summary."""
     box = Classifier(bundle.load(args.bundle), SystemClock())
-    told = contact_positions.measure(box, args.unseen, args.seen, args.hard, options.Log())
+    result = contact_positions.measure(box, args.unseen, args.seen, args.hard, options.Log())
     args.out.mkdir(parents=True, exist_ok=True)
-    put(args.out / "place.json", (json.dumps(told, indent=1) + "\n").encode(), parents=True)
-    put(args.out / "place.svg", (contact_plot.draw(told) + "\n").encode(), parents=True)
-    print("\n".join(contact_positions.lines(told)))
+    put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
+    put(args.out / "place.svg", (contact_plot.draw(result) + "\n").encode(), parents=True)
+    print("\n".join(contact_positions.lines(result)))

@@ -1,4 +1,4 @@
-"""The room of the options that several commands share. In: a parser, or what it read. Out: options, or what they mean."""
+"""Options that several commands share. In: a parser, or the arguments it parsed. Out: options, or their values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from train.evaluation import evaluate
 from train.models import methods
 
 Add = Callable[[str, Callable[[argparse.Namespace], None], str], argparse.ArgumentParser]
-"""How a command is added: its name, what runs, what it does -> its parser."""
+"""Adds a command: its name, the function that runs it, its description -> its parser."""
 SET = "FILE (.npz, .h5), a folder of recordings or sim:NAME[:SEED[-LAST][:SWEEPS]]; several are joined"
 LOG_EVERY_S = 30
 
@@ -27,7 +27,7 @@ def add_set(command: argparse.ArgumentParser) -> None:
 
 
 def add_effort(command: argparse.ArgumentParser) -> None:
-    """How long networks are trained."""
+    """Options for how long networks are trained."""
     usual = methods.FULL_EFFORT
     command.add_argument("--effort", type=float, default=usual.share, metavar="SHARE",
                          help="of the networks' usual iterations (1)")  # fmt: skip
@@ -37,25 +37,25 @@ def add_effort(command: argparse.ArgumentParser) -> None:
 
 
 def add_where(command: argparse.ArgumentParser) -> None:
-    """Where the work is done and kept."""
+    """Options for where tasks run and where their results are kept."""
     command.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
-    command.add_argument("--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster that does the work")
+    command.add_argument("--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster that runs the tasks")
     command.add_argument("--cache", type=Path, default=evaluate.CACHE, metavar="DIR",
-                         help=f"where finished folds are kept, so that an interrupted run goes on ({evaluate.CACHE})")  # fmt: skip
+                         help=f"where finished folds are kept, so that an interrupted run continues ({evaluate.CACHE})")  # fmt: skip
 
 
 def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
-    """The sets named, joined and narrowed. seed: of simulated ones that name none."""
+    """The sets of --set, joined and narrowed by --only. seed: of simulated ones that name none."""
     return sets.join([sets.load(spec, seed) for spec in args.sets]).select(args.only)
 
 
 def names(args: argparse.Namespace) -> tuple[str, ...]:
-    """The methods asked for."""
+    """The methods of --method."""
     return tuple(methods.every()) if args.method == "all" else tuple(args.method.split(","))
 
 
 def seeds(args: argparse.Namespace) -> range:
-    """1 to --seeds. Raises FormatError where that is none."""
+    """1 to --seeds. Raises FormatError where that is below 1."""
     if args.seeds < 1:
         raise FormatError(f"--seeds {args.seeds} is none; use 1 or more")
     return range(1, args.seeds + 1)
@@ -67,18 +67,18 @@ def effort(args: argparse.Namespace) -> methods.Effort:
 
 
 def where(args: argparse.Namespace) -> evaluate.Where:
-    """Where the work is done and kept."""
+    """Where tasks run and where their results are kept."""
     return evaluate.Where(args.jobs, args.scheduler, args.cache, getattr(args, "kept", False))
 
 
 class Log:
-    """Tells how far it is: one line that is written over for eyes, one line in LOG_EVERY_S for a file."""
+    """Shows progress on the error stream: one line that is overwritten on a terminal, else one line every LOG_EVERY_S."""
 
     def __init__(self) -> None:
         self._last = time.monotonic()
 
     def __call__(self, line: str) -> None:
-        """Tell `line`."""
+        """Show `line`."""
         if sys.stderr.isatty():
             print(f"\r{line}\033[K", end="", file=sys.stderr, flush=True)
         elif time.monotonic() - self._last > LOG_EVERY_S:

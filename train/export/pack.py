@@ -1,6 +1,6 @@
-"""The room where a trained model becomes a bundle. In: a graph, its sweeps, a folder. Out: the folder, or a refusal.
+"""Packing a trained model as a bundle. In: a graph, its sweeps, a folder. Out: the folder, or ExportRefused.
 
-Nothing leaves that does not do on this machine, through the box's own classifier, what was trained.
+A model is refused unless the box's classifier, on this machine, answers as the trained model does.
 """
 
 from __future__ import annotations
@@ -37,33 +37,34 @@ from train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
 MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
-"""Shares of held-out sweeps that the box may refuse (stuck taxels, say), and call unknown, of which its limit makes some
-.05; more means that thresholds or limit do not fit."""
+"""Shares of held-out sweeps that the box may refuse (because of stuck taxels, for instance), and call unknown, which it
+does for about 5 % by its limit; more means that thresholds or limit do not fit."""
 RUNTIME = "0.2.0"
 """The first version of the box that reads such a manifest."""
 REFUSED, UNKNOWN = -1, -2
-"""What `score` gives instead of a label."""
+"""What `score` returns instead of a label."""
 
 
 class ExportRefused(BundleError):
-    """A model that changed on its way to the box, or would not be one there."""
+    """A model that answers differently in its bundle than it was trained, or that the box could not use."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """What goes into a bundle. model: `sweep` or `features` -> `logits`, and what `early` and `known` need. input: as in
-    the manifest.
+    """The content of a bundle. model: `sweep` or `features` -> `logits`, and the outputs that `early` and `known` need.
+    input: as in the manifest.
 
-    train, held: what it was trained on and what it was not, parted by `held_by`. about: how it was made, figures: how
-    it did, for the manifest. early, known: for the manifest, with the file means.npz where there is `known`.
-    reference: the float form of a model in int8. made: the fit of one of our own networks, which `pack` completes.
+    train, held_out: the sweeps it was trained on and the others, split by the group `held_out_by`. about: how it was
+    made; figures: its results, both for the manifest. early, known: for the manifest; means: the file means.npz, where
+    there is `known`. reference: the float form of a model in int8. made: the fit of a network of the compact family,
+    to which `pack` adds early answers and novelty.
     """
 
     model: onnx.ModelProto
     input: str
     train: Dataset
-    held: Dataset
-    held_by: str
+    held_out: Dataset
+    held_out_by: str
     about: dict[str, Any]
     figures: dict[str, Any] = field(default_factory=dict)
     early: bundle.Early | None = None
@@ -79,14 +80,14 @@ def pack(
 ) -> bundle.Manifest:  # fmt: skip
     """Check `content` and put it at `target`, whole or not at all; an older bundle there is replaced.
 
-    commit: of the code, for the manifest. full_scale: the sensor's highest digit where it is not its type's. pitch_mm: from
-    taxel to taxel; where it is not known, the box cannot say how far a skin has moved.
+    commit: of the code, for the manifest. full_scale: the sensor's highest raw count where that is not the maximum of its
+    type. pitch_mm: from taxel to taxel; without it the box cannot say how far a skin has moved.
     Raises ExportRefused where a check fails, and BundleError where a label or the target cannot be used.
     """
-    content = completed(content)
-    train, held = content.train, content.held
+    content = with_posthoc(content)
+    train, held_out = content.train, content.held_out
     logits = run(content.model, model_inputs(content.input, train))
-    golden = golden_sweeps(train, logits, named_by_means(content, train) if content.known else logits)
+    golden = golden_sweeps(train, logits, logits_of_means(content, train) if content.known else logits)
     files = {bundle.MODEL: content.model.SerializeToString(), bundle.GOLDEN: golden}
     files |= {bundle.MEANS: content.means} if content.known else {}
     limits = thresholds(train, full_scale)
@@ -96,12 +97,15 @@ def pack(
         made={"commit": commit, "set": train.source, "machine": platform.machine(), "cpus": os.cpu_count(),
               "torch": torch.__version__, "onnxruntime": onnxruntime.__version__} | content.about,
     )  # fmt: skip
-    with _aside(target) as folder:
+    with _replacing(target) as folder:
         for file, data in files.items():
             (folder / file).write_bytes(data)
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         figures = judge(
-            folder, held, run(content.model, model_inputs(content.input, held)), f"held-out {content.held_by}"
+            folder,
+            held_out,
+            run(content.model, model_inputs(content.input, held_out)),
+            f"held-out {content.held_out_by}",
         )
         manifest = replace(manifest, figures=figures | content.figures)
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
@@ -110,7 +114,7 @@ def pack(
 
 
 def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
-    """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, which judge it.
+    """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, on which it is tested.
 
     Raises FormatError for a method whose features the box does not compute.
     """
@@ -124,13 +128,15 @@ def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Co
             f"method {method.name!r} looks at the features {method.input!r} of prior work, which the box does not compute; "
             "compare it with evaluate, and pack another"
         )
-    train, held_out, held_by = hold_out(sweeps, seed)
+    train, held_out, held_out_by = hold_out(sweeps, seed)
     model = method.train(train, model_inputs(method.input, train), seed)
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
     forms = getattr(model, "forms", {})
     reference = forms["float"].graph() if "float" in forms else None
     made = getattr(model, "made", None)
-    return model, Content(model.graph(), method.input, train, held_out, held_by, about, reference=reference, made=made)
+    return model, Content(
+        model.graph(), method.input, train, held_out, held_out_by, about, reference=reference, made=made
+    )
 
 
 def pack_to_measure(content: Content, target: Path, full_scale: float | None = None) -> bundle.Manifest:
@@ -138,45 +144,48 @@ def pack_to_measure(content: Content, target: Path, full_scale: float | None = N
     return pack(content, target, content.about["method"], "1", provenance.commit(), full_scale)
 
 
-def completed(content: Content) -> Content:
-    """`content` with all that stands on the trunk of what was `made`: early answers where its sweeps support them, and
-    what is known. As it is where nothing was held out, or not all its materials were trained."""
+def with_posthoc(content: Content) -> Content:
+    """`content` with what is fitted on the trunk of the fit `made`: early answers, where its sweeps support them, and
+    novelty. Unchanged where nothing was held out, or not all its materials were trained."""
     made = content.made
     if made is None or made.train.materials != content.train.materials:
         return content
     try:
         done = calibrate(made)
-    except FormatError:  # too few groups: nothing could judge
+    except FormatError:  # too few groups to hold some out, on which it could be fitted
         return content
     rule = done.rule
-    told = {"early": {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why}
+    early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
     return replace(
         content, model=done.graph(made.trunk(tenths=bool(rule.early))), early=rule.early, known=done.known(),
-        means=done.means(), about=content.about | told,
+        means=done.means(), about=content.about | {"early": early},
     )  # fmt: skip
 
 
-def named_by_means(content: Content, sweeps: Dataset) -> Array:
-    """Logits [N, K] as the box computes them from class means where a label is enrolled, not cooled."""
+def logits_of_means(content: Content, sweeps: Dataset) -> Array:
+    """Logits [N, K] as the box computes them from class means where a label is enrolled, before temperature scaling."""
     embedding = onnx.ModelProto()
     embedding.CopyFrom(content.model)
     kept = [output for output in embedding.graph.output if output.name == "embedding"]
     del embedding.graph.output[:]
     embedding.graph.output.extend(kept)
     with np.load(io.BytesIO(content.means)) as means:
-        named: Array = run(embedding, sweeps.samples) @ means["means"].T + means["bias"]
-    return named
+        logits: Array = run(embedding, sweeps.samples) @ means["means"].T + means["bias"]
+    return logits
 
 
-def golden_sweeps(sweeps: Dataset, logits: Array, also: Array) -> bytes:
+def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> bytes:
     """An .npz of one training sweep of the first and the last material, and their logits.
 
-    Of those that are recognised, by the logits `also` too, it is the one whose probability is the median: neither so sure that a small fault does
-    not show, nor so unsure that rounding turns it. Raises ExportRefused where none is recognised.
+    Of the sweeps that both kinds of logits recognise it is the one with the median probability: not so certain that a
+    small fault does not show, and not so uncertain that rounding changes the label. Raises ExportRefused where none is
+    recognised.
     """
     index = []
     for label in (0, len(sweeps.materials) - 1):
-        known = np.flatnonzero((sweeps.labels == label) & (logits.argmax(1) == label) & (also.argmax(1) == label))
+        known = np.flatnonzero(
+            (sweeps.labels == label) & (logits.argmax(1) == label) & (logits_of_means.argmax(1) == label)
+        )
         if not len(known):
             raise ExportRefused(f"no training sweep of {sweeps.materials[label]!r} is recognised; train longer")
         order = np.argsort(softmax(logits[known])[:, label], kind="stable")
@@ -187,74 +196,74 @@ def golden_sweeps(sweeps: Dataset, logits: Array, also: Array) -> bytes:
 
 
 def thresholds(sweeps: Dataset, full_scale: float | None) -> bundle.Thresholds:
-    """What a window must reach: a tenth of the weakest contact in training, the strongest taxel's mean."""
+    """The thresholds for a window. contact: a tenth of the weakest contact in training, by the strongest taxel's mean."""
     weakest = float(sweeps.samples.mean(axis=1, dtype=np.float64).max(axis=(1, 2)).min())
     kind = sweeps.samples.dtype
     top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
-    # below the weakest also where a tared skin was pulled, and its digits are negative
+    # below the weakest also where a tared skin was pulled, so that its counts are negative
     contact = weakest - 0.9 * abs(weakest)
     return bundle.Thresholds(contact=contact, full_scale=float(top if full_scale is None else full_scale))
 
 
 def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> Array:
-    """Labels that the box gives, int64 [N] into the bundle's, or REFUSED or UNKNOWN.
+    """The box's labels, int64 [N] into the bundle's, or REFUSED or UNKNOWN.
 
-    fused: each sweep gets what the box says after all of its recording.
+    fused: each sweep gets the box's answer after all sweeps of its recording.
     """
     form, labels = sweeps.format, classifier.bundle.manifest.labels
     t_ns, seq = (np.arange(form.window) * form.period_ns).astype(np.int64), np.arange(form.window)
     recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
-    given = np.full(len(sweeps), REFUSED)
+    answers = np.full(len(sweeps), REFUSED)
     for i in np.argsort(recording, kind="stable"):
         frames = Frames(t_ns, seq, sweeps.samples[i])
         verdict = classifier(Sweep(int(i), 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1)))
         if verdict.label:
-            given[recording == recording[i] if fused else i] = labels.index(verdict.label)
+            answers[recording == recording[i] if fused else i] = labels.index(verdict.label)
         elif verdict.status is Status.UNKNOWN and not fused:
-            given[i] = UNKNOWN
-    return given
+            answers[i] = UNKNOWN
+    return answers
 
 
 def figures(classifier: Classifier, sweeps: Dataset, protocol: str) -> dict[str, Any]:
-    """Accuracy by sweep, and by recording where one holds several; what the box refuses or does not know is wrong."""
+    """Accuracy by sweep, and by recording where one holds several; a refused or unknown sweep counts as wrong."""
     right = score(classifier, sweeps) == sweeps.labels
-    told = {protocol: figure(int(right.sum()), len(sweeps))}
+    result = {protocol: figure(int(right.sum()), len(sweeps))}
     first = np.unique(sweeps.group("recording"), return_index=True)[1]
     if len(first) < len(sweeps):
         right = (score(classifier, sweeps, fused=True) == sweeps.labels)[first]
-        told[f"{protocol}, by recording"] = figure(int(right.sum()), len(first))
-    return told
+        result[f"{protocol}, by recording"] = figure(int(right.sum()), len(first))
+    return result
 
 
-def judge(folder: Path, held: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
-    """Figures of the bundle in `folder` on `held`, run as the box runs it; `logits` [N, K]: what export saw there.
+def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
+    """Figures of the bundle in `folder` on `held_out`, run as the box runs it; logits [N, K]: of the graph, on the same.
 
     Raises ExportRefused where the box gives another label than export, or refuses too many sweeps.
     """
     box = Classifier(bundle.load(folder), SystemClock())
     box.self_test()
-    given = score(box, held)
-    refused, unknown = given == REFUSED, given == UNKNOWN
-    if other := int(np.sum((given != logits.argmax(1)) & (given >= 0))):
-        raise ExportRefused(f"the box labels {other} of {len(held)} held-out sweeps otherwise than export did")
+    answers = score(box, held_out)
+    refused, unknown = answers == REFUSED, answers == UNKNOWN
+    if other := int(np.sum((answers != logits.argmax(1)) & (answers >= 0))):
+        raise ExportRefused(f"the box labels {other} of {len(held_out)} held-out sweeps otherwise than export did")
     if refused.mean() > MOST_REFUSED:
         raise ExportRefused(
-            f"the box would refuse {refused.sum()} of {len(held)} held-out sweeps (limit {MOST_REFUSED:.0%}); "
+            f"the box would refuse {refused.sum()} of {len(held_out)} held-out sweeps (limit {MOST_REFUSED:.0%}); "
             f"see their thresholds {box.bundle.manifest.thresholds}, and drop sweeps with stuck taxels from the set"
         )
     if unknown.mean() > MOST_UNKNOWN:
         raise ExportRefused(
-            f"the box would call {unknown.sum()} of {len(held)} held-out sweeps unknown (limit {MOST_UNKNOWN:.0%}, "
+            f"the box would call {unknown.sum()} of {len(held_out)} held-out sweeps unknown (limit {MOST_UNKNOWN:.0%}, "
             f"squared distance {box.bundle.manifest.known}); record more positions, so that it learns how sweeps vary"
         )
-    return figures(box, held, protocol)
+    return figures(box, held_out, protocol)
 
 
 @contextlib.contextmanager
-def _aside(target: Path) -> Iterator[Path]:
-    """A new folder beside `target` that takes its place when the block ends well, and vanishes when it does not."""
+def _replacing(target: Path) -> Iterator[Path]:
+    """A new folder beside `target` that replaces it when the block succeeds, and is removed when it fails."""
     if target.exists() and not (target / bundle.MANIFEST).is_file():
-        raise ExportRefused(f"{target} is no bundle and will not be replaced; name another folder with --out")
+        raise ExportRefused(f"{target} is not a bundle and will not be replaced; name another folder with --out")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with storage.folder(target.resolve()) as new:

@@ -1,6 +1,6 @@
-"""The room where a trained network becomes int8 for the box. In: a Fit. Out: its bundle, or a refusal.
+"""Quantization of a trained network for the box. In: a Fit. Out: its bundle in int8, or ExportRefused.
 
-Nothing leaves whose int8 form answers otherwise than what was trained.
+A network whose int8 form does not answer as the trained one is refused.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from train.onnx_tools.quantize import quantize
 
 Array = NDArray[Any]
 MOST_TORCH_DIFFERENCE = 0.01
-"""Of a logit, PyTorch against the float graph: the same sums in another order."""
+"""Of a logit, between PyTorch and the float graph: they add the same numbers in another order."""
 MOST_LOST = 0.005
-"""Of accuracy on held-out sweeps, float less int8: as float's own probabilities have it (Apart.expected_loss), whatever
-the number of sweeps; and as counted, where it is no chance. Counting alone cannot tell: two unsure sweeps of a hundred
-that change sides are two points lost or won."""
+"""Loss of accuracy on held-out sweeps, float less int8: as expected from float's probabilities (Apart.expected_loss),
+whatever the number of sweeps; and as counted, where that is significant. Counting alone is not enough: two uncertain
+sweeps of a hundred that change their label are two points lost or won."""
 CHANCE = 0.05
-"""As likely as that may it be, were neither form better, that int8 loses so many or more of the sweeps that they differ
-on (one-sided sign test); below, what was counted is believed."""
+"""Level of significance: of the one-sided sign test on the sweeps on which both forms differ, that int8 is not worse. The
+counted loss is used only where the probability is below it."""
 LEAST_AGREEMENT, MOST_PROBABILITY_DIFFERENCE, MOST_MEAN_DIFFERENCE = 0.96, 0.3, 0.025
-"""Share of held-out sweeps with equal labels, where one sweep may always differ; how far a probability of one may move,
-and that on average. Of 14 fits of four sizes to five sets the worst had .974, .199 and .015."""
+"""Share of held-out sweeps with equal labels, of which one may always differ; largest change of a probability, and its
+mean. Of 14 fits of four sizes to five sets the worst had 0.974, 0.199 and 0.015."""
 
 SATURATED = 0.01
-"""Share of a tensor's values beyond reach from which on it is named as the cause, though noise grows with every layer
-behind it."""
+"""Where a larger share of a tensor's values is beyond the range of int8, this tensor is named as the cause, although the
+noise grows with every later layer."""
 
 
 def export(
@@ -59,40 +59,44 @@ def export(
     reference, model = graphs(fit)
     with torch.no_grad():
         wanted = fit.network()(torch.from_numpy(fit.held.samples.astype(np.float32))).numpy()
-    apart = float(np.abs(wanted - parity.logits(reference, fit.held.samples)).max())
-    if not apart <= MOST_TORCH_DIFFERENCE:
+    difference = float(np.abs(wanted - parity.logits(reference, fit.held.samples)).max())
+    if not difference <= MOST_TORCH_DIFFERENCE:
         raise ExportRefused(
-            f"the float graph differs from pytorch by {apart:.3g} in a logit (limit {MOST_TORCH_DIFFERENCE}); "
-            f"fit again, and look at train/exact.py if it stays"
+            f"the float graph differs from pytorch by {difference:.3g} in a logit (limit {MOST_TORCH_DIFFERENCE}); "
+            "fit again; if it stays, compare train/models/compact/graph.py with network.py"
         )
-    about = fit.about | {"torch_difference": apart}
+    about = fit.about | {"torch_difference": difference}
     content = Content(model, "raw", fit.train, fit.held, fit.about["held_out_by"], about, made=fit)
     return pack(checked(content, reference), target, name, version, commit, full_scale, pitch_mm)
 
 
 def graphs(fit: Fit) -> tuple[onnx.ModelProto, onnx.ModelProto]:
-    """(float, int8): `sweep` -> `logits`, each with a head fitted on what its own trunk gives."""
+    """(float, int8): `sweep` -> `logits`, each with a head fitted on the features of its own trunk."""
     reference = with_head(fit.trunk(int8=False), fit.weights["head.weight"], fit.weights["head.bias"])
     return reference, with_head(fit.trunk(), *fit.int8_head())
 
 
 def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
-    """`content`, whose model is int8, with how it compares with its float form `reference`; as it is where there is none.
+    """`content`, whose model is int8, with a comparison with its float form `reference`; unchanged where that is None.
 
     Raises ExportRefused where `check` does.
     """
     if reference is None:
         return content
-    held = content.held
+    held_out = content.held_out
     found = parity.measure(
-        content.model, model_inputs(content.input, held), held.labels, reference, held.group(content.held_by)
+        content.model,
+        model_inputs(content.input, held_out),
+        held_out.labels,
+        reference,
+        held_out.group(content.held_out_by),
     )
     check(found)
     return replace(content, figures=content.figures | {"parity": found.summary()})
 
 
 def check(found: Parity) -> None:
-    """Raises ExportRefused, with the number, its limit and what to try, where int8 is not what float was."""
+    """Raises ExportRefused, with the number, its limit and what to try, where int8 differs too much from float."""
     apart, lost = found.apart, found.lost
     if apart is None or lost is None:
         raise ExportRefused("there is no float form that int8 could be compared with; export a fit")
@@ -106,10 +110,10 @@ def check(found: Parity) -> None:
             f"int8 is right on {lost.int8_right} of {lost.total} held-out sweeps, float on {lost.float_right}: "
             f"{100 * lost.lost:.2f} points lost (limit {100 * MOST_LOST}); {hint}"
         )
-    given_away, moved, moved_mean = apart.expected_loss, apart.probability_difference, apart.probability_mean
-    if not given_away <= MOST_LOST:
+    expected, moved, moved_mean = apart.expected_loss, apart.probability_difference, apart.probability_mean
+    if not expected <= MOST_LOST:
         raise ExportRefused(
-            f"int8 loses {100 * given_away:.2f} points on held-out sweeps, by float's own probabilities "
+            f"int8 loses {100 * expected:.2f} points on held-out sweeps, by float's own probabilities "
             f"(limit {100 * MOST_LOST}); {hint}"
         )
     if not (moved <= MOST_PROBABILITY_DIFFERENCE and moved_mean <= MOST_MEAN_DIFFERENCE):
@@ -129,9 +133,9 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
     Raises FormatError where formats or materials differ, or nothing is in int8.
     """
     if source.is_dir():
-        held = bundle.load(source)
-        form, materials = held.format, held.manifest.labels
-        model, reference, kind = onnx.load_from_string(held.model), None, held.manifest.input
+        loaded = bundle.load(source)
+        form, materials = loaded.format, loaded.manifest.labels
+        model, reference, kind = onnx.load_from_string(loaded.model), None, loaded.manifest.input
     else:
         made = Fit.load(source)
         form, materials, kind = made.train.format, made.train.materials, "raw"
@@ -143,8 +147,8 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
         )
     found = parity.measure(model, model_inputs(kind, sweeps), sweeps.labels, reference, sweeps.group("recording"))
     if file:
-        told = {"model": source.name, "set": sweeps.source} | found.json() | provenance()
-        put(file, (json.dumps(told, indent=1) + "\n").encode(), parents=True)
+        result = {"model": source.name, "set": sweeps.source} | found.json() | provenance()
+        put(file, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     return parity.table(found)
 
 
@@ -157,8 +161,8 @@ def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         small = Compact(form, classes, 0.1, norm=False).eval().graph()
-    digits = rng.integers(0, 256, (4, form.window, form.rows, form.cols), np.uint8)
-    paper = quantize(networks.paper_cnn(form, classes, rng), digits, PAPER_INT8)
+    counts = rng.integers(0, 256, (4, form.window, form.rows, form.cols), np.uint8)
+    paper = quantize(networks.paper_cnn(form, classes, rng), counts, PAPER_INT8)
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "fp32.onnx", folder / "paper_int8.onnx"
     for path, model in zip(paths, (small, paper), strict=True):

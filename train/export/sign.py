@@ -1,7 +1,7 @@
-"""The room where a bundle is signed. In: a bundle's folder, somebody's key, a counter. Out: the bundle with its signature.
+"""Signing a bundle. In: a bundle's folder, a key, a counter. Out: the bundle with its signature.
 
-The box refuses a bundle whose counter is not above that of each that it has committed, so that no old one, however well
-signed, can be put back unnoticed. The counter is the signer's: count what you deliver, from 1.
+The box refuses a bundle whose counter is not above that of every bundle it has committed, so that nobody can install an
+old one again, even with a valid signature. The signer chooses the counter: number your deliveries, from 1.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from appliance.deployment import signature
 
 
 def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
-    """Sign the bundle in `folder`; its manifest. counter: goes into the manifest first, so the bundle's id changes.
+    """Sign the bundle in `folder`; its manifest. counter: is written into the manifest first, so the bundle's id changes.
 
-    Raises BundleError where the bundle is not whole or has no counter yet, and ConfigError where `key` does not sign.
+    Raises BundleError where the bundle is incomplete or has no counter yet, and ConfigError where `key` does not sign.
     """
     manifest = bundle.load(folder).manifest
     if counter is not None:

@@ -74,6 +74,7 @@ def _panel(axes: Axes, spots: Sequence[Spot], y: str, cost: str) -> None:
     axes.grid(color=FAINT, linewidth=0.6)
     tens = 10.0 ** np.arange(np.floor(np.log10(x.min())), np.ceil(np.log10(x.max())) + 1)
     ticks = [k * t for t in tens for k in (1, 3) if axes.get_xlim()[0] <= k * t <= axes.get_xlim()[1]]
+    ticks = ticks or [float(f"{x.min():.1g}")]  # a single dot may have neither 1 nor 3 times a power of ten in reach
     axis = COSTS[cost]
     set_ticks(axes.xaxis, ticks, axis.unit)
     set_ticks(axes.yaxis, np.arange(bottom, 1.001, 0.1 if bottom >= 0.4 else 0.2), percent=True)

@@ -1,8 +1,8 @@
-"""The room of what is left out. In: a scene's sweeps, and what varies there. Out: what a method gets right on each sweep.
+"""Nested cross-validation. In: a scene's sweeps, and the groups that vary there. Out: what a method gets right.
 
-The values of every group that varies are drawn into a few parts. A method is trained without one part, or without two,
-and tested on them. One training without the parts p and q serves twice: seen from p, which stays unseen until the end,
-it is the inner fold that tests on q, and the other way round.
+The values of every group that varies are distributed over a few parts. A method is trained without one part, or without
+two, and tested on them. One training without the parts p and q is used twice: as the inner fold that tests on q while p
+is held out, and the other way round.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from train.selection.scene import Scene
 
 Array = NDArray[Any]
 FOLDS = {0: 5, 1: 5, 2: 4}
-"""Parts of each group by the number of groups; THREE for more. Five make fifteen trainings of a method, two times four
-thirty-six."""
-THREE = 3
+"""Parts of each group by the number of groups; MANY_GROUPS for more. Five parts make fifteen trainings of a method, two
+times four parts thirty-six."""
+MANY_GROUPS = 3
 Unseen = tuple[int, ...]
-"""Numbers of the one or two parts that a training does without."""
+"""Numbers of the one or two parts that are left out of a training."""
 
 
 class Refused(FormatError):
@@ -52,40 +52,41 @@ class HeldOutPart:
 
 
 def parts(sweeps: Dataset, varies: Sequence[str], folds: int = 0) -> list[HeldOutPart]:
-    """The parts of all groups `varies`; of recordings, materials spread evenly, where nothing varies.
+    """The parts of all groups `varies`; of recordings, with materials spread evenly, where nothing varies.
 
-    Raises FormatError where a group has a single value, cuts recordings, or takes a material along when left out.
+    Raises FormatError where a group has a single value, divides recordings, or where leaving out a part leaves a material
+    without training sweeps.
     """
-    most = folds or FOLDS.get(len(varies), THREE)
+    most = folds or FOLDS.get(len(varies), MANY_GROUPS)
     if not varies:
         recordings = sweeps.group("recording")
         drawn = Protocol(f"random:{most}").folds(sweeps, 1)
         return [_part(sweeps, "recording", np.unique(recordings[test])) for _, test in drawn]
-    found = []
+    found: list[HeldOutPart] = []
     for name in varies:
         values = np.unique(sweeps.group(name))
         if len(values) < 2:
             raise FormatError(f"{sweeps.source}: group {name!r} has one value, {values[0]}; take it out of varies")
-        mixed = np.random.default_rng(0).permutation(values)
-        found += [_part(sweeps, name, some) for some in np.array_split(mixed, min(most, len(values)))]
+        shuffled = np.random.default_rng(0).permutation(values)
+        found += [_part(sweeps, name, some) for some in np.array_split(shuffled, min(most, len(values)))]
     return found
 
 
 def _part(sweeps: Dataset, name: str, values: Array) -> HeldOutPart:
-    told = ", ".join(map(str, sorted(values.tolist())[:5]))
+    first = ", ".join(map(str, sorted(values.tolist())[:5]))
     out = np.isin(sweeps.group(name), values)
     recording = sweeps.group("recording")
     if set(recording[out]) & set(recording[~out]):
         raise FormatError(f"{sweeps.source}: group {name!r} cuts recordings in two; take it out of varies")
     for label in np.setdiff1d(sweeps.labels[out], sweeps.labels[~out]):
-        raise FormatError(f"{sweeps.source}: without {name} {told} there is no {sweeps.materials[label]!r} to train on; "
+        raise FormatError(f"{sweeps.source}: without {name} {first} there is no {sweeps.materials[label]!r} to train on; "
                           f"record it elsewhere too, or take {name!r} out of varies")  # fmt: skip
     return HeldOutPart(name, tuple(sorted(values.tolist())), out)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How far one method is behind another: the mean share of sweeps, its standard error, its 95 % interval."""
+    """How far one method is behind another: the mean share of sweeps, its standard error and its 95 % interval."""
 
     mean: float
     se: float
@@ -94,18 +95,18 @@ class Difference:
 
     @property
     def within(self) -> bool:
-        """Not more than one standard error."""
+        """Whether it is at most one standard error."""
         return self.mean <= self.se + 1e-12
 
     def json(self) -> dict[str, float]:
-        """As scripts read it."""
+        """For scripts, rounded."""
         return {k: round(v, 4) for k, v in vars(self).items()}
 
 
 class Trials:
-    """Trains and tests on a scene's sweeps, each training once. sweeps: as they are; asked: with those under stress.
+    """Trains and tests on a scene's sweeps, each training once. sweeps: as recorded; asked: with the corrupted ones too.
 
-    conditions: names of what the test sweeps are under, of which each counts the same; the first is nothing.
+    conditions: names of the corruptions of the test sweeps, of which each counts the same; the first is none.
     """
 
     def __init__(
@@ -118,21 +119,22 @@ class Trials:
         self.clusters = np.stack([sweeps.group(name) for name in self.groups])
         found = corruptions.find(list(scene.stress))
         self.conditions = ["as recorded", *(f"{s.name} {scene.stress[s.name]:g} {s.unit}" for s in found)]
-        under = [s.apply(EvaluationSweeps(sweeps), scene.stress[s.name], 1) for s in found]
-        many = len(self.conditions)
+        corrupted = [s.apply(EvaluationSweeps(sweeps), scene.stress[s.name], 1) for s in found]
+        count = len(self.conditions)
         self.asked = replace(
-            sweeps, samples=np.concatenate([sweeps.samples, *under]), labels=np.tile(sweeps.labels, many),
-            groups={k: np.tile(v, many) for k, v in sweeps.groups.items()},
+            sweeps, samples=np.concatenate([sweeps.samples, *corrupted]), labels=np.tile(sweeps.labels, count),
+            groups={k: np.tile(v, count) for k, v in sweeps.groups.items()},
         )  # fmt: skip
         self._done: dict[Any, Fold] = {}
 
     def pairs(self) -> list[Unseen]:
-        """All two parts without which two materials are left to train on."""
+        """All pairs of parts without which two materials are left to train on."""
         every = combinations(range(len(self.parts)), 2)
-        return [u for u in every if len(np.unique(self.sweeps.labels[self._left(u)])) > 1]
+        return [u for u in every if len(np.unique(self.sweeps.labels[self._kept(u)])) > 1]
 
     def run(self, method: str, what: Sequence[Unseen], changes: Sequence[Change] = ()) -> None:
-        """Train `method` without each of `what`; changes: of the sweeps, one for each of `what`. Raises Refused."""
+        """Train `method` without each of `what`; changes: of the sweeps, one for each of `what`. Raises Refused where the
+        method cannot work with them."""
         changes = changes or [WHOLE] * len(what)
         left = [(method, c, s, u) for u, c in zip(what, changes, strict=True) for s in self.seeds
                 if (method, c, s, u) not in self._done]  # fmt: skip
@@ -152,69 +154,76 @@ class Trials:
             if self._done[name].refused:
                 raise Refused(self._done[name].refused)
 
-    def _left(self, unseen: Unseen) -> Array:
-        return ~np.any([self.parts[p].out for p in unseen], axis=0)
+    def _kept(self, unseen: Unseen) -> Array:
+        """bool [N], the sweeps outside the parts `unseen`."""
+        kept: Array = ~np.any([self.parts[p].out for p in unseen], axis=0)
+        return kept
 
     def _split(self, unseen: Unseen) -> tuple[Array, Array]:
-        """Numbers of sweeps of `asked`: sound ones to train on, all conditions to test on."""
-        left = self._left(unseen)
-        return np.flatnonzero(left), np.flatnonzero(np.tile(~left, len(self.conditions)))
+        """Numbers of sweeps of `asked`: those as recorded to train on, all conditions to test on."""
+        kept = self._kept(unseen)
+        return np.flatnonzero(kept), np.flatnonzero(np.tile(~kept, len(self.conditions)))
 
     def folds(self, method: str, unseen: Unseen, change: Change = WHOLE) -> Iterator[tuple[int, Array, Array]]:
-        """What `run` found, for each seed and condition: the condition's number, sweeps [n], logits [n, K]."""
+        """The results of `run` for each seed and condition: the condition's number, sweeps [n], logits [n, K]."""
         for seed in self.seeds:
             fold = self._done[method, change, seed, unseen]
             condition, sweep = np.divmod(fold.test, len(self.sweeps))
             for c in range(len(self.conditions)):
-                mine = condition == c
-                yield c, sweep[mine], fold.logits[mine]
+                tested = condition == c
+                yield c, sweep[tested], fold.logits[tested]
 
     def right(self, method: str, unseen: Unseen, change: Change = WHOLE) -> Array:
-        """Share [N] of the seeds and conditions in which each sweep was named rightly; not a number where not tested."""
+        """Share [N] of the seeds and conditions in which each sweep got the right label; NaN where it was not tested."""
         total = np.zeros(len(self.sweeps))
         for _, sweep, logits in self.folds(method, unseen, change):
             total[sweep] += logits.argmax(1) == self.sweeps.labels[sweep]
-        total[self._left(unseen)] = np.nan
-        return total / (len(self.seeds) * len(self.conditions))
+        total[self._kept(unseen)] = np.nan
+        share: Array = total / (len(self.seeds) * len(self.conditions))
+        return share
 
     def scores(self, method: str, aside: int | None = None, changes: Sequence[Change] = ()) -> Array:
         """`right` of every sweep when its own part is left out, [groups, N].
 
-        aside: a part that no training and no test saw; not a number there. changes: of the sweeps, one for each part.
+        aside: a part that no training and no test may use; NaN there. changes: of the sweeps, one for each part.
         """
         rows = np.full((len(self.groups), len(self.sweeps)), np.nan)
         keys = self.seen_from(aside)
         for (p, unseen), change in zip(keys.items(), changes or [WHOLE] * len(keys), strict=True):
-            inside = self.parts[p].out if aside is None else self.parts[p].out & ~self.parts[aside].out
-            rows[self.groups.index(self.parts[p].group), inside] = self.right(method, unseen, change)[inside]
+            tested = self.parts[p].out if aside is None else self.parts[p].out & ~self.parts[aside].out
+            rows[self.groups.index(self.parts[p].group), tested] = self.right(method, unseen, change)[tested]
         return rows
 
     def seen_from(self, aside: int | None) -> dict[int, Unseen]:
-        """By part that is tested on, what the training does without: it alone, or it and the part `aside`."""
+        """By part that is tested on, the parts left out of the training: that part alone, or it and the part `aside`."""
         if aside is None:
             return {p: (p,) for p in range(len(self.parts))}
         pairs = [u for u in self.pairs() if aside in u]
         return {u[u[0] == aside]: u for u in pairs}
 
     def difference(self, better: Array, worse: Array) -> Difference:
-        """Of two methods' `scores`, sweep by sweep: what both find hard does not count.
+        """Of two methods' `scores`, paired by sweep: a sweep that is hard for both does not count.
 
-        The standard error is that of the mean over values of the group, which fail together, or that over sweeps where
-        it is larger: a few values may agree by chance. Of several groups it is the mean of theirs, as if they failed
-        together too.
+        The standard error is that of the mean over values of the group, whose sweeps are correlated, or that over sweeps
+        where it is larger: a few values may agree by chance. Of several groups it is the mean of theirs, as if these were
+        correlated too.
         """
-        means, errors, freedom = [], [], []
+        means: list[float] = []
+        errors: list[float] = []
+        freedom: list[int] = []
         for lost, cluster in zip(better - worse, self.clusters, strict=True):
             there = np.isfinite(lost)
             if there.any():
                 mean, error, n = _error(lost[there], cluster[there])
-                means, errors, freedom = [*means, mean], [*errors, error], [*freedom, n - 1]
+                means.append(mean)
+                errors.append(error)
+                freedom.append(n - 1)
         mean, se = float(np.mean(means)), float(np.mean(errors))
-        wide = float(student.ppf(0.975, max(min(freedom), 1))) * se
-        return Difference(mean, se, mean - wide, mean + wide)
+        half_width = float(student.ppf(0.975, max(min(freedom), 1))) * se
+        return Difference(mean, se, mean - half_width, mean + half_width)
 
     def mean(self, scores: Array) -> float:
-        """Mean over groups of the share that is right."""
+        """Mean over groups of the share of right answers."""
         return float(np.mean([np.nanmean(row) for row in scores if np.isfinite(row).any()]))
 
     def accuracy(self, scores: Array) -> dict[str, float]:
@@ -226,12 +235,12 @@ class Trials:
 
     def tested(self, method: str) -> tuple[Array, Array, Array, Array]:
         """All tests with one part left out: group, condition and sweep [n], probabilities [n, K]."""
-        held: list[tuple[Array, ...]] = []
+        rows: list[tuple[Array, ...]] = []
         for p, part in enumerate(self.parts):
             for c, sweep, logits in self.folds(method, (p,)):
                 group = np.full(len(sweep), self.groups.index(part.group))
-                held.append((group, np.full(len(sweep), c), sweep, softmax(logits)))
-        group, condition, sweep, probability = (np.concatenate(column) for column in zip(*held, strict=True))
+                rows.append((group, np.full(len(sweep), c), sweep, softmax(logits)))
+        group, condition, sweep, probability = (np.concatenate(column) for column in zip(*rows, strict=True))
         return group, condition, sweep, probability
 
 
@@ -239,7 +248,7 @@ def _error(lost: Array, cluster: Array) -> tuple[float, float, int]:
     """Mean of `lost` [n], its standard error, and how many clusters there are."""
     member = np.unique(cluster, return_inverse=True)[1]
     mean, n = float(lost.mean()), int(member.max()) + 1
-    alone = float(lost.std(ddof=1)) / np.sqrt(len(lost)) if len(lost) > 1 else 0.0
-    together = np.bincount(member, lost - mean)
-    grouped = np.sqrt(n / (n - 1) * np.sum(together**2)) / len(lost) if n > 1 else 0.0
-    return mean, max(alone, float(grouped)), n
+    by_sweep = float(lost.std(ddof=1)) / np.sqrt(len(lost)) if len(lost) > 1 else 0.0
+    sums = np.bincount(member, lost - mean)
+    by_cluster = np.sqrt(n / (n - 1) * np.sum(sums**2)) / len(lost) if n > 1 else 0.0
+    return mean, max(by_sweep, float(by_cluster)), n

@@ -1,7 +1,7 @@
-"""The room of what a scene does not need. In: a Selection. Out: a curve for each thing that may be left out, and a Change.
+"""How far the sweeps of a scene can be reduced. In: a Selection. Out: a curve for each kind of reduction, and a Change.
 
-Each curve trains the chosen method anew with less, on the same parts, and compares with the whole, sweep by sweep. What
-is kept is the least for which it, and all that is more, loses no more than one standard error.
+Each curve trains the chosen method again on reduced sweeps, on the same parts, and compares it with whole sweeps, paired
+by sweep. Kept is the strongest reduction for which it, and every weaker one, loses at most one standard error.
 """
 
 from __future__ import annotations
@@ -22,34 +22,35 @@ from train.selection.select import Selection
 Array = NDArray[Any]
 Json = dict[str, Any]
 Step = tuple[str, float, list[Change], Change]
-"""One point of a curve: its name, the share that is left, the change for each part, that for all sweeps."""
+"""One point of a curve: its name, the share that is left, the change for each part, the change for all sweeps."""
 WINDOWS, RATES, BITS = (0.75, 0.5, 0.25), (2, 4, 8), (1, 2, 3, 4)
-BEYOND = 2
-"""A curve ends at the second point that loses too much: two show where it falls."""
+POINTS_BEYOND = 2
+"""A curve ends at the second point that loses too much: two show where accuracy falls."""
 CONFUSED = 0.25
-"""Two materials are proposed as one where so many of their sweeps are taken for each other; tossing a coin gives half."""
-SET_IT = {
+"""Two materials are proposed as one where this share of their sweeps is confused; guessing gives half."""
+HOW_TO_SET = {
     "window": "nothing to set: the box takes the middle of each sweep; the robot may slide for less long",
     "rate": "set the readout board to average {0} frames and send one",
     "taxels": "connect only these taxels, in this order, or leave the others out on the readout board",
-    "bits": "a converter of this many bits will do; the digits keep their type, and nothing changes in the bundle",
+    "bits": "a converter of this many bits will do; the raw counts keep their type, and nothing changes in the bundle",
 }
 
 
 def curves(choice: Selection, scene: Scene, log: Callable[[str], None]) -> tuple[list[Json], Change, Json]:
-    """The curves of scene.reduce; what of scene.apply is left out together, and the accuracy with it."""
-    told, least = [], {}
+    """The curves of scene.reduce; the reductions of scene.apply as one Change, and the accuracy with it."""
+    found: list[Json] = []
+    strongest: dict[str, Step] = {}
     for kind in scene.reduce:
         if kind == "classes":
-            told.append(classes(choice, scene.accuracy))
+            found.append(classes(choice, scene.accuracy))
             continue
-        log(f"with less of {kind}")
-        curve, least[kind] = _curve(choice, scene, kind)
-        told.append(curve)
-    applied, accuracy = _together(choice, scene, {kind: least[kind] for kind in scene.apply if kind in least})
-    for curve in told:
+        log(f"reduced: {kind}")
+        curve, strongest[kind] = _curve(choice, scene, kind)
+        found.append(curve)
+    applied, accuracy = _together(choice, scene, {kind: strongest[kind] for kind in scene.apply if kind in strongest})
+    for curve in found:
         curve["applied"] = getattr(applied, curve["kind"], None) != getattr(WHOLE, curve["kind"], None)
-    return told, applied, accuracy
+    return found, applied, accuracy
 
 
 def _curve(choice: Selection, scene: Scene, kind: str) -> tuple[Json, Step]:
@@ -66,14 +67,16 @@ def _curve(choice: Selection, scene: Scene, kind: str) -> tuple[Json, Step]:
         fine = _fine(trials, scene, full, scores)
         points.append(_point(trials, full, scores, step, fine))
         beyond += not fine
-        if beyond == BEYOND:
+        if beyond == POINTS_BEYOND:
             break
         if not beyond:
             kept = step
     change = kept[3]
-    set_it = SET_IT[kind].format(change.rate) if change != WHOLE else ""
+    how_to_set = HOW_TO_SET[kind].format(change.rate) if change != WHOLE else ""
     taxels = {"taxels": [list(divmod(t, trials.sweeps.format.cols)) for t in sorted(change.taxels)]}
-    return {"kind": kind, "points": points, "kept": kept[0], "set": set_it} | (taxels if change.taxels else {}), kept
+    return {"kind": kind, "points": points, "kept": kept[0], "set": how_to_set} | (
+        taxels if change.taxels else {}
+    ), kept
 
 
 def _scores(trials: Trials, method: str, step: Step) -> Array:
@@ -82,7 +85,7 @@ def _scores(trials: Trials, method: str, step: Step) -> Array:
 
 
 def _fine(trials: Trials, scene: Scene, full: Array, scores: Array) -> bool:
-    """Less is enough, and does not fall below what is wanted where the whole does not."""
+    """Whether the reduced sweeps suffice, and do not miss the wanted accuracy where the whole ones reach it."""
     falls_short = trials.mean(scores) < scene.accuracy <= trials.mean(full)
     return trials.difference(full, scores).within and not falls_short
 
@@ -116,21 +119,21 @@ def _rates(trials: Trials) -> Iterator[Step]:
 
 def _bits(trials: Trials) -> Iterator[Step]:
     kind = trials.sweeps.samples.dtype
-    of = 8 if kind.kind == "f" else 8 * kind.itemsize
+    all_bits = 8 if kind.kind == "f" else 8 * kind.itemsize
     for bits in BITS:
-        yield f"{of - bits} bits", 1 - bits / of, [Change(bits=bits)] * len(trials.parts), Change(bits=bits)
+        yield f"{all_bits - bits} bits", 1 - bits / all_bits, [Change(bits=bits)] * len(trials.parts), Change(bits=bits)
 
 
 def _taxels(trials: Trials) -> Iterator[Step]:
-    """Powers of two. Which ones is found anew without each part: that is part of what is judged."""
+    """Numbers of taxels that are powers of two. Which taxels is found again without each part, as it is part of the test."""
     form = trials.sweeps.format
-    many = form.rows * form.cols
+    count = form.rows * form.cols
     orders = [transforms.order(trials.sweeps.take(~part.out)) for part in trials.parts]
     overall = transforms.order(trials.sweeps)
-    n = 2 ** ((many - 1).bit_length() - 1) if many > 1 else 0
+    n = 2 ** ((count - 1).bit_length() - 1) if count > 1 else 0
     while n:
         change = [Change(taxels=tuple(sorted(order[:n]))) for order in orders]
-        yield f"{n} taxels", n / many, change, Change(taxels=tuple(sorted(overall[:n])))
+        yield f"{n} taxels", n / count, change, Change(taxels=tuple(sorted(overall[:n])))
         n //= 2
 
 
@@ -140,9 +143,9 @@ STEPS: dict[str, Callable[[Trials], Iterator[Step]]] = {
 
 
 def _together(choice: Selection, scene: Scene, least: dict[str, Step]) -> tuple[Change, Json]:
-    """What is left out of all that may be, one after another as long as all together lose no more than may be lost."""
+    """The reductions of `least` applied one after another, each kept only while all kept ones together are still fine."""
     trials, method = choice.trials, choice.final.chosen
-    full = held = choice.final.scores[method]
+    full = reduced = choice.final.scores[method]
     changes, total = [WHOLE] * len(trials.parts), WHOLE
     for name, share, each, change in least.values():
         if change == WHOLE:
@@ -153,21 +156,22 @@ def _together(choice: Selection, scene: Scene, least: dict[str, Step]) -> tuple[
         except FormatError:
             continue
         if _fine(trials, scene, full, scores):
-            changes, total, held = both, total.and_then(change), scores
-    return total, trials.accuracy(held) | {"behind": trials.difference(full, held).json()}
+            changes, total, reduced = both, total.and_then(change), scores
+    return total, trials.accuracy(reduced) | {"behind": trials.difference(full, reduced).json()}
 
 
 def classes(choice: Selection, wanted: float) -> Json:
-    """What is gained by counting materials as one, the most confused pair first; counted, not trained anew.
+    """The accuracy gained by merging materials, the most confused pair first; counted without training again.
 
-    Proposed are pairs that are CONFUSED, and as many as it takes to reach what is wanted. Nothing is applied: whether
-    two materials may be one is not ours to say.
+    Proposed are pairs that are CONFUSED, and as many as are needed to reach the wanted accuracy. Nothing is applied:
+    only the user knows whether two materials may share a name.
     """
     trials = choice.trials
     group, _, sweep, probability = trials.tested(choice.final.chosen)
-    label, names = trials.sweeps.labels[sweep], [(name,) for name in trials.sweeps.materials]
+    label = trials.sweeps.labels[sweep]
+    names: list[tuple[str, ...]] = [(name,) for name in trials.sweeps.materials]
     points: list[Json] = []
-    proposed, merged, going = [(name,) for name in trials.sweeps.materials], "", True
+    proposed, merged, proposing = list(names), "", True
     while True:
         rows = _rows(trials, group, sweep, probability.argmax(1) == label)
         accuracy, share = trials.accuracy(rows), len(names) / len(trials.sweeps.materials)
@@ -178,17 +182,17 @@ def classes(choice: Selection, wanted: float) -> Json:
         a, b = np.unravel_index(confused.argmax(), confused.shape)
         names[a], merged = names[a] + names[b], " + ".join(names[a] + names[b])
         names.pop(b)
-        if going := going and (confused[a, b] >= CONFUSED or accuracy["mean"] < wanted):
+        if proposing := proposing and (confused[a, b] >= CONFUSED or accuracy["mean"] < wanted):
             proposed = list(names)
         probability[:, a] += probability[:, b]
         probability = np.delete(probability, b, axis=1)
         label = np.where(label == b, a, label - (label > b))
-    together = [list(those) for those in proposed if len(those) > 1]
+    together = [list(merge) for merge in proposed if len(merge) > 1]
     return {"kind": "classes", "points": points, "kept": points[0]["name"], "proposed": together, "set": ""}
 
 
 def _confused(label: Array, probability: Array) -> Array:
-    """[K, K], above the diagonal: the share of two materials' sweeps that are taken for the other one."""
+    """[K, K], above the diagonal: the share of two materials' sweeps that are labelled as the other one."""
     k = probability.shape[1]
     counts = np.zeros((k, k))
     np.add.at(counts, (label, probability.argmax(1)), 1)
@@ -198,7 +202,7 @@ def _confused(label: Array, probability: Array) -> Array:
 
 def _rows(trials: Trials, group: Array, sweep: Array, right: Array) -> Array:
     """`right` of all tests as scores [groups, N]."""
-    total, many = np.zeros((2, len(trials.groups), len(trials.sweeps)))
+    total, count = np.zeros((2, len(trials.groups), len(trials.sweeps)))
     np.add.at(total, (group, sweep), right)
-    np.add.at(many, (group, sweep), 1)
-    return np.where(many > 0, total / np.maximum(many, 1), np.nan)
+    np.add.at(count, (group, sweep), 1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -1,4 +1,4 @@
-"""The room of scenes: what an integrator has, and what must do there. In: scene.toml. Out: a checked Scene and its sweeps.
+"""Scenes: what an integrator has, and what a model must do there. In: scene.toml. Out: a checked Scene and its sweeps.
 
 docs/choose/tubes.toml shows every key. The dataclasses are the schema: a field's type and limits say what the file may hold.
 """
@@ -25,9 +25,9 @@ from train.evaluation import corruptions
 from train.models import methods
 
 REDUCTIONS = ("window", "rate", "taxels", "bits", "classes")
-"""What may be tried with less of."""
+"""Properties of the sweeps that can be reduced."""
 APPLICABLE = ("window", "rate", "taxels")
-"""Of these, what a bundle's format holds. The others are told only."""
+"""Those of them that the format of a bundle holds. The others are only reported."""
 
 
 def _text(default: str, form: re.Pattern[str] = LABEL) -> Any:
@@ -38,8 +38,8 @@ def _text(default: str, form: re.Pattern[str] = LABEL) -> Any:
 
 
 def _texts(value: Any) -> tuple[str, ...] | None:
-    sound = isinstance(value, list) and all(isinstance(v, str) and v for v in value) and len(set(value)) == len(value)
-    return tuple(value) if sound else None
+    valid = isinstance(value, list) and all(isinstance(v, str) and v for v in value) and len(set(value)) == len(value)
+    return tuple(value) if valid else None
 
 
 def _list(default: tuple[str, ...] = (), of: tuple[str, ...] = ()) -> Any:
@@ -56,17 +56,19 @@ def _severities(value: Any) -> dict[str, float] | None:
 
 
 def _merged(value: Any) -> dict[str, tuple[str, ...]] | None:
-    held = {name: _texts(names) for name, names in value.items()} if isinstance(value, dict) else {"": None}
-    sound = all(names and LABEL.fullmatch(name) for name, names in held.items())
-    return held if sound else None  # type: ignore[return-value]
+    if not isinstance(value, dict):
+        return None
+    found = {name: names for name, listed in value.items() if (names := _texts(listed)) and LABEL.fullmatch(name)}
+    return found if len(found) == len(value) else None
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What the board has for a sweep. Without a limit a figure does not count.
+    """The limits of the board; a figure without a limit does not count. Measured as export.measure measures.
 
-    ms: for features and network together. kb: 1000 bytes, of the whole bundle. mb: 2**20 bytes, resident with it.
-    slower: how many of this machine's ms are one of the board's: an assumption, until it is measured there.
+    ms: processor time of a sweep in the box's classifier. kb: size of the whole bundle in units of 1000 bytes. mb: resident
+    memory of a process with the bundle in MiB. slower: how many ms the board needs for one of this machine's: an
+    assumption, until it is measured there.
     """
 
     ms: float = number(math.inf, 0.001, 1_000_000)
@@ -77,14 +79,15 @@ class Budget:
 
 @dataclass(frozen=True)
 class Scene:
-    """What scene.toml says. Every field but `sets` may be left out.
+    """The content of scene.toml. Every field but `sets` may be left out.
 
-    name, version: of the bundle; the file's own name, and "1". sets: as --set, files relative to scene.toml, $NAMES of
-    the environment filled in; only: as --only. materials: those at hand, all where empty; merge: of several labels
-    one. varies: groups that are others at work than in training. folds: into how many parts the values of each are
-    drawn (0: five for one group, four for two, else three). stress: severity by name. accuracy: wanted; 0: as much as
-    there is. seeds: of training, 1 to so many. methods: the ladder, where it is not the usual one. reduce: what may be
-    tried with less of; apply: with what of it the bundle is packed. full_scale: the sensor's highest digit; 0: its type's.
+    name, version: of the bundle; default: the file's name, and "1". sets: as --set, files relative to scene.toml, $NAMES
+    replaced by environment variables; only: as --only. materials: those to tell apart, all where empty; merge: several
+    labels that become one. varies: groups that differ in operation from training. folds: number of parts of each group
+    (0: five for one group, four for two, else three). stress: severity by name of the corruption. accuracy: wanted; 0:
+    as high as possible. seeds: number of seeds of training, from 1 on. methods: the candidates, where they are not the
+    usual ones. reduce: properties to try with less of; apply: those of them with which the bundle is packed. full_scale:
+    the sensor's highest raw count; 0: the maximum of its type.
     """
 
     name: str = _text("")
@@ -106,8 +109,8 @@ class Scene:
     path: Path = Path()
 
     def sweeps(self) -> Dataset:
-        """The sweeps at hand, narrowed and merged. Raises FormatError naming scene.toml and what does not fit the sets."""
-        whole = sets.join([sets.load(self._place(spec), 1) for spec in self.sets]).select(self.only)
+        """The sweeps of the sets, narrowed and merged. Raises FormatError naming scene.toml and what does not fit the sets."""
+        whole = sets.join([sets.load(self._located(spec), 1) for spec in self.sets]).select(self.only)
         known = whole.materials
         for name in (*self.materials, *(m for names in self.merge.values() for m in names)):
             if name not in known:
@@ -128,7 +131,8 @@ class Scene:
                 raise self._error("varies", name, (*sorted(part.groups), "recording"))
         return part
 
-    def _place(self, spec: str) -> str:
+    def _located(self, spec: str) -> str:
+        """`spec` with environment variables replaced, and a file relative to scene.toml."""
         full = os.path.expandvars(spec)
         if "$" in full:
             raise FormatError(f"{self.path.name}: sets: {spec!r} names a variable that is not set; set it to a folder")
@@ -141,31 +145,31 @@ class Scene:
 def read(path: Path) -> Scene:
     """The scene in a file. Raises FormatError naming the file, the key, its value and what is allowed."""
     try:
-        told = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
         raise FormatError(f"{path.name}: not TOML: {e}") from e
-    budget = told.pop("budget", {})
+    budget = table.pop("budget", {})
     if not isinstance(budget, dict):
         raise FormatError(f"{path.name}: budget = {budget!r} is not allowed; write a table [budget]")
     name = re.sub(r"[^A-Za-z0-9 _.-]", "-", path.stem).lstrip(" _.-")[:24] or "scene"
-    found = {"name": name} | _values(path.name, "", Scene, told)
+    found = {"name": name} | _values(path.name, "", Scene, table)
     scene = Scene(**found, budget=Budget(**_values(path.name, "budget.", Budget, budget)), path=path)
-    _check(scene, told)
+    _check(scene, table)
     return scene
 
 
-def _values(file: str, section: str, schema: type[Any], told: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of one table, each as its field has it."""
+def _values(file: str, section: str, schema: type[Any], table: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of one table, each as its field reads it."""
     known = {name: key for name, key in keys(schema).items() if key.limits}
     return read_table(
-        known, told,
+        known, table,
         unknown=lambda name: FormatError(f"{file}: key {section}{name} is unknown{_near(name, tuple(known))}"),
         refused=lambda why: FormatError(f"{file}: {section}{why}"),
     )  # fmt: skip
 
 
-def _check(scene: Scene, told: Mapping[str, Any]) -> None:
-    """What fits no single key. Raises FormatError."""
+def _check(scene: Scene, table: Mapping[str, Any]) -> None:
+    """Check what concerns several keys. Raises FormatError."""
     file = scene.path.name
     if not scene.sets:
         raise FormatError(f'{file}: no sets; name some, e.g. sets = ["recordings.npz"]')
@@ -189,7 +193,7 @@ def _check(scene: Scene, told: Mapping[str, Any]) -> None:
             raise FormatError(
                 f"{file}: stress.{name} = {severity:g} is out of range; use up to {most:g} {digital[name].unit}"
             )
-    if "apply" in told and (unused := set(scene.apply) - set(scene.reduce)):
+    if "apply" in table and (unused := set(scene.apply) - set(scene.reduce)):
         raise FormatError(f"{file}: apply names {min(unused)!r}, which is not in reduce; add it there")
 
 

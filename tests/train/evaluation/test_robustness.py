@@ -386,7 +386,7 @@ def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pyte
     first = robustness.run(["a", "b"], sweeps, trial, where, seeds=(1, 2), log=lines.append)
     assert [line.split(" done")[0] for line in lines] == ["1/4", "2/4", "3/4", "4/4"]
     assert first["methods"]["b"]["seeds"] == [1, 2]
-    monkeypatch.setattr(robustness, "one", None)
+    monkeypatch.setattr(robustness, "evaluate_method", None)
     assert robustness.run(["a", "b"], sweeps, trial, where, seeds=(1, 2)) == first
     monkeypatch.undo()
     with pytest.raises(FormatError, match="method 'a' is unknown"):

@@ -101,10 +101,10 @@ def test_accuracies_count_right_answers(monkeypatch: pytest.MonkeyPatch) -> None
     def told(kind: str, of: sim_calibration.sets.SweepSet) -> np.ndarray:
         return of.labels[:, None] + rng.normal(0, 0.01, (len(of), 3))
 
-    monkeypatch.setattr(sim_calibration.methods, "given", told)
+    monkeypatch.setattr(sim_calibration.methods, "model_inputs", told)
     assert (sim_calibration.accuracies(sweeps, SEED) == 1).all()
     labels = np.where(np.isin(sweeps.group("set"), HARD), (sweeps.labels + 1) % 6, sweeps.labels)
-    monkeypatch.setattr(sim_calibration.methods, "given", lambda kind, of: told(kind, sweeps))
+    monkeypatch.setattr(sim_calibration.methods, "model_inputs", lambda kind, of: told(kind, sweeps))
     assert (sim_calibration.accuracies(replace(sweeps, labels=labels), SEED) == 0).all()
 
 

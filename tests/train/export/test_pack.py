@@ -32,8 +32,8 @@ def test_the_box_says_what_the_desktop_says(name: str, tmp_path: Path):
     it = Classifier(bundle.load(tmp_path / "b"), SystemClock())
     assert it.self_test() < 0.02
     model = METHODS[name].train(content.train, methods.model_inputs(METHODS[name].input, content.train), 1)
-    want = model.logits(methods.model_inputs(METHODS[name].input, content.held)).argmax(1)
-    assert (pack.score(it, content.held) == want).all()
+    want = model.logits(methods.model_inputs(METHODS[name].input, content.held_out)).argmax(1)
+    assert (pack.score(it, content.held_out) == want).all()
 
 
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - ON_THE_BOX))
@@ -63,4 +63,4 @@ def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
     with pytest.raises(BundleError, match="no training sweep of 'a' is recognised"):
         pack.pack(content, tmp_path / "b", "any", "1", "")
     assert not (tmp_path / "b").exists()
-    assert np.isin(content.held.labels, [0, 1, 2]).all()
+    assert np.isin(content.held_out.labels, [0, 1, 2]).all()

@@ -301,7 +301,7 @@ def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp
         [bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS]
     )
     (tmp_path / "letters").mkdir()
-    with pytest.raises(ExportRefused, match="is no bundle and will not be replaced"):
+    with pytest.raises(ExportRefused, match="is not a bundle and will not be replaced"):
         quantized_bundle.export(fitted, tmp_path / "letters", "new", "2", "")
     assert sorted(f.name for f in tmp_path.iterdir()) == ["bundle", "letters"]
 
@@ -390,7 +390,7 @@ def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch
     train, held, by = hold_out(easy(), 1)
     model = method.train(train, train.samples, 1)
     content, reference = pack.Content(model.graph(), "raw", train, held, by, {}), model.forms["float"].graph()
-    assert quantized_bundle.checked(content, reference).figures["parity"]["total"] == len(content.held)
+    assert quantized_bundle.checked(content, reference).figures["parity"]["total"] == len(content.held_out)
     assert quantized_bundle.checked(content, None) is content
     monkeypatch.setattr(quantized_bundle, "MOST_MEAN_DIFFERENCE", 0.0)
     with pytest.raises(ExportRefused, match=r"on average \(limit 0.0\)"):
