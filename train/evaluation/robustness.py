@@ -161,7 +161,7 @@ def table(result: Json) -> str:
         hardest = ", ".join(f"{w['stress']} −{w['lost']:.2f}" for w in worst(result, name))
         lines.append(f"- {name}: worst, by the mean loss over all severities: {hardest}")
     lines += [f"- {name}: {entry['refused']}" for name, entry in result["methods"].items() if entry["refused"]]
-    lines += ["", "Sweeps that tell nothing:", ""]
+    lines += ["", "Sweeps without information:", ""]
     for name in dict.fromkeys(name for entry in entries.values() for name in entry["trouble"]):
         answers = Counter(entry["trouble"][name].split(":")[0] for entry in entries.values())
         desktop = ", ".join(f"{n} methods {answer}" for answer, n in answers.items())

@@ -31,14 +31,14 @@ HERE = Where(jobs=1, cache=None)
 
 
 def test_it_finds_what_is_there_to_find():
-    """Hums of three pitches are told apart under every protocol, by window and by recording."""
+    """Hums of three pitches are distinguished under every protocol, by window and by recording."""
     for result in every(
         tones(), HERE, "L-gauss", "H-svm", protocols=("leave:session", "random:3", "split:session=0,1->2")
     ):
-        told = result.json()
-        assert told["window"]["right"] >= 0.9 * told["window"]["total"], told
-        assert told["recording"]["right"] == told["recording"]["total"]
-        assert told["agreement"] == 1
+        figures = result.json()
+        assert figures["window"]["right"] >= 0.9 * figures["window"]["total"], figures
+        assert figures["recording"]["right"] == figures["recording"]["total"]
+        assert figures["agreement"] == 1
 
 
 def test_it_finds_nothing_where_there_is_nothing():
@@ -65,19 +65,19 @@ def test_the_counts_are_those_of_the_logits():
     """Windows by the largest logit, recordings by the product of their probabilities, the confusion matrix of both."""
     sweeps = tones(noise=150.0)
     (result,) = every(sweeps, HERE, "L-knn")
-    told, labels = result.json(), sweeps.labels[result.test]
+    figures, labels = result.json(), sweeps.labels[result.test]
     assert sorted(result.test) == list(range(len(sweeps)))
-    assert told["window"] == {"right": int((result.logits.argmax(1) == labels).sum()), "total": 36}
+    assert figures["window"] == {"right": int((result.logits.argmax(1) == labels).sum()), "total": 36}
     right = 0
     for number in range(18):
         mine = sweeps.groups["recording"][result.test] == number
         right += np.log(softmax(result.logits[mine])).sum(0).argmax() == labels[mine][0]
-    assert told["recording"] == {"right": right, "total": 18}
-    confusion = np.array(told["confusion"])
+    assert figures["recording"] == {"right": right, "total": 18}
+    confusion = np.array(figures["confusion"])
     assert confusion.sum(1).tolist() == [12, 12, 12]
-    assert np.trace(confusion) == told["window"]["right"]
-    low, high = told["interval"]
-    assert low <= told["window"]["right"] / 36 <= high
+    assert np.trace(confusion) == figures["window"]["right"]
+    low, high = figures["interval"]
+    assert low <= figures["window"]["right"] / 36 <= high
 
 
 def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
@@ -102,7 +102,9 @@ def test_what_was_interrupted_goes_on_where_it_was(tmp_path: Path, monkeypatch: 
     with pytest.raises(KeyboardInterrupt):
         every(tones(), where, "L-gauss")
     assert len(list(tmp_path.glob("*.npz"))) == 2
-    assert not every(tones(), replace(where, kept=True), "L-gauss")  # and nothing is trained, nothing half told
+    assert not every(
+        tones(), replace(where, kept=True), "L-gauss"
+    )  # and nothing is trained, no incomplete result reported
     (result,) = every(tones(), where, "L-gauss")
     assert len(calls) == 4
     (again,) = every(tones(), where, "L-gauss")
@@ -214,7 +216,7 @@ def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
 
 
 def test_a_method_that_cannot_work_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Windows too short for a spectrum over time: said with its reason and an exit code, after all else was done."""
+    """Windows too short for a spectrum over time: reported with the reason and an exit code, after all else was done."""
     whole, out = tones(), tmp_path / "r.json"
     short = Dataset(whole.samples[:, :7], whole.labels, whole.materials, 100.0, whole.groups, "short")
     short.save(tmp_path / "short.npz")
@@ -238,9 +240,9 @@ def test_bad_arguments_are_one_line(args: tuple[str, str], tmp_path: Path, capsy
     tones().save(tmp_path / "t.npz")
     good = {"--set": str(tmp_path / "t.npz"), "--protocol": "leave:session", "--method": "L-svm"}
     assert command(*sum((good | dict([args])).items(), ()), cache=tmp_path) == FormatError.exit_code
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1
-    assert args[1].split("=")[0] in said[0]
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 1
+    assert args[1].split("=")[0] in error[0]
 
 
 def test_the_methods_are_listed_with_a_line_each(capsys: pytest.CaptureFixture[str]):

@@ -77,8 +77,8 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
     )  # fmt: skip
     processes = [scheduler]
     try:
-        for said in scheduler.stderr:
-            if found := re.search(r"tcp://127\.0\.0\.1:\d+", said):
+        for line in scheduler.stderr:
+            if found := re.search(r"tcp://127\.0\.0\.1:\d+", line):
                 break
         address = found[0]
         for _ in range(2):
@@ -163,7 +163,7 @@ def test_a_task_that_kills_every_worker_ends_with_a_reason(cluster, monkeypatch:
 
 
 def test_a_cluster_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
-    """No scheduler at that address: told within its deadline, with the command that starts one."""
+    """No scheduler at that address: reported within its deadline, with the command that starts one."""
     monkeypatch.setattr(parallel, "CONNECT_S", 1)
     with pytest.raises(FormatError, match=r"no scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"):
         list(parallel.results(add, [1], [np.arange(3.0)], scheduler="tcp://127.0.0.1:9"))

@@ -55,7 +55,7 @@ class NearestMean:
 
     def graph(self) -> onnx.ModelProto:
         """Stress is put on the desktop's answers; no graph is asked for."""
-        raise AssertionError("stress asked for a graph")
+        raise AssertionError("the corruption asked for a graph")
 
 
 def _figures(given: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ def test_digits_stay_digits(name: str, sweeps: Dataset):
 
 @pytest.mark.parametrize("name", [n for n in BY_NAME if BY_NAME[n].only == "simulated"])
 def test_the_scene_is_drawn_anew(name: str):
-    """Each physical stress changes simulated sweeps, and is refused by name where there is nothing to draw."""
+    """Each physical corruption changes simulated sweeps, and is refused by name where there is no scene to draw."""
     entry = BY_NAME[name]
     assert entry.apply(scene(), 0, 0) is scene().sweeps.samples
     severe = entry.apply(scene(), entry.severities[-1], 0)
@@ -120,7 +120,7 @@ def test_no_severity_beyond_the_scale(severity: float):
 
 
 def test_stresses_by_name():
-    """Found by name, unknown ones are refused; a simulated trial is drawn anew, a file's digits are changed."""
+    """Found by name, unknown ones are refused; simulated sweeps are drawn anew, the raw counts of a file are changed."""
     assert [s.name for s in corruptions.find(["hum", "dead"])] == ["hum", "dead"]
     with pytest.raises(FormatError, match="stress 'cold' is unknown; use some of shift-rows, "):
         corruptions.find(["cold"])
@@ -186,7 +186,7 @@ def test_speed_is_the_fingers():
 
 
 def test_dead_stuck_and_noisy_taxels():
-    """As many taxels as said, the others as they were; those dead at 1 are dead at 3 too."""
+    """As many taxels as the severity says, the others unchanged; those dead at 1 are dead at 3 too."""
     trial = EvaluationSweeps(small())
     for name in ("dead", "stuck", "noisy"):
         one, three = (BY_NAME[name].apply(trial, n, 5) != trial.sweeps.samples for n in (1, 3))
@@ -313,7 +313,7 @@ def test_the_fall_is_between_two_severities():
 
 
 def task(method: str, seed: int, right: list[int], **more) -> dict:
-    """What `one` gives, by hand: 20 sweeps under one stress."""
+    """What `evaluate_method` returns, by hand: 20 sweeps under one corruption."""
     curve = {"unit": "taxels", "about": "", "severities": [0.0, 1.0, 2.0], "right": right, "broken": [0, 0, 1]}
     return {"method": method, "seed": seed, "set": "x", "refused": "", "total": 20, "ran": "", "trouble": {},
             "curves": {"dead": curve}} | more  # fmt: skip
@@ -342,7 +342,7 @@ def test_the_worst_come_first():
 
 
 def test_the_table_says_where_each_falls():
-    """One column a method, one row a stress; never is more than the severest; what was refused says why."""
+    """A column for each method, a row for each corruption; "never" is more than the severest; a refusal has its reason."""
     refused = {"method": "c", "seed": 0, "set": "x", "refused": "too short"}
     text = robustness.table(robustness.merge([task("a", 0, [18, 16, 10]), task("b", 0, [10, 10, 10]), refused]))
     assert "| accuracy lost by .05 at | a | b |" in text
@@ -393,8 +393,8 @@ def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pyte
         robustness.run(["a"], sweeps, trial, where)
 
 
-def test_all_usual_stresses_by_default():
-    """None stands for what makes sense; features are computed of the stressed digits."""
+def test_all_applicable_corruptions_by_default():
+    """None stands for all that apply; features are computed from the corrupted counts."""
     seen = []
 
     @dataclass
@@ -443,7 +443,8 @@ def test_an_answer_that_is_no_number_is_wrong():
 
 
 def test_trouble_has_a_name():
-    """Sound methods stay finite or refuse; what is no digit never reaches them; a crash is told, and the worst wins."""
+    """Sound methods stay finite or refuse; a value that is not finite never reaches them; a crash is reported, and the worst
+    answer counts."""
     model = learn(small(), small().samples, 0)
     found = robustness.uninformative_answers(FAKE, model, EvaluationSweeps(small("float32")))
     assert [found[k] for k in ("silent", "constant", "saturated")] == ["finite"] * 3
@@ -466,7 +467,7 @@ def test_trouble_has_a_name():
 
 
 def test_the_box_answers_with_a_status(default_bundle: bundle.Bundle):
-    """Through recorder and classifier: what tells nothing is refused by name, and a sound sweep is not."""
+    """Through sweep cutter and classifier: an uninformative sweep is refused by name, and a sound one is not."""
     assert robustness.box_answers(default_bundle) == {
         "silent": "no-contact", "constant": "stuck-taxel", "one-frame": "short", "saturated": "saturated",
     }  # fmt: skip

@@ -84,7 +84,7 @@ def test_what_is_measured_is_complete_and_adds_up(measured: dict) -> None:
 
 
 def test_every_effect_is_switched_off_in_turn(measured: dict) -> None:
-    """Each row tells the accuracies without the effect and their change; each effect changes some of them."""
+    """Each row holds the accuracies without the effect and their change; each effect changes some of them."""
     assert tuple(measured["without"]) == EFFECTS
     for row in measured["without"].values():
         assert row["change"] == pytest.approx(np.array(row["ours"]) - measured["ours"])
@@ -92,19 +92,19 @@ def test_every_effect_is_switched_off_in_turn(measured: dict) -> None:
 
 
 def test_accuracies_count_right_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sweeps that tell their label in every feature are all right; with labels drawn anew next to nothing is."""
+    """Sweeps whose features all equal their label are all named rightly; with shifted labels in the test sets none is."""
     monkeypatch.setattr(sim_calibration, "FIGURES", FIGURES[3:])
     monkeypatch.setattr(sim_calibration, "PRINTED", sim_calibration.PRINTED[3:])
     sweeps = sim_calibration.draw(SEED, per_material=4)
     rng = np.random.default_rng(0)
 
-    def told(kind: str, of: sim_calibration.sets.SweepSet) -> np.ndarray:
+    def inputs(kind: str, of: sim_calibration.sets.SweepSet) -> np.ndarray:
         return of.labels[:, None] + rng.normal(0, 0.01, (len(of), 3))
 
-    monkeypatch.setattr(sim_calibration.methods, "model_inputs", told)
+    monkeypatch.setattr(sim_calibration.methods, "model_inputs", inputs)
     assert (sim_calibration.accuracies(sweeps, SEED) == 1).all()
     labels = np.where(np.isin(sweeps.group("set"), HARD), (sweeps.labels + 1) % 6, sweeps.labels)
-    monkeypatch.setattr(sim_calibration.methods, "model_inputs", lambda kind, of: told(kind, sweeps))
+    monkeypatch.setattr(sim_calibration.methods, "model_inputs", lambda kind, of: inputs(kind, sweeps))
     assert (sim_calibration.accuracies(replace(sweeps, labels=labels), SEED) == 0).all()
 
 

@@ -1,4 +1,4 @@
-"""How sure the box may be: figures on Gaussians whose truth is known, and the command's room from set to page."""
+"""Uncertainty: figures on Gaussians whose true values are known, and the command from set to page."""
 
 import json
 import re
@@ -21,7 +21,7 @@ NAMES = ("a", "b", "c", "d")
 
 
 def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
-    """Features [N, 10, 4] of n sweeps of four materials at each place, told apart from the middle of the sweep on."""
+    """Features [N, 10, 4] of n sweeps of four materials at each place, distinguishable from the middle of the sweep on."""
     rng = np.random.default_rng(seed)
     labels = np.tile(np.repeat(np.arange(4), n), places)
     at = np.repeat(np.arange(places), 4 * n) + first
@@ -44,19 +44,20 @@ def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, place
 
 
 @pytest.fixture(scope="module")
-def told():
+def figures():
     """All figures of one fold, each material left out once."""
     held = [case(k) for k in (NONE_LEFT_OUT, 0, 1, 2, 3)]
     return json.loads(json.dumps(uncertainty.figures(held, NAMES, 1)))
 
 
 def test_error_is_the_gap_between_said_and_right():
-    """.9 said and .7 right is .2 off, whatever the number; honest is 0; bins count by their sweeps."""
+    """A probability of 0.9 with 0.7 right is an error of 0.2, whatever the number; a calibrated one is 0; bins count by
+    their sweeps."""
     right = np.arange(100) < 70
     assert uncertainty.error(np.full(100, 0.9), right) == pytest.approx(0.2)
     assert uncertainty.error(np.full(100, 0.7), right) == pytest.approx(0)
-    said = np.concatenate([np.full(50, 0.95), np.full(50, 0.55)])
-    assert uncertainty.error(said, np.concatenate([np.ones(50, bool), np.arange(50) < 5])) == pytest.approx(0.25)
+    confidence = np.concatenate([np.full(50, 0.95), np.full(50, 0.55)])
+    assert uncertainty.error(confidence, np.concatenate([np.ones(50, bool), np.arange(50) < 5])) == pytest.approx(0.25)
     assert uncertainty.reliability(np.array([1.0, 0.0]), np.array([True, False]))[-1] == {
         "said": 1.0,
         "right": 1.0,
@@ -76,9 +77,9 @@ def test_an_overconfident_head_is_made_honest():
     assert 0 < figures["accuracy"]["low"] < figures["accuracy"]["accuracy"] < figures["accuracy"]["high"] < 1
 
 
-def test_more_sweeps_for_more_certainty(told):
+def test_more_sweeps_for_more_certainty(figures):
     """Mean sweeps and accuracy rise with the probability wanted; one sweep where none is."""
-    for held in told["sequence"].values():
+    for held in figures["sequence"].values():
         sweeps = [p["sweeps"] for p in held["points"]]
         assert sweeps[0] == 1
         assert sweeps == sorted(sweeps)
@@ -95,14 +96,14 @@ def test_the_sequential_test_stops_where_it_is_sure():
     assert uncertainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.999)["right_of_decided"] is None
 
 
-def test_strangers_six_deviations_away_are_seen(told):
+def test_unknown_materials_six_deviations_away_are_detected(figures):
     """A material left out is six deviations from the others, known ones are chi-squared: AUROC above .95."""
-    for row in told["unknown"]["materials"].values():
+    for row in figures["unknown"]["materials"].values():
         assert row["low"] <= row["auroc"] <= row["high"]
         assert (row["known"], row["unknown"]) == (216, 72)
-    assert 0.99 < told["unknown"]["mean"]["auroc"] <= 1
-    assert told["unknown"]["scores"]["distance, where trained materials differ"] < 0.95  # in their midst
-    assert 0.9 < told["unknown"]["mean"]["kept"] < 0.99
+    assert 0.99 < figures["unknown"]["mean"]["auroc"] <= 1
+    assert figures["unknown"]["scores"]["distance, where trained materials differ"] < 0.95  # among them
+    assert 0.9 < figures["unknown"]["mean"]["kept"] < 0.99
 
 
 def test_a_stranger_that_is_no_stranger_is_not_seen():
@@ -112,9 +113,9 @@ def test_a_stranger_that_is_no_stranger_is_not_seen():
     assert abs(uncertainty.unknown(done, NAMES)["mean"]["auroc"] - 0.5) < 0.06
 
 
-def test_enrolment_from_more_sweeps_comes_nearer(told):
-    """The share of the fully trained accuracy grows with sweeps; old classes lose little; both places are told."""
-    points = {(p["where"], p["sweeps"]): p for p in told["enrolment"]["points"]}
+def test_enrolment_from_more_sweeps_comes_nearer(figures):
+    """The share of the fully trained accuracy grows with sweeps; old classes lose little; both places are reported."""
+    points = {(p["where"], p["sweeps"]): p for p in figures["enrolment"]["points"]}
     assert {w for w, _ in points} == {"same place", "other places"}
     for where in ("same place", "other places"):
         assert points[where, 1]["share"] < points[where, 10]["share"]
@@ -123,9 +124,9 @@ def test_enrolment_from_more_sweeps_comes_nearer(told):
         assert set(points[where, 5]["by_material"]) == set(NAMES)
 
 
-def test_early_needs_half_the_sweep_where_that_tells_all(told):
+def test_early_needs_half_the_sweep_where_that_suffices(figures):
     """All is known at the fifth tenth: the share is below .6 and accuracy is that of the whole sweep."""
-    early = told["early"]
+    early = figures["early"]
     assert early["share"] < 0.6
     assert abs(early["lost"]) <= 0.02
     assert len(early["always"]) == 10
@@ -133,7 +134,7 @@ def test_early_needs_half_the_sweep_where_that_tells_all(told):
 
 
 def test_two_materials_leave_nobody_out():
-    """Of two materials none can be left out: calibration, sweeps and early are told, and the page says no more."""
+    """Of two materials none can be left out: calibration, sweeps and early answers are reported, and the page has no more."""
     one = case()
     two, test = one.seen_labels < 2, one.labels < 2
     also = one.copied_labels < 2
@@ -150,9 +151,9 @@ ABOUT = ("set", "test", "protocol", "method", "seed", "effort", "folds", "traini
          "digest", "commit", "machine", "took_s")  # fmt: skip
 
 
-def test_the_page_stands_alone(told):
+def test_the_page_stands_alone(figures):
     """One file without script or address; its pictures are sound XML; each target says whether it was reached."""
-    html, pictures = uncertainty_report.render(told | dict.fromkeys(ABOUT, "x"))
+    html, pictures = uncertainty_report.render(figures | dict.fromkeys(ABOUT, "x"))
     assert not re.search(r"<script|src=|href=\"http", html)
     assert len(pictures) == 5
     for svg in pictures.values():
@@ -199,7 +200,7 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
 
 
 def test_methods_without_tenths_are_refused(tmp_path):
-    """L-gauss has no trunk: said by name."""
+    """L-gauss has no trunk: refused by name."""
     with pytest.raises(FormatError, match="L-gauss"):
         uncertainty.run(
             sweeps(), None, "split:position=0,1,2->3", "L-gauss", Where(jobs=1, cache=None), print, Effort(0.02)

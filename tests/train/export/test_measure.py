@@ -34,7 +34,7 @@ def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
     for one in made:
         box = Classifier(bundle.load(one.folder), SystemClock())
         known = sweeps()
-        assert [box.logits(digits).argmax() for digits in known.samples] == known.labels.tolist()
+        assert [box.logits(counts).argmax() for counts in known.samples] == known.labels.tolist()
         assert one.window_s == 0.4
         assert measure.sizes(one.folder)[0] == (one.folder / "model.onnx").stat().st_size < measure.sizes(one.folder)[1]
 
@@ -42,7 +42,7 @@ def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
 def test_all_take_turns():
     """Every round begins with another model; each one's first sweep of a turn is not counted."""
     order: list[str] = []
-    calls = {name: (lambda digits, name=name: order.append(name)) for name in "abc"}
+    calls = {name: (lambda counts, name=name: order.append(name)) for name in "abc"}
     took = measure.timed(calls, np.zeros((5, 1)), rounds=3, block=2)
     assert "".join(order) == "aaabbbccc" + "bbbcccaaa" + "cccaaabbb"
     assert {name: (len(ms), bool((ms > 0).all())) for name, ms in took.items()} == dict.fromkeys("abc", (6, True))
@@ -51,12 +51,12 @@ def test_all_take_turns():
 def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
     """Costs of a real bundle: the keys that the issue names, resident memory of Python with numpy and onnxruntime."""
     made = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
-    (told, _) = model_forms.measured(made, sweeps().samples, 2)
-    assert set(KEYS) <= told.keys()
-    assert told["runs_on_box"]
-    assert 15 < told["rss_mb"] < 150
-    assert 0 < told["ms_p50"] <= told["ms_p99"]
-    assert told["file_kb"] < told["bundle_kb"]
+    (costs, _) = model_forms.measured(made, sweeps().samples, 2)
+    assert set(KEYS) <= costs.keys()
+    assert costs["runs_on_box"]
+    assert 15 < costs["rss_mb"] < 150
+    assert 0 < costs["ms_p50"] <= costs["ms_p99"]
+    assert costs["file_kb"] < costs["bundle_kb"]
     assert not model_forms._costs(made[0], Measurement(1.0, 1.0, 10, 20, 400.0, ("torch",)))["runs_on_box"]
 
 
@@ -74,16 +74,16 @@ def test_torch_runs_what_was_trained(tmp_path: Path):
     """The network as TorchScript gives its own logits."""
 
     class Network(torch.nn.Module):
-        def forward(self, digits: torch.Tensor) -> torch.Tensor:
-            return digits.flatten(1).float()[:, :2]
+        def forward(self, counts: torch.Tensor) -> torch.Tensor:
+            return counts.flatten(1).float()[:, :2]
 
     @dataclass
     class Model:
         network: torch.nn.Module
 
     model_forms._save_torch(Model(Network()), sweeps(), 1, tmp_path)
-    digits = sweeps().samples[3]
-    assert measure.load(tmp_path)(digits).tolist() == digits.ravel()[:2].tolist()
+    counts = sweeps().samples[3]
+    assert measure.load(tmp_path)(counts).tolist() == counts.ravel()[:2].tolist()
 
 
 def test_aeon_runs_what_was_trained(tmp_path: Path):

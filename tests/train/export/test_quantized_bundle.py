@@ -1,4 +1,4 @@
-"""The room of export: what the graphs hold, what a bundle must pass before it leaves, what is refused and why."""
+"""Export: the content of the graphs, the checks that a bundle must pass, what is refused and why."""
 
 from __future__ import annotations
 
@@ -78,15 +78,15 @@ def negated(fitted: Fit) -> Fit:
 
 @pytest.mark.parametrize("dtype", graph_builder.TENSOR)
 def test_the_float_graph_is_the_network(dtype: str):
-    """For each digit type: PyTorch's logits, fixed shapes, the sensor's own digits going in."""
+    """For each type of raw counts: PyTorch's logits, fixed shapes, the sensor's own counts as input."""
     form = SweepFormat(3, 2, 100.0, 128, dtype)
     torch.manual_seed(0)
     model = Compact(form, 3, 0.1, norm=False).eval()
     graph = model.graph()
-    digits = np.random.default_rng(0).integers(0, 200, (5, 128, 3, 2)).astype(dtype)
+    counts = np.random.default_rng(0).integers(0, 200, (5, 128, 3, 2)).astype(dtype)
     with torch.no_grad():
-        want = model(torch.from_numpy(digits.astype(np.float32))).numpy()
-    np.testing.assert_allclose(parity.logits(graph, digits), want, atol=1e-3)
+        want = model(torch.from_numpy(counts.astype(np.float32))).numpy()
+    np.testing.assert_allclose(parity.logits(graph, counts), want, atol=1e-3)
     assert all(size > 0 for shape in shapes(graph) for size in shape)
     (given,) = graph.graph.input
     assert (given.name, given.type.tensor_type.elem_type) == ("sweep", graph_builder.TENSOR[dtype])
@@ -132,10 +132,10 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     assert held["n"] == len(fitted.held)
     assert held["accuracy"] == pytest.approx(np.mean(pack.score(it, fitted.held) == fitted.held.labels), abs=1e-4)
     assert manifest.figures["held-out recording, by recording"]["n"] == len(fitted.held) / 2
-    told = manifest.figures["parity"]
-    assert told["agreement"] >= quantized_bundle.LEAST_AGREEMENT
-    assert told["lost"] <= quantized_bundle.MOST_LOST
-    assert told["total"] == len(fitted.held)
+    result = manifest.figures["parity"]
+    assert result["agreement"] >= quantized_bundle.LEAST_AGREEMENT
+    assert result["lost"] <= quantized_bundle.MOST_LOST
+    assert result["total"] == len(fitted.held)
     weakest = fitted.train.samples.mean(axis=1).max(axis=(1, 2)).min()
     assert manifest.thresholds.contact == pytest.approx(0.1 * weakest)
     assert manifest.thresholds.full_scale == 255
@@ -212,7 +212,7 @@ def test_a_range_for_one_outlier_is_refused(tight: Fit):
 
 
 def test_a_layer_that_saturates_is_refused(tight: Fit):
-    """The first stage reaches a twentieth of what it should: no head can cope; how much is cut off is told."""
+    """The first stage reaches a twentieth of what it should: no head can compensate; the share that is cut off is reported."""
     first, *others = tight.reach.responses
     with pytest.raises(ExportRefused, match=r"\(limit .*suffers most \(\d+ dB, [3-6]\d\.\d% beyond"):
         judged(ranged(tight, (0.05 * first, *others)))
@@ -232,9 +232,9 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
     """A Parity of `n` sweeps, of which int8 loses and wins some; all else as good as can be unless it is named."""
     right = np.arange(n) >= won, np.arange(n) < n - lost
     usual = {"agreement": 1, "expected_loss": 0, "probability_difference": 0, "probability_mean": 0}
-    told = parity.Apart(**(usual | apart), logit_difference=0, logit_mean=0)
+    difference = parity.Apart(**(usual | apart), logit_difference=0, logit_mean=0)
     layer = Layer("conv1", "activations", "float", (0,) * 4, 0, 1, 1 / 255, 0.001, 35)
-    return parity.Parity(n, int(right[1].sum()), told, parity.loss(*right), 0, (layer,))
+    return parity.Parity(n, int(right[1].sum()), difference, parity.loss(*right), 0, (layer,))
 
 
 @pytest.mark.parametrize(
@@ -265,7 +265,7 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
 
 
 def test_a_box_that_would_refuse_is_no_box(fitted: Fit, tmp_path: Path):
-    """A full scale that the sweeps pass: they count as saturated, which export tells instead of the robot."""
+    """A full scale that the sweeps pass: they count as saturated, which export reports before a robot meets it."""
     with pytest.raises(ExportRefused, match=r"the box would refuse \d+ of \d+ held-out sweeps"):
         quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
 
@@ -364,7 +364,7 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
 
 
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
-    """Nothing in it is int8: both forms are one, the box's labels are its network's, no tensor is told; what another
+    """Nothing in it is int8: both forms are one, the box's labels are its network's, no tensor is reported; what another
     head says is refused here as well."""
     made = fit.fit(easy(), 1, FitRecipe(), shape=ARCHITECTURES["bands"])
     quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
@@ -372,11 +372,11 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     assert it.self_test() < 1e-6
     assert "QuantizeLinear" not in {n.op_type for n in onnx.load(tmp_path / "b" / bundle.MODEL).graph.node}
     with torch.no_grad():
-        said = made.network()(torch.from_numpy(made.held.samples.astype(np.float32))).numpy()
-    assert [it.logits(x).argmax() for x in made.held.samples] == said.argmax(1).tolist()
-    told = it.bundle.manifest.figures["parity"]
-    assert (told["agreement"], told["lost"]) == (1, 0)
-    assert told["probability_difference"] < 1e-3
+        logits = made.network()(torch.from_numpy(made.held.samples.astype(np.float32))).numpy()
+    assert [it.logits(x).argmax() for x in made.held.samples] == logits.argmax(1).tolist()
+    result = it.bundle.manifest.figures["parity"]
+    assert (result["agreement"], result["lost"]) == (1, 0)
+    assert result["probability_difference"] < 1e-3
     (method,) = methods.find(["compact-bands"], methods.Effort(0.02))
     content = pack.trained(method, easy(), 1)
     assert quantized_bundle.checked(content, content.reference).figures["parity"]["agreement"] == 1
@@ -410,21 +410,21 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
     )
     it, rest = box(tmp_path / "b"), sets.load(str(tmp_path / "rest.npz"))
     assert (it.bundle.format.dtype, it.bundle.format.rows, it.bundle.format.window) == ("int16", 16, 128)
-    told = pack.figures(it, rest, "unseen")
-    assert told["unseen"]["accuracy"] > 0.9
-    assert told["unseen, by recording"]["accuracy"] > 0.9  # 70 of 74 with the default network of decision 0005
+    result = pack.figures(it, rest, "unseen")
+    assert result["unseen"]["accuracy"] > 0.9
+    assert result["unseen, by recording"]["accuracy"] > 0.9  # 70 of 74 with the default network of decision 0005
     sentences = ["demo", "--sim", f"replay:{tmp_path / 'rest.npz'}", "--virtual", "--sweeps", str(len(rest))]
     assert palpate([*sentences, "--set", f"classifier.bundle={tmp_path / 'b'}"]) == 0
     out = capsys.readouterr().out
     right, total = (int(n) for n in re.search(r"all objects +(\d+) / (\d+)", out).groups())
-    assert total == told["unseen, by recording"]["n"]
-    assert right / total == pytest.approx(told["unseen, by recording"]["accuracy"], abs=0.01)
+    assert total == result["unseen, by recording"]["n"]
+    assert right / total == pytest.approx(result["unseen, by recording"]["accuracy"], abs=0.01)
     assert "frames lost     0 of" in out
 
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
-    """Materials that differ in nothing but their offset: told apart by a head that sees means, hidden from one that does not."""
+    """Materials that differ in nothing but their offset: distinguished by a head that sees means, hidden from one that does not."""
     whole = easy(seed=3)
     rng = np.random.default_rng(4)
     labels = rng.permutation(whole.labels)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from appliance.inference.classifier import softmax
-from train.metrics.score import Score, fused, interval
+from train.metrics.score import Score, figure, fused, interval
 
 
 def test_a_tally_counts():
@@ -55,3 +55,8 @@ def test_no_window_can_veto_all_others():
     scores, _ = fused(np.array([[1e4, 0.0]] + [[0.0, 9.0]] * 5, np.float32), np.zeros(6, int))
     assert np.isfinite(scores).all()
     assert scores.argmax() == 1
+
+
+def test_a_figure_has_wilsons_interval():
+    """55 of 60, the paper's T-HARD: .917 in [.819, .964]."""
+    assert figure(55, 60) == {"accuracy": 0.9167, "n": 60, "low": 0.8193, "high": 0.9639}

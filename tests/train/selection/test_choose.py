@@ -1,4 +1,4 @@
-"""Choosing: the smallest that will do and no smaller, within the budget, honestly judged; and less where less will do."""
+"""Choosing the smallest sufficient model within the budget, its unbiased figure, and reduced sweeps where they suffice."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def guess(sweeps: Dataset, given: np.ndarray, seed: int, number: int = 0) -> Pow
 
 
 def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise: float = 0.15) -> Dataset:
-    """Four materials at several places: the taxels named tell half of it each, by the strength of what they feel."""
+    """Four materials at several places: each of the named taxels has half of the information, by the strength of what they feel."""
     labels = np.tile(np.arange(4), places * each)
     rng = np.random.default_rng(3)
     bits = np.stack([labels % 2, labels // 2], axis=1)
@@ -117,25 +117,25 @@ def parts_of(sweeps: Dataset, **more) -> nested_cv.Trials:
 
 @cache
 def two() -> Dataset:
-    """A skin of which the first two taxels tell everything."""
+    """A skin whose first two taxels have all the information."""
     return skin()
 
 
 def test_the_smallest_that_will_do_is_taken(fakes):
-    """One taxel tells half of it, two tell all: two are taken, with reasons both ways; four and six are not tried."""
+    """One taxel has half of the information, two have all: two are taken, with reasons both ways; four and six are not tried."""
     choice = chosen(two())
-    told = choice.json(asked())
-    assert told["chosen"] == "see-2"
-    assert told["smaller"]["method"] == "see-1"
-    assert told["smaller"]["low"] > 0.3
-    assert told["honest"]["chose"] == {"see-2": 3}
-    assert told["honest"]["mean"] > 0.95
-    assert told["next"] == "see-4"
-    assert "even a faultless one" in {r["method"]: r["why_not"] for r in told["rungs"]}["see-4"]
+    result = choice.json(asked())
+    assert result["chosen"] == "see-2"
+    assert result["smaller"]["method"] == "see-1"
+    assert result["smaller"]["low"] > 0.3
+    assert result["honest"]["chose"] == {"see-2": 3}
+    assert result["honest"]["mean"] > 0.95
+    assert result["next"] == "see-4"
+    assert "even a faultless one" in {r["method"]: r["why_not"] for r in result["rungs"]}["see-4"]
 
 
 def test_the_cheapest_is_taken_where_it_suffices(fakes):
-    """Two materials that the first taxel tells apart."""
+    """Two materials that the first taxel distinguishes."""
     sweeps = two().take(two().labels < 2).select(())
     choice = chosen(sweeps)
     assert choice.final.chosen == "see-1"
@@ -181,7 +181,7 @@ def test_the_order_is_that_of_cost(fakes):
 
 
 def test_what_is_over_the_budget_is_not_tried(fakes):
-    """Time on the board, size or memory: named with its limit; the best of the others is told, wanted or not."""
+    """Time on the board, size or memory: named with its limit; the best of the others is taken, whether it reaches what is wanted or not."""
     for budget in ({"ms": 0.3, "slower": 2.0}, {"kb": 15}):
         choice = chosen(two(), budget=scene.Budget(**budget))
         assert choice.final.chosen == "see-1"
@@ -199,7 +199,7 @@ def test_nothing_fits(fakes):
 
 
 def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
-    """It has no cost, or its training refuses: the reason is told and the others are tried."""
+    """It has no cost, or its training refuses: the reason is reported and the others are tried."""
     never = Method("see-0", "refuses", "raw", lambda sweeps, given, seed: learn(sweeps, given[:, :1], seed))
     fakes(
         {"see-0": never, **FAKES, "bad": never},
@@ -214,7 +214,7 @@ def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
     json.dumps(choice.json(asked()), allow_nan=False)
 
 
-def test_the_honest_figure_does_not_flatter(fakes):
+def test_the_nested_figure_is_not_optimistic(fakes):
     """Of sixteen that only guess the best one looks good; the choice, judged on what it has not seen, is a guess."""
     known = {f"g{i}-": Method(f"g{i}-", "guesses", "raw", partial(guess, number=i)) for i in range(16)}
     fakes(known, {name: BundleCost(0.1, 10 + i, 50) for i, name in enumerate(known)})
@@ -223,10 +223,10 @@ def test_the_honest_figure_does_not_flatter(fakes):
     shuffled = replace(sweeps, labels=np.random.default_rng(8).permutation(sweeps.labels))
     choice = chosen(shuffled, folds=3)
     best = choice.trials.mean(choice.final.scores[choice.final.best])
-    honest = choice.trials.mean(choice.nested)
+    nested = choice.trials.mean(choice.nested)
     assert best > 0.6
-    assert honest < best - 0.08
-    assert honest == pytest.approx(0.5, abs=0.1)
+    assert nested < best - 0.08
+    assert nested == pytest.approx(0.5, abs=0.1)
 
 
 def test_an_inner_choice_never_sees_its_part(fakes):
@@ -256,12 +256,12 @@ def test_the_error_is_that_of_what_fails_together(fakes):
     assert trials.difference(ones, ones).json() == {"mean": 0, "se": 0, "low": 0, "high": 0}
 
 
-def test_stress_counts(fakes):
-    """A dead taxel at work: what looks at more taxels is worth it now; each condition has its figure."""
+def test_corruptions_count_like_sweeps_as_recorded(fakes):
+    """Each condition has its figure, and the accuracy is their mean."""
     choice = chosen(skin(each=2), stress={"noise": 0.5})
-    told = choice.json(asked())
-    assert [c["name"] for c in told["conditions"]] == ["as recorded", "noise 0.5 deviations"]
-    assert told["accuracy"]["mean"] == pytest.approx(np.mean([c["accuracy"] for c in told["conditions"]]), abs=1e-3)
+    result = choice.json(asked())
+    assert [c["name"] for c in result["conditions"]] == ["as recorded", "noise 0.5 deviations"]
+    assert result["accuracy"]["mean"] == pytest.approx(np.mean([c["accuracy"] for c in result["conditions"]]), abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -297,12 +297,12 @@ def test_parts_are_whole_and_few():
 def reduced(sweeps: Dataset, **more) -> dict[str, dict]:
     """The curves of a scene by what there is less of, and under "change" what would be left out of the bundle."""
     wish = asked(**more)
-    told, change, accuracy = reduction_curves.curves(chosen(sweeps, **more), wish, lambda line: None)
-    return {curve["kind"]: curve for curve in told} | {"change": change, "accuracy": accuracy}
+    result, change, accuracy = reduction_curves.curves(chosen(sweeps, **more), wish, lambda line: None)
+    return {curve["kind"]: curve for curve in result} | {"change": change, "accuracy": accuracy}
 
 
 def test_two_taxels_are_all_that_is_needed(fakes):
-    """Of six the third and the fifth tell everything: these two are kept, one alone is not enough."""
+    """Of six the third and the fifth have all the information: these two are kept, one alone is not enough."""
     fakes({"see-6": FAKES["see-6"]}, {"see-6": COSTS["see-6"]})
     found = reduced(skin(taxels=(2, 4)), reduce=("taxels",), apply=("taxels",))
     assert found["taxels"]["kept"] == "2 taxels"
@@ -327,7 +327,7 @@ def hum(slow: float, fast: float, places: int = 4) -> Dataset:
 
 
 def test_a_low_rate_is_enough_for_slow_things(fakes):
-    """Averaging takes the fast noise away: the lowest rate is kept, and told what to set; nothing is applied unasked."""
+    """Averaging takes the fast noise away: the lowest rate is kept, with what to set; nothing is applied unasked."""
     found = reduced(hum(slow=5, fast=1), reduce=("rate",))
     assert found["rate"]["kept"] == "25 Hz"
     assert found["rate"]["set"] == "set the readout board to average 8 frames and send one"
@@ -342,7 +342,7 @@ def test_a_rate_that_is_needed_is_kept(fakes):
     assert [p["fine"] for p in found["rate"]["points"]] == [True, False, False]
 
 
-def test_a_shorter_window_is_applied_and_what_cannot_be_is_told(fakes):
+def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported(fakes):
     """Sixty frames are more than needed; the fake refuses fewer than four, and the curve says so."""
     found = reduced(two(), reduce=("window",))
     assert found["window"]["kept"] == "0.15 s"
@@ -363,7 +363,7 @@ def test_less_does_not_fall_below_what_is_wanted(fakes):
 
 
 def test_materials_that_look_alike_are_proposed_as_one(fakes):
-    """Only the first taxel tells something: a and c, b and d are the same to it. Proposed, not applied."""
+    """Only the first taxel has information: a and c, b and d are the same to it. Proposed, not applied."""
     sweeps = skin(taxels=(0, 0))
     strength = replace(
         sweeps, samples=np.where(np.arange(6)[:, None] == 0, skin().samples, skin(taxels=(5, 5)).samples[:, :, :1])
@@ -413,26 +413,26 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
         str(tmp_path / "c"),
     ]
     assert main(args) == 0
-    told = json.loads((tmp_path / "b-why" / "choice.json").read_text())
+    result = json.loads((tmp_path / "b-why" / "choice.json").read_text())
     packed = bundle.load(tmp_path / "b")
-    assert told["chosen"] == packed.manifest.made["method"]
+    assert result["chosen"] == packed.manifest.made["method"]
     assert (packed.manifest.name, packed.manifest.labels) == ("drawer", ("a", "d"))
-    assert packed.format.window == told["bundle"]["format"]["window"] == round(60 * told["applied"]["window"])
-    honest = packed.manifest.figures["the choice, made without each part and tested on it"]
-    assert honest["accuracy"] == told["honest"]["mean"] > 0.9
-    assert 0 < max(told["bundle"]["used"].values()) < 1
-    assert {"commit", "machine", "digest", "seeds", "command"} <= told.keys()
+    assert packed.format.window == result["bundle"]["format"]["window"] == round(60 * result["applied"]["window"])
+    nested = packed.manifest.figures["the choice, made without each part and tested on it"]
+    assert nested["accuracy"] == result["honest"]["mean"] > 0.9
+    assert 0 < max(result["bundle"]["used"].values()) < 1
+    assert {"commit", "machine", "digest", "seeds", "command"} <= result.keys()
     page = (tmp_path / "b-why" / "index.html").read_text()
     assert "http" not in page.replace("http://www.w3.org", "")
-    said = capsys.readouterr().out
-    assert f"{told['chosen']} with" in said or f"{told['chosen']} is enough" in said
-    assert "Reached: 80 % is wanted" in said
+    output = capsys.readouterr().out
+    assert f"{result['chosen']} with" in output or f"{result['chosen']} is enough" in output
+    assert "Reached: 80 % is wanted" in output
     assert main(args) == 0  # again, from what is kept
-    assert json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"] == told["rungs"]
+    assert json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"] == result["rungs"]
 
 
 def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
-    """The best is told and packed all the same."""
+    """The best is reported and packed all the same."""
     monkeypatch.setattr(measure, "memory", lambda folder, sweeps: {"rss_mib": 50.0, "foreign": []})
     hard = skin(noise=0.9)
     hard.save(tmp_path / "skin.npz")
@@ -445,10 +445,14 @@ def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, mon
 
 
 def test_cheap_is_what_takes_little_of_the_scarcer():
-    """Of time and room, whichever the board has less of; without a budget the smaller; of equals the faster."""
+    """Of time and storage, whichever the board has less of; without a budget the smaller; of equals the faster."""
     small, fast = BundleCost(0.4, 20, 60), BundleCost(0.1, 40, 50)
-    tight = {"time": scene.Budget(ms=1, kb=1000, slower=2), "room": scene.Budget(ms=100, kb=50), "none": scene.Budget()}
+    tight = {
+        "time": scene.Budget(ms=1, kb=1000, slower=2),
+        "storage": scene.Budget(ms=100, kb=50),
+        "none": scene.Budget(),
+    }
     cheaper = {name: min((small, fast), key=lambda cost: cost.order(b)) for name, b in tight.items()}
-    assert cheaper == {"time": fast, "room": small, "none": small}
+    assert cheaper == {"time": fast, "storage": small, "none": small}
     assert BundleCost(0.1, 20, 50).order(scene.Budget()) < small.order(scene.Budget())
     assert small.used(tight["time"]) == {"ms": 0.8, "kb": 0.02}

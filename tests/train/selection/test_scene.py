@@ -178,8 +178,8 @@ def test_the_examples_are_scenes_and_name_every_key():
     docs = ROOT / "docs" / "choose"
     found = {path.name: scene.read(path) for path in docs.glob("*.toml")}
     assert {"tubes.toml", "fabrics.toml"} <= found.keys()
-    told = tomllib.loads((docs / "tubes.toml").read_text())
-    assert told.keys() == {f.name for f in fields(scene.Scene)} - {"path"}
-    assert told["budget"].keys() == {f.name for f in fields(scene.Budget)}
+    table = tomllib.loads((docs / "tubes.toml").read_text())
+    assert table.keys() == {f.name for f in fields(scene.Scene)} - {"path"}
+    assert table["budget"].keys() == {f.name for f in fields(scene.Budget)}
     usual = select.candidates(replace(found["tubes.toml"], methods=()))
     assert list(found["tubes.toml"].methods) == usual
