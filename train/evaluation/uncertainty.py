@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from appliance.bundle.bundle import Early
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
-from appliance.inference.enrolment import joined
+from appliance.inference.enrolment import extended
 from train.calibration.early_exit import LEVELS, decide
 from train.calibration.novelty import Embedding, auroc, embed
 from train.calibration.posthoc import Posthoc
@@ -289,7 +289,7 @@ def _enrolled(
 def enrolled_logits(embedding: Embedding, z: Array, sweeps: Array) -> Array:
     """Logits [n, K + 1], before temperature scaling, of embeddings z [n, r] with one label more, enrolled from `sweeps`
     [m, r] as the box enrols it."""
-    enrolled = joined(embedding.classes(), sweeps)
+    enrolled = extended(embedding.classes(), sweeps)
     logits: Array = z @ enrolled.means.T + enrolled.bias
     return logits
 
