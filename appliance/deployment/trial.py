@@ -1,8 +1,8 @@
-"""A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store is told to record: starts that
-count against the bundle, its progress, and the commit once enough went well.
+"""A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store records: starts that count
+against the bundle, its progress, and the commit once enough went well.
 
-`Store.choose` counts a start before the bundle is touched. The start is not held against the bundle while the skin is away,
-nor when the program ends in order or for want of a device.
+`Store.choose` counts a start before the bundle is touched. The count is taken back while the skin is away, and when the
+program ends in order or because a device is missing.
 """
 
 from __future__ import annotations
