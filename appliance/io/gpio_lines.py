@@ -28,7 +28,7 @@ event."""
 _ADVICE = {
     errno.EACCES: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
     errno.EPERM: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
-    errno.EBUSY: "another program or driver holds one of them; gpioinfo tells which",
+    errno.EBUSY: "another program or driver holds one of them; gpioinfo shows which",
     errno.ENXIO: "one of them cannot raise interrupts; choose another line",
     errno.EINVAL: "the chip may not know this bias; try bias = 'as-is'",
     errno.ENODEV: "the chip is gone; plug it in and start again",

@@ -251,7 +251,7 @@ class SerialSink:
             _keep_others_out(port.fileno())
         except (OSError, ValueError) as e:  # SerialException is an OSError
             held = getattr(e, "errno", None) in (errno.EBUSY, errno.EAGAIN)
-            advice = "end the program that has it (fuser tells)" if held else "check serial.port and group dialout"
+            advice = "end the program that has it (fuser shows it)" if held else "check serial.port and group dialout"
             self.trouble = f"serial port {self._config.port} cannot be opened: {e}; {advice}"
             return False
         self._port, self.trouble, self._rest = port, "", b""

@@ -1,4 +1,4 @@
-"""What fuzzing has learned, held in each run: the corpus, all that ever broke, and that each promise can be seen broken."""
+"""Results of fuzzing, tested in each run: the corpus, all former crashes, and that each broken promise is detected."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_what_was_found_still_holds(target: str, tmp_path: Path) -> None:
 
 
 def test_each_crash_is_explained() -> None:
-    """No input in crashes/ without a word on what it did, and none that is told of but gone."""
+    """Each input in crashes/ is explained in BROKE, and each explained one exists."""
     there = {f"{target}/{file.stem}" for target in TARGETS for file in corpus.crashes(target)}
     assert there == set(BROKE)
 
@@ -83,7 +83,7 @@ def test_each_crash_is_explained() -> None:
 def test_the_corpus_is_small_and_read_as_it_was_written(
     target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One line an input, the shortest first; a file that fits a change's page."""
+    """One line per input, the shortest first; a file of a size that can be reviewed."""
     file = corpus.SAVED / f"{target}.txt"
     assert file.stat().st_size < 200_000
     saved = corpus.load(target)
@@ -119,11 +119,11 @@ READ: dict[str, Callable[[bytes, Path], Any]] = {
     "recording": read_recording,
     "capture": lambda data, folder: capture.Playback(written(folder, "c", data)).format,
 }
-"""What the room makes of an input: something, nothing, or an error of its own."""
+"""How each target reads an input: a value, nothing, or one of its own errors."""
 
 
 def taken(target: str, data: bytes, folder: Path) -> bool:
-    """Whether the room takes an input, rather than to refuse it."""
+    """Whether the target accepts an input."""
     try:
         return bool(READ[target](data, folder))
     except ApplianceError:
@@ -138,9 +138,9 @@ def test_the_corpus_reaches_what_lies_behind_the_checks(target: str, tmp_path: P
     assert 2 <= count < len(INPUTS[target]) - 2
 
 
-def changed(room: Any, name: str, change: Callable[[Any], Any]) -> Callable[..., Any]:
-    """A function of a room whose result is changed."""
-    right = getattr(room, name)
+def changed(module: Any, name: str, change: Callable[[Any], Any]) -> Callable[..., Any]:
+    """A function of a module with a changed result."""
+    right = getattr(module, name)
     return lambda *args, **more: change(right(*args, **more))
 
 
@@ -153,13 +153,13 @@ def fewer(got: packets.Unpacked) -> packets.Unpacked:
 
 
 def forgetful(data: bytes) -> packets.Unpacked:
-    """Gives the rest of the bytes away where a packet is not yet whole."""
+    """Drops the rest of the bytes if a packet is incomplete."""
     got = packets.Unpacked([], [], len(data), b"")
     return got if len(data) < packets.HEADER.size else UNPACK(data)
 
 
 def searching(data: bytes) -> packets.Unpacked:
-    """Looks for the next magic from every byte on: right, but its time grows with the square."""
+    """Searches the next magic from every byte: correct, but in quadratic time."""
     for at in range(len(data)):
         data.find(packets.MAGIC, at)
     return UNPACK(data)
@@ -176,12 +176,12 @@ def trusting(data: bytes, at: int) -> Any:
 
 
 def unguarded(kind: Any, table: Any) -> Any:
-    """A dataclass from whatever is there, as the manifest was read once."""
+    """A dataclass from unchecked values, as the manifest was read once."""
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in table.items()})
 
 
 def hasty(data: bytes, rest: bytes = b"") -> tuple[list[robot_link.Command], bytes]:
-    """Drops a line that is too long as soon as it is, as was done once."""
+    """Drops a line as soon as it is too long, as was done once."""
     found, rest = PARSE(rest + data)
     return found, b"" if len(rest) > robot_link.MAX_LINE else rest
 
@@ -190,7 +190,7 @@ UNPACK, ONE, PARSE, FIT, FRAMES = packets.unpack, packets._one, robot_link.parse
 
 
 def numb(load: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that reads a file, with an error that does not say which."""
+    """A function that reads a file and raises an error without its name."""
 
     def call(*args: Any, **more: Any) -> Any:
         try:
@@ -202,7 +202,7 @@ def numb(load: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def broken_json(text: bytes) -> Any:
-    """Reads nothing, and says so in two lines."""
+    """Raises an error of two lines."""
     raise ValueError("line 1\nline 2")
 
 
@@ -244,38 +244,38 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
 
 
 @pytest.mark.parametrize(
-    ("target", "what", "room", "name", "broken"), BREAKS, ids=[f"{b[0]}-{b[1].replace(' ', '-')}" for b in BREAKS]
+    ("target", "what", "module", "name", "broken"), BREAKS, ids=[f"{b[0]}-{b[1].replace(' ', '-')}" for b in BREAKS]
 )
 def test_each_promise_can_be_seen_broken(
-    target: str, what: str, room: Any, name: str, broken: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    target: str, what: str, module: Any, name: str, broken: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A room that is broken on purpose is found by the known inputs."""
-    monkeypatch.setattr(room, name, broken)
+    """A module that is broken on purpose is detected by the known inputs."""
+    monkeypatch.setattr(module, name, broken)
     with pytest.raises((AssertionError, ApplianceError)):
         check_inputs(target, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("target", "room", "name"),
+    ("target", "module", "name"),
     [("unpack", packets, "unpack_identity"), ("command", robot_link, "_command"), ("settings", config, "_checked"),
      ("manifest", manifest, "typed"), ("recording", types, "typed"), ("capture", capture, "typed")],
 )  # fmt: skip
 def test_another_error_is_not_kept_back(
-    target: str, room: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    target: str, module: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is none of the room's own errors comes out of a target, so that the fuzzer stops at it."""
+    """An unexpected exception leaves the target, so that the fuzzer stops at it."""
 
     def broken(*args: object) -> None:
         raise ZeroDivisionError("broken")
 
-    monkeypatch.setattr(room, name, broken)
+    monkeypatch.setattr(module, name, broken)
     with pytest.raises(ZeroDivisionError, match="broken"):
         check_inputs(target, tmp_path)
 
 
 @pytest.mark.parametrize("target", TARGETS)
 def test_changes_keep_the_form(target: str, tmp_path: Path) -> None:
-    """A mutator gives the same for the same seed, and a good part of what it makes is still taken."""
+    """A mutator gives the same for the same seed, and a good part of its outputs is still accepted."""
 
     def plain(data: bytes) -> bytes:
         return data.replace(b"A", b"E")

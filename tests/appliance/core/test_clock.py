@@ -1,4 +1,4 @@
-"""Device time to host time: drift, spikes, wraps."""
+"""Conversion of device time to host time: drift, latency spikes, counter wraps."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,8 @@ PACKET_NS = 4 * 1e9 / 750
 
 
 def errors_ms(ppm: float, seconds: float, seed: int, spikes: float = 0.01) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time in s, error of the clock in ms and error of a plain arrival stamp in ms, packet by packet as a box sees them."""
+    """Time in s, error of the clock in ms and error of a plain arrival stamp in ms, packet by packet as a box sees
+    them."""
     rng = np.random.default_rng(seed)
     clock = DeviceClock()
     n = round(seconds * 1e9 / PACKET_NS)
@@ -29,14 +30,15 @@ def errors_ms(ppm: float, seconds: float, seed: int, spikes: float = 0.01) -> tu
 @pytest.mark.parametrize("ppm", [80, -80, 0, 150])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_drift_and_spikes(ppm: float, seed: int):
-    """80 ppm and 1 % spikes of 5-40 ms: under 1 ms from the fifth second on, where a plain stamp errs by tens."""
+    """80 ppm and 1 % spikes of 5-40 ms: under 1 ms from the fifth second on, where the arrival time alone is wrong by
+    tens of ms."""
     t_s, error, plain = errors_ms(ppm, 60, seed)
     assert np.abs(error[t_s >= 5]).max() < 1
     assert plain[t_s >= 5].max() > 5
 
 
 def test_wraps_of_the_device_clock():
-    """The device counter, started 5 s before its end, wraps without a step in host time."""
+    """The device counter, started 5 s before its wrap, wraps without a step in host time."""
     t_s, error, _ = errors_ms(0, 10, 4, spikes=0)
     assert np.abs(np.diff(error[t_s > 3])).max() < 0.5
 
@@ -48,7 +50,7 @@ def test_unwrap_goes_both_ways():
 
 
 def test_slope_is_bounded():
-    """A step of latency is not taken for a drift of more than the bound."""
+    """A step of latency is not taken for a drift beyond the bound."""
     clock = DeviceClock(max_ppm=200)
     for i in range(40):
         ns = i * 250_000_000
@@ -68,7 +70,7 @@ def test_system_clock_sleeps():
 
 @pytest.mark.parametrize("ppm", [80, -80, 0, 150])
 def test_frames_that_all_come_late_were_not_taken_late(ppm: float):
-    """A FIFO that stays 400 ms full for a minute moves the clock by what crystals drift, and not by 400 ms."""
+    """A FIFO that stays 400 ms full for a minute shifts the clock by the crystals' drift, not by 400 ms."""
     clock, errors_ms = DeviceClock(), []
     for i in range(100 * 125):
         true_ns = i * 8_000_000
@@ -81,7 +83,8 @@ def test_frames_that_all_come_late_were_not_taken_late(ppm: float):
 
 @pytest.mark.parametrize("ppm", [-2000, -500, 500, 2000])
 def test_no_line_is_kept_for_ever(ppm: float):
-    """A board beyond the bound whose first packets all came late: the error is that of the last 20 s, and grows no more."""
+    """A board beyond the bound whose first packets all came late: the error is that of the last 20 s and stops
+    growing."""
     rng, clock, arrival_ns, error_ms = np.random.default_rng(0), DeviceClock(), 0, []
     for true_ns in range(0, 150_000_000_000, 16_000_000):
         late_ns = 20e6 if true_ns < 5e9 else 1e6

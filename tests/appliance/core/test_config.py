@@ -1,4 +1,4 @@
-"""appliance/config.py: layers and their sources, every way a file can be wrong, and the board files as wiring plans."""
+"""Settings: layers and their sources, every way a file can be wrong, and the board files as wiring plans."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def _load(folder: Path, board: str | None = None, *sets: str) -> config.Config:
 
 
 def _shipped(board: str | None = None, *sets: str) -> config.Config:
-    """The files of this repository, without what this machine may have in /etc."""
+    """The files of this repository, without those of this machine in /etc."""
     return config.load(board, sets, folder=FIRMWARE, site=Path(os.devnull))
 
 
 def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
-    """Code, sensor.toml, board, site and --set, each with one value that it decides; of two --set the last wins."""
+    """Defaults, sensor.toml, board, site and --set each decide one value; of two --set the last wins."""
     (folder / "palpate.toml").write_text("[trigger]\nglitch_us = 300\nstorm_edges = 50\n")
     c = _load(folder, "a", "trigger.glitch_us=9", "trigger.glitch_us=400", "serial.port=/dev/ttyUSB0")
     assert (c.board, c.sources["board"]) == ("a", "--board")
@@ -67,7 +67,7 @@ def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder: Path
 
 
 def test_without_a_board_and_files_no_line_is_wired(tmp_path: Path) -> None:
-    """A missing sensor.toml is no error: the code's defaults hold, and no line is wired."""
+    """Without sensor.toml the defaults apply, and no line is wired."""
     (tmp_path / "palpate.toml").write_text("")
     c = _load(tmp_path)
     assert set(c.sources.values()) == {"code"}
@@ -113,7 +113,7 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
 def test_a_wrong_file_names_itself_the_key_and_what_is_allowed(
     folder: Path, file: str, text: str, name: str, hint: str
 ) -> None:
-    """The same mistakes in each layer's file: path, key with value, and hint stand in the message."""
+    """The same mistakes in each layer's file: the message has path, key with value, and advice."""
     (folder / file).write_text(text)
     with pytest.raises(ConfigError) as e:
         _load(folder, "a")
@@ -150,14 +150,14 @@ def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint:
     ],
 )
 def test_set_takes_toml_or_a_bare_string(folder: Path, option: str, section: str, key: str, value: object) -> None:
-    """What is not one TOML value is a string as it stands."""
+    """A text that is not one TOML value is used as a string."""
     got = getattr(getattr(_load(folder, None, option), section), key)
     assert (got, type(got)) == (value, type(value))
 
 
 @pytest.mark.parametrize("board", ["c", "../a", "a.toml", 0, [], ["a"], True])
 def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> None:
-    """By option and by site file; no name leads out of the folder, and what is no name at all is not taken for none."""
+    """By option and by site file; no name leads out of the folder, and a value that is no name is an error."""
     (folder / "palpate.toml").write_text(f"board = {json.dumps(board)}\n")
     with pytest.raises(ConfigError, match=r"palpate\.toml: board = .*boards there: a, b$"):
         _load(folder)
@@ -199,7 +199,7 @@ _NAMES = ["sensor.serial", "serial.baud", "output.class_bits", "trigger.mode", "
 @settings(deadline=None)
 @given(st.text(max_size=30), st.sampled_from(_NAMES))
 def test_any_set_text_is_a_value_or_a_config_error(text: str, name: str) -> None:
-    """No text ends in another exception."""
+    """No text raises another exception."""
     with contextlib.suppress(ConfigError):
         assert _shipped(None, f"{name}={text}").sources[name] == "--set"
 
@@ -276,7 +276,7 @@ def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str)
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_dead_program_is_not_ready(board: str) -> None:
-    """READY rests on a line that is low from power-on, and the page asks for strict_gpiod and the pull-down."""
+    """READY is on a line that is low from power-on, and the page asks for strict_gpiod and the pull-down."""
     assert int(_shipped(board).output.ready.removeprefix("GPIO")) >= 9
     for words in ("\n#     dtparam=strict_gpiod\n", "10 kohm pull-down on READY", "6117", "6150"):
         assert words in _page(board)

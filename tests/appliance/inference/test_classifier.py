@@ -1,4 +1,4 @@
-"""Bundle and classifier: what is altered is refused, what is refused says why, and fusing is what the paper and Bayes say."""
+"""Bundle and classifier: altered files are refused with the reason, and fusion follows the paper and Bayes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BARE = np.zeros((4, 4))
 
 
 def moving(level: float = 80, shape: tuple[int, ...] = (300, 4, 4)) -> np.ndarray:
-    """A skin that is loaded everywhere and moves."""
+    """A window of a skin that is loaded everywhere and vibrates."""
     return np.random.default_rng(0).integers(level - 5, level + 5, shape).astype(np.uint8)
 
 
@@ -38,7 +38,7 @@ def sweep_of(taxels: np.ndarray, **more) -> Sweep:
 
 
 def test_a_sound_window_passes():
-    """A loaded skin that moves is fine; so is one whose last row is off the tube."""
+    """A loaded, vibrating skin is accepted, also if its last row is off the tube."""
     taxels = moving()
     assert inspect(taxels, BARE, LIMITS).status is Status.OK
     taxels[:, 3] = 0
@@ -57,7 +57,7 @@ def test_a_sound_window_passes():
     ],
 )
 def test_a_spoiled_window_is_named(place, value: int, status: Status, detail: str):
-    """Each kind of trouble, and where it is (row.column from 1)."""
+    """Each kind of fault, with its taxel (row.column from 1)."""
     taxels = moving()
     taxels[place] = value
     found = inspect(taxels, BARE, LIMITS)
@@ -67,28 +67,28 @@ def test_a_spoiled_window_is_named(place, value: int, status: Status, detail: st
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_taxel_that_gives_no_number_is_dead(value: float):
-    """One frame of it is enough, at the edge too, and however many dead ones the bundle bears."""
+    """One frame of it is enough, also at the edge, and for any number of dead taxels that the bundle tolerates."""
     taxels = moving().astype(np.float32)
     taxels[150, 0, 3] = value
     found = inspect(taxels, BARE, replace(LIMITS, dead_taxels=3))
     assert (found.status, found.detail) == (Status.DEAD_TAXEL, "taxel 1.4")
 
 
-def test_a_bundle_that_bears_dead_taxels():
-    """As many dead taxels as the bundle allows are let through."""
+def test_a_bundle_that_tolerates_dead_taxels():
+    """As many dead taxels as the bundle allows are accepted."""
     taxels = moving()
     taxels[:, 1, 2] = 0
     assert inspect(taxels, BARE, replace(LIMITS, dead_taxels=1)).status is Status.OK
 
 
 def test_tare_counts():
-    """A load is what is above the tare."""
+    """The load is counted from the tare."""
     assert inspect(moving(80), np.full((4, 4), 75.0), LIMITS).status is Status.NO_CONTACT
 
 
 @given(st.integers(1, 40), st.integers(1, 5), st.integers(1, 5), st.integers(0, 255), st.integers(0, 2**32 - 1))
 def test_any_window_gets_a_status(n: int, rows: int, cols: int, spread: int, seed: int):
-    """Any digits of any shape, one frame long or constant: a status, never an error."""
+    """Any counts of any shape, one frame long or constant: a status, never an error."""
     taxels = np.random.default_rng(seed).integers(0, spread + 1, (n, rows, cols)).astype(np.uint8)
     assert inspect(taxels, np.zeros((rows, cols)), LIMITS).status in Status
 
@@ -107,13 +107,13 @@ def test_product_is_bayes():
 
 
 def test_no_sweep_can_veto():
-    """A sweep that is sure beyond all measure does not outweigh three that say otherwise."""
+    """A sweep with probability 1 does not outweigh three that disagree."""
     sure, other = np.array([1.0, 0.0]), np.array([1e-5, 1 - 1e-5])
     assert fuse([sure, other, other, other], "product").argmax() == 1
 
 
 def test_vote_is_the_papers():
-    """The most frequent label wins, of equally frequent ones the first: with two sweeps the first always does."""
+    """The most frequent label wins, of equally frequent ones the first: with two sweeps the first decides."""
     a, b, c = np.eye(3) * 0.8 + 0.1
     assert fuse([b, a], "vote").argmax() == 1
     assert fuse([a, b, b], "vote").argmax() == 1
@@ -127,7 +127,7 @@ def test_golden_sweeps_pass(default_bundle: Bundle):
 
 
 def test_golden_sweeps_can_fail(default_bundle: Bundle):
-    """Logits that the model does not give are found."""
+    """Logits that differ from the model's are detected."""
     other = replace(default_bundle, golden_logits=-default_bundle.golden_logits)
     with pytest.raises(BundleError, match="get another label"):
         Classifier(other, VirtualClock()).self_test()
@@ -146,7 +146,7 @@ def test_verdict_carries_what_is_known(default_bundle: Bundle):
 
 
 def test_below_the_threshold_is_unsure(default_bundle: Bundle):
-    """The label is still told, but not as `ok`."""
+    """The label is still reported, but not as `ok`."""
     strict = replace(default_bundle.manifest, thresholds=replace(default_bundle.manifest.thresholds, unsure=1.1))
     v = Classifier(replace(default_bundle, manifest=strict), VirtualClock())(sweep_of(default_bundle.golden[0]))
     assert v.status is Status.UNSURE
@@ -155,7 +155,7 @@ def test_below_the_threshold_is_unsure(default_bundle: Bundle):
 
 @pytest.mark.parametrize("status", [s for s in Status if not s.classified])
 def test_refused_sweeps_keep_their_status(default_bundle: Bundle, status: Status):
-    """What the recorder refused is not classified."""
+    """A sweep whose status is not ok is not classified."""
     sweep = replace(sweep_of(default_bundle.golden[0]), status=status)
     v = Classifier(default_bundle, VirtualClock())(sweep)
     assert (v.status, v.label, v.fused, len(v.scores)) == (status, "", 0, 0)
@@ -171,10 +171,10 @@ def of_features(weights: np.ndarray) -> dict[str, bytes]:
         [onnx.numpy_helper.from_array(weights.astype(np.float32), "W")],
     )  # fmt: skip
     made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
-    held = bundle.files(bundle.DEFAULT) | {bundle.MODEL: made.SerializeToString()}
-    entries = {name: bundle.file_entry(held[name]) for name in (bundle.MODEL, bundle.GOLDEN)}
-    manifest = bundle.Manifest.parse(held[bundle.MANIFEST])
-    return held | {bundle.MANIFEST: replace(manifest, input="L", early=None, known=None, files=entries).json()}
+    files = bundle.files(bundle.DEFAULT) | {bundle.MODEL: made.SerializeToString()}
+    entries = {name: bundle.file_entry(files[name]) for name in (bundle.MODEL, bundle.GOLDEN)}
+    manifest = bundle.Manifest.parse(files[bundle.MANIFEST])
+    return files | {bundle.MANIFEST: replace(manifest, input="L", early=None, known=None, files=entries).json()}
 
 
 def test_features_go_through_the_same_runtime():
@@ -188,13 +188,13 @@ def test_features_go_through_the_same_runtime():
 
 
 def test_as_many_features_as_the_manifest_computes():
-    """A model of four features, where input L has three."""
+    """A model of four features is refused, since input L has three."""
     with pytest.raises(BundleError, match=r"takes float32 \[1, 4\], the manifest has float32 \[1, 3\]"):
         bundle.from_files(of_features(np.ones((4, 6))), "here")
 
 
 def copy(tmp_path: Path) -> Path:
-    """A copy of the default bundle to be spoiled."""
+    """A copy of the default bundle, to be damaged."""
     return Path(shutil.copytree(bundle.DEFAULT, tmp_path / "bundle"))
 
 
@@ -278,7 +278,7 @@ def test_pickles_are_not_opened(tmp_path: Path):
 
 
 def test_a_model_that_is_none(default_bundle: Bundle):
-    """Bytes that onnxruntime cannot open, had the bundle's check let them through."""
+    """Bytes that onnxruntime cannot open, if the bundle's check had accepted them."""
     with pytest.raises(BundleError, match="refuses the model"):
         Classifier(replace(default_bundle, model=b"nonsense"), VirtualClock())
 
@@ -288,7 +288,7 @@ KNOWN = {"limit": 9.0, "temperature": 2.0}
 
 
 def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **changes) -> Path:
-    """A toy bundle whose manifest says something else, or whose means.npz holds something else."""
+    """A toy bundle with another manifest or another means.npz."""
     folder = toy_bundle.put(tmp_path / "toy", toy_bundle.files())
     if arrays is not None:
         (folder / bundle.MEANS).write_bytes(toy_bundle.npz(**arrays))
@@ -299,7 +299,7 @@ def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **chang
 
 
 def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bundle):
-    """Without the new fields; what is written now is read again as it was."""
+    """Without the new fields; a manifest that is written now is read again unchanged."""
     folder = copy(tmp_path)
     old = json.loads((folder / bundle.MANIFEST).read_text())
     (folder / bundle.MANIFEST).write_text(
@@ -351,7 +351,7 @@ def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bund
     ],
 )
 def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: str):
-    """Numbers that make no sense, fields that are missing or unknown, one half without the other."""
+    """Numbers out of range, fields that are missing or unknown, `known` without means.npz and the reverse."""
     with pytest.raises(BundleError, match=hint):
         bundle.load(spoiled(tmp_path, **changes))
 
@@ -379,7 +379,7 @@ def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: s
     ],
 )
 def test_broken_means_are_named(tmp_path: Path, arrays: dict, hint: str):
-    """Counts against labels, types, numbers that are none, an order that is none, objects."""
+    """Wrong number of labels, wrong types, NaN, wrong order, pickled objects."""
     with pytest.raises(BundleError, match=hint):
         bundle.load(spoiled(tmp_path, arrays))
 
@@ -392,7 +392,7 @@ def test_early_heads_and_enrolled_labels_exclude_each_other(tmp_path: Path):
 
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"nonsense", toy_bundle.npy(np.arange(3))])
 def test_means_that_are_no_npz(tmp_path: Path, data: bytes):
-    """Whatever the file holds, it is named."""
+    """For any content the file is named."""
     folder = spoiled(tmp_path)
     (folder / bundle.MEANS).write_bytes(data)
     files = json.loads((folder / bundle.MANIFEST).read_text())["files"]
@@ -422,7 +422,7 @@ def test_means_that_are_no_npz(tmp_path: Path, data: bytes):
     ],
 )
 def test_outputs_of_the_model_are_those_of_the_manifest(tmp_path: Path, more: dict, fine: bool):
-    """What is needed is there, what is there fits, what is unknown is refused."""
+    """Required outputs exist, existing ones fit, unknown ones are refused."""
     refused = pytest.raises(BundleError, match="must not be opened")
     with contextlib.nullcontext() if fine else refused:
         toy_bundle.load(tmp_path / "toy", **more)
@@ -440,13 +440,13 @@ def test_a_far_sweep_is_unknown(tmp_path: Path):
 
 
 def test_a_faulty_window_is_not_unknown(tmp_path: Path):
-    """What the window itself tells comes first."""
+    """A fault of the window has precedence."""
     it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
     assert it(sweep_of(np.zeros((20, 2, 2), np.int16))).status is Status.NO_CONTACT
 
 
 def test_an_unknown_sweep_does_not_count_for_its_object(tmp_path: Path):
-    """The object's other sweeps stay, and are not diluted."""
+    """The object's other sweeps are kept unchanged."""
     it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
     one = it(toy_bundle.sweep(2.9, 0, object=1))
     assert it(toy_bundle.sweep(30, 30, object=1)).status is Status.UNKNOWN
@@ -456,7 +456,7 @@ def test_an_unknown_sweep_does_not_count_for_its_object(tmp_path: Path):
 
 
 def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
-    """A float skin far beyond all reason overflows the network: no label, no NaN, and the object is not poisoned."""
+    """Huge float32 counts overflow the network: no label, no NaN, and the object's other sweeps are unaffected."""
     fmt = replace(toy_bundle.FORMAT, dtype="float32")
     made = toy_bundle.files(fmt=fmt, outputs=("logits",), known=None)
     limits = replace(bundle.Manifest.parse(made[bundle.MANIFEST]).thresholds, full_scale=3e38)
@@ -475,8 +475,8 @@ def borderline(**more) -> tuple[Sweep, float]:
     return toy_bundle.sweep(2.8, -1, **more), 1 / (1 + np.exp(-0.6))
 
 
-def test_sweeps_are_asked_for_until_one_is_sure(tmp_path: Path):
-    """Unsure, unsure, ok: after n sweeps the odds are those of one to the power n. A further one is fused too."""
+def test_sweeps_are_requested_until_the_probability_suffices(tmp_path: Path):
+    """Unsure, unsure, ok: after n sweeps the odds are those of one to the power n. A further one is fused, too."""
     it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=5)
     given = [it(borderline(object=1)[0]) for _ in range(4)]
     p = borderline()[1]
@@ -490,7 +490,7 @@ def test_sweeps_are_asked_for_until_one_is_sure(tmp_path: Path):
 
 
 def test_at_the_limit_the_answer_is_final(tmp_path: Path):
-    """Undecided with label and probability; a robot that goes on is answered by the same rule, and may become sure."""
+    """Undecided with label and probability; a robot that continues is answered by the same rule, and may get ok."""
     it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=2)
     given = [it(borderline(object=1)[0]) for _ in range(3)]
     assert [v.status for v in given] == [Status.UNSURE, Status.UNDECIDED, Status.OK]
@@ -500,13 +500,13 @@ def test_at_the_limit_the_answer_is_final(tmp_path: Path):
     assert (against.status, against.fused) == (Status.UNDECIDED, 4)
 
 
-@pytest.mark.parametrize("more", [{"object": 0}, {"object": 1, "how": "none"}])
+@pytest.mark.parametrize("more", [{"object": 0}, {"object": 1, "fusion": "none"}])
 def test_sweeps_that_stand_alone_never_reach_the_limit(tmp_path: Path, more: dict):
-    """Without NEW OBJECT, or with fusing off, each sweep is one; a limit of one makes it final."""
-    how = more.pop("how", "product")
-    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), how, min_probability=0.85, max_sweeps=2)
+    """Without NEW OBJECT, or without fusion, each sweep is its own; a limit of one makes it final."""
+    fusion = more.pop("fusion", "product")
+    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), fusion, min_probability=0.85, max_sweeps=2)
     assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNSURE] * 3
-    it = Classifier(it.bundle, VirtualClock(), how, min_probability=0.85, max_sweeps=1)
+    it = Classifier(it.bundle, VirtualClock(), fusion, min_probability=0.85, max_sweeps=1)
     assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNDECIDED] * 3
 
 
@@ -520,7 +520,7 @@ def test_sure_is_the_bundles_where_none_is_given(tmp_path: Path):
 
 
 def test_what_is_not_ok_need_not_count(tmp_path: Path):
-    """An early answer that would not be ok is none, and leaves the object as it was."""
+    """An early answer that would not be ok is not given, and the object's state is unchanged."""
     it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85)
     first = it(borderline(object=1)[0])
     for object in (1, 2):
@@ -549,8 +549,8 @@ def test_early_logits(tmp_path: Path):
         ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}, ["embedding"]),
     ],
 )
-def test_only_what_is_needed_is_asked_for(tmp_path: Path, more: dict, asked: list[str], monkeypatch):
-    """onnxruntime is asked for no output that nobody looks at."""
+def test_only_needed_outputs_are_computed(tmp_path: Path, more: dict, asked: list[str], monkeypatch):
+    """No unused output is requested from onnxruntime."""
     it = Classifier(toy_bundle.load(tmp_path / "toy", **more), VirtualClock())
     seen = []
 
@@ -593,14 +593,14 @@ def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
     ],
 )
 def test_means_of_another_training_are_found(tmp_path: Path, arrays: dict):
-    """Class means that name a golden sweep otherwise than the model's own logits are refused."""
+    """Class means that give a golden sweep another label than the model's logits are refused."""
     it = Classifier(bundle.load(spoiled(tmp_path, arrays)), VirtualClock())
     with pytest.raises(BundleError, match=r"means\.npz and the model's own logits call a golden sweep"):
         it.self_test()
 
 
-def test_of_equal_probabilities_the_first_label_is_told(default_bundle: Bundle):
-    """As argmax has it: neighbours that vote alike, or logits in few steps, must not name otherwise than export did."""
+def test_of_equal_probabilities_the_first_label_is_reported(default_bundle: Bundle):
+    """As argmax: equal votes of neighbours, or coarse logits, must give the same label as at export."""
     it = Classifier(default_bundle, VirtualClock())
     window = default_bundle.golden[0]
     sweep = Sweep(1, 0, 0, Status.OK, Frames(np.arange(len(window)), np.arange(len(window)), window))

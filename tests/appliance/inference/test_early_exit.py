@@ -1,4 +1,4 @@
-"""Deciding early: a toy graph whose heads are known by arithmetic, on the rig; every way in which it can go wrong."""
+"""Early exit: a toy graph whose heads can be computed by hand, on simulated devices; each way in which it can fail."""
 
 from __future__ import annotations
 
@@ -37,13 +37,15 @@ NEEDS = (20, 40, 60, 80)
 LEAD = 10
 SLIDE = 120
 SETS = ("classifier.early=true", "sweep.lead_ms=100")
-WEIGHTS = np.array([[1, 0], [-1, 0], [1, 0], [-1, 0]], np.float32) / 20  # "left": tenth of left less right, in digits
+WEIGHTS = (
+    np.array([[1, 0], [-1, 0], [1, 0], [-1, 0]], np.float32) / 20
+)  # "left": a tenth of left minus right, in counts
 
 
 def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool = True) -> Bundle:
-    """A bundle whose logit of "left" is a tenth of the left taxels' mean less the right ones'; that of "right" is 0.
+    """A bundle whose logit of "left" is a tenth of the left minus the right taxels' mean; that of "right" is 0.
 
-    Head d is given the mean of the frames that it may see and none of the others.
+    Head d gets the mean of exactly the frames of its step.
     """
     share = np.zeros((STEPS, FMT.window), np.float32)
     for row, n in zip(share, NEEDS, strict=True):
@@ -81,7 +83,7 @@ def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool =
 
 
 def slid(*differences: int) -> np.ndarray:
-    """A slide [SLIDE, 2, 2]: left less right is as given in each fifth of the window, the last one to the end."""
+    """A slide [SLIDE, 2, 2]: left minus right is as given in each fifth of the window, the last one to the end."""
     diff = np.repeat(differences, FMT.window // 5)[: FMT.window]
     diff = np.concatenate([diff[:1].repeat(LEAD), diff, diff[-1:].repeat(SLIDE)])[:SLIDE]
     frames = np.empty((SLIDE, 2, 2))
@@ -107,18 +109,18 @@ def simulated_slides(
 
 
 def all_of(box: Rigged) -> list[Verdict]:
-    """The verdicts on everything that the robot does, and what comes in two seconds after it."""
+    """The verdicts on everything that the robot does, and those of two more seconds."""
     verdicts = box.until(lambda: box.simulated.finished(box.box.answered))
     return verdicts + box.seconds(2)
 
 
-def told(verdicts: list[Verdict]) -> list[tuple[str, str, float]]:
+def summary(verdicts: list[Verdict]) -> list[tuple[str, str, float]]:
     """Status, label and share of each."""
     return [(str(v.status), v.label, v.share) for v in verdicts]
 
 
 def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]:
-    """How these lines moved."""
+    """The levels that were written to these lines, in order."""
     return [(name, level) for _, name, level in simulated.gpio.written if name in names]
 
 
@@ -139,7 +141,8 @@ def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]
     ],
 )
 def test_the_rule(scores: list[float], agree: int, want: bool):
-    """Probable enough for its own step, the last `agree` steps of one label; a least above 1 is never reached."""
+    """The step's own least probability, and the same label in the last `agree` steps; a least above 1 is never
+    reached."""
     rule = Early((0.9, 0.8, 1.1, 0.5), agree)
     assert decides(np.array([[p, 1 - p] for p in scores]), rule) is want
 
@@ -149,7 +152,7 @@ def test_an_early_answer(rigged: Callable[..., Rigged]):
     simulated = simulated_slides(slid(-10, 60))
     box = rigged(simulated, SETS, toy())
     (verdict,) = all_of(box)
-    assert told([verdict]) == [("ok", "left", 0.4)]
+    assert summary([verdict]) == [("ok", "left", 0.4)]
     assert verdict.probability == pytest.approx(1 / (1 + np.exp(-2.5)), abs=1e-6)
     assert verdict.fused == 1
     assert 0 <= verdict.latency_ns < 1_000_000
@@ -158,30 +161,31 @@ def test_an_early_answer(rigged: Callable[..., Rigged]):
 
 
 def test_steps_must_agree(rigged: Callable[..., Rigged]):
-    """The same slide where two steps must name one label: the first said "right", so it takes the third."""
-    assert told(all_of(rigged(simulated_slides(slid(-10, 60)), SETS, toy(agree=2)))) == [("ok", "left", 0.6)]
+    """The same slide where two steps must agree: the first named "right", so the third step answers."""
+    assert summary(all_of(rigged(simulated_slides(slid(-10, 60)), SETS, toy(agree=2)))) == [("ok", "left", 0.6)]
 
 
 @pytest.mark.parametrize(("sets", "least"), [((), 0.9), (SETS, 1.1)])
 def test_otherwise_the_answer_is_the_usual_one(rigged: Callable[..., Rigged], sets: tuple[str, ...], least: float):
-    """Off by default; and where no step is sure enough: the middle window, once, bit for bit the same."""
+    """Off by default; or if no step is sufficient: the middle window, once, bit for bit the same."""
     (want,) = all_of(rigged(simulated_slides(slid(20, 20)), (), toy(early=False)))
     simulated = simulated_slides(slid(20, 20))
     (verdict,) = all_of(rigged(simulated, sets, toy((least,) * STEPS)))
-    assert told([verdict]) == [("ok", "left", 1.0)]
+    assert summary([verdict]) == [("ok", "left", 1.0)]
     assert verdict.scores.tobytes() == want.scores.tobytes()
     assert (devices.DECIDED, True) not in levels(simulated, devices.DECIDED)
 
 
 def test_the_robot_stops_and_is_faster(rigged: Callable[..., Rigged]):
-    """DECIDED ends the slide: three sweeps, three answers, each touch as short as its share and the robot's reaction."""
+    """DECIDED ends the slide: three sweeps, three answers, each touch as short as its share and the robot's
+    reaction."""
     simulated = simulated_slides(slid(60), slid(-10, 60), slid(10))
     box = rigged(simulated, SETS, toy())
     verdicts = box.until(lambda: box.box.answered == 1)
     assert box.box.newest_frame().any()
     box.seconds(0.1)
     assert not box.box.newest_frame().any()
-    assert told(verdicts + all_of(box)) == [("ok", "left", 0.2), ("ok", "left", 0.4), ("ok", "left", 1.0)]
+    assert summary(verdicts + all_of(box)) == [("ok", "left", 0.2), ("ok", "left", 0.4), ("ok", "left", 1.0)]
     touched = [a.stop - a.start for a in simulated.robot.played]
     for frames, n in zip(touched, (20, 40), strict=False):
         assert LEAD + n < frames <= LEAD + n + 3 + 3  # the rest of a packet, 20 ms to react, and up to the next frame
@@ -189,8 +193,9 @@ def test_the_robot_stops_and_is_faster(rigged: Callable[..., Rigged]):
     assert box.box.counters.lost_frames == 0
 
 
-def test_lines_tell_it_in_order(rigged: Callable[..., Rigged]):
-    """Sentence, class bits, RESULT VALID, then DECIDED with READY and BUSY; DECIDED falls when the next sweep starts."""
+def test_lines_change_in_order(rigged: Callable[..., Rigged]):
+    """Sentence, class bits, RESULT VALID, then DECIDED with READY and BUSY; DECIDED falls when the next sweep
+    starts."""
     simulated = simulated_slides(slid(60), slid(10))
     heard_before: list[bool] = []
     kept_after: list[bool] = []
@@ -215,7 +220,7 @@ def test_lines_tell_it_in_order(rigged: Callable[..., Rigged]):
 
 
 def test_a_start_edge_beside_the_answer(rigged: Callable[..., Rigged]):
-    """In the turn of an early answer the next sweep starts: RESULT VALID and DECIDED were up, and fall for it."""
+    """In the turn of an early answer the next sweep starts: RESULT VALID and DECIDED were high, and fall."""
     simulated = simulated_slides(slid(60), stops=False, packet_frames=30)
     box = rigged(simulated, SETS, toy())
     simulated.gpio.drive(devices.START, True, simulated.backend.board.frame_ns(85))  # frame 69 comes with frame 89
@@ -223,13 +228,13 @@ def test_a_start_edge_beside_the_answer(rigged: Callable[..., Rigged]):
     assert levels(simulated, devices.DECIDED, devices.RESULT_VALID) == [
         (name, level) for level in (True, False) for name in (devices.RESULT_VALID, devices.DECIDED)
     ]
-    assert told(box.seconds(1)) == [("ok", "left", 0.2)]  # the finger still slides
+    assert summary(box.seconds(1)) == [("ok", "left", 0.2)]  # the finger still slides
 
 
 def test_a_robot_that_slides_on_gets_no_second_answer(rigged: Callable[..., Rigged]):
-    """The stop edge at the slide's usual end is silent, and the next sweep is a sweep like any other."""
+    """The stop edge at the slide's usual end gives no answer, and the next sweep is treated as usual."""
     simulated = simulated_slides(slid(60), slid(60), stops=False)
-    assert told(all_of(rigged(simulated, SETS, toy()))) == [("ok", "left", 0.2)] * 2
+    assert summary(all_of(rigged(simulated, SETS, toy()))) == [("ok", "left", 0.2)] * 2
     assert [a.stop - a.start for a in simulated.robot.played] == [SLIDE] * 2
 
 
@@ -239,14 +244,14 @@ def test_how_frames_come_changes_nothing(rigged: Callable[..., Rigged], packet_f
     slides = slid(-10, 20, 60), slid(-10, -10, 60), slid(60)
     want = all_of(rigged(simulated_slides(*slides), SETS, toy()))
     have = all_of(rigged(simulated_slides(*slides, packet_frames=packet_frames), SETS, toy()))
-    assert told(have) == told(want) == [("ok", "left", s) for s in (0.6, 0.8, 0.2)]
+    assert summary(have) == summary(want) == [("ok", "left", s) for s in (0.6, 0.8, 0.2)]
     assert [v.scores.tobytes() for v in have] == [v.scores.tobytes() for v in want]
 
 
 def test_one_run_of_the_graph_at_each_step(rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch):
-    """A sweep that nothing decides asks the heads four times, one that is decided at the second step twice; idle never.
+    """The heads run four times for a sweep without early answer, twice for one answered at step two, never when idle.
 
-    Where the window begins is looked for once for the steps, and once for the middle.
+    The begin of the window is searched once for the steps, and once for the middle.
     """
     asked: list[int] = []
     looked: list[int] = []
@@ -260,7 +265,7 @@ def test_one_run_of_the_graph_at_each_step(rigged: Callable[..., Rigged], monkey
 
 
 def test_the_rest_of_the_window_repeats_the_newest_frame(monkeypatch: pytest.MonkeyPatch):
-    """The graph is given the frames there are, and the last of them to the end: whole windows, nothing made up."""
+    """The graph gets the frames so far, and the last of them repeated to the end of the window."""
     given: list[np.ndarray] = []
     classifier = Classifier(toy(), rig.VirtualClock())
     heads = classifier.early
@@ -274,37 +279,37 @@ def test_the_rest_of_the_window_repeats_the_newest_frame(monkeypatch: pytest.Mon
 
 
 def so_far(taxels: np.ndarray, share: float) -> Sweep:
-    """A sweep that goes on."""
+    """A sweep that is still going on."""
     n = np.arange(len(taxels))
     return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels), share=share)
 
 
-def spoiled(how: str) -> np.ndarray:
-    """A slide that the toy is sure about, but a skin that is not as it should be."""
+def spoiled(fault: str) -> np.ndarray:
+    """A slide that is clear to the toy, on a faulty skin."""
     frames = slid(60)
-    if how == "saturated":
+    if fault == "saturated":
         frames[:, :, 0] = 255 - (np.arange(SLIDE) % 4 == 0)[:, None]
-    elif how == "stuck-taxel":
+    elif fault == "stuck-taxel":
         frames[:, 1, 0] = 200
-    elif how == "dead-taxel":
+    elif fault == "dead-taxel":
         frames[:, 1, 1] = 0
-    elif how == "no-contact":
+    elif fault == "no-contact":
         frames = frames // 50
     return frames
 
 
-@pytest.mark.parametrize("how", ["saturated", "stuck-taxel", "dead-taxel", "no-contact"])
-def test_a_spoiled_skin_is_not_decided_early(rigged: Callable[..., Rigged], how: str):
-    """However sure the heads are, the whole sweep says what is wrong; without the spoiling it is decided at once."""
-    assert told(all_of(rigged(simulated_slides(spoiled(how)), SETS, toy((0.5,) * STEPS)))) == [(how, "", 1.0)]
-    assert told(all_of(rigged(simulated_slides(spoiled("")), SETS, toy((0.5,) * STEPS)))) == [("ok", "left", 0.2)]
+@pytest.mark.parametrize("fault", ["saturated", "stuck-taxel", "dead-taxel", "no-contact"])
+def test_a_spoiled_skin_is_not_decided_early(rigged: Callable[..., Rigged], fault: str):
+    """For any output of the heads the whole sweep reports the fault; without the fault the answer is early."""
+    assert summary(all_of(rigged(simulated_slides(spoiled(fault)), SETS, toy((0.5,) * STEPS)))) == [(fault, "", 1.0)]
+    assert summary(all_of(rigged(simulated_slides(spoiled("")), SETS, toy((0.5,) * STEPS)))) == [("ok", "left", 0.2)]
 
 
 def test_a_taxel_that_moves_late_is_no_fault(rigged: Callable[..., Rigged]):
-    """Constant in the first step, moving in the second: refused there, decided here."""
+    """Constant in the first step, varying in the second: no answer there, an answer here."""
     frames = slid(60)
     frames[: LEAD + NEEDS[0], 0, 0] = 160
-    assert told(all_of(rigged(simulated_slides(frames), SETS, toy()))) == [("ok", "left", 0.4)]
+    assert summary(all_of(rigged(simulated_slides(frames), SETS, toy()))) == [("ok", "left", 0.4)]
 
 
 def test_a_tare_counts(rigged: Callable[..., Rigged]):
@@ -327,12 +332,13 @@ def test_a_tare_counts(rigged: Callable[..., Rigged]):
     ],
 )
 def test_missing_frames(rigged: Callable[..., Rigged], at: int, lost: int, counted: int, want: tuple[str, str, float]):
-    """Two lost frames, also the last of a step, are interpolated and counted; over a wider gap nothing is decided."""
+    """Two lost frames, also the last of a step, are interpolated and counted; after a wider gap there is no early
+    answer."""
     simulated = simulated_slides(slid(-10, 60), packet_frames=1)
     count = itertools.count()
     simulated.backend.mangle = lambda data: b"" if 0 <= next(count) - 40 - LEAD - at < lost else data
     box = rigged(simulated, SETS, toy())
-    assert told(all_of(box)) == [want]
+    assert summary(all_of(box)) == [want]
     assert [s.lost for s in box.kept] == [counted]
 
 
@@ -356,12 +362,12 @@ def test_what_goes_wrong_after_the_answer(rigged: Callable[..., Rigged], what: s
             box.edge(devices.START, 0.1 + i * 1e-4, i % 2 == 0)
     elif what == "stop":
         box.pulse(devices.STOP, 0.1)  # one too many: that of the slide's end has no start any more
-    assert told(verdicts) == [("ok", "left", 0.2)]
+    assert summary(verdicts) == [("ok", "left", 0.2)]
     assert [str(v.status) for v in box.seconds(3)] == want
 
 
 def test_what_goes_wrong_before_the_answer(rigged: Callable[..., Rigged]):
-    """Unplugged before a step is sure: `sensor-lost` at once, and nothing early after it is plugged in again."""
+    """Unplugged before an early answer: `sensor-lost` at once, and no early answer after it is plugged in again."""
     simulated = simulated_slides(slid(-10, 60), stops=False)
     box = rigged(simulated, SETS, toy())
     box.until(lambda: box.box.format == FMT and ("BUSY", True) in levels(simulated, "BUSY"))
@@ -390,21 +396,22 @@ def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Callable[...,
     assert [v.probability for v in verdicts] == pytest.approx(1 / (1 + np.exp(-logits)), abs=1e-6)
 
 
-def test_what_would_be_unsure_goes_on(rigged: Callable[..., Rigged]):
-    """`min_probability` is not reached by one sweep: no early answer, the whole one asks for another; fused it comes early."""
+def test_without_ok_the_sweep_goes_on(rigged: Callable[..., Rigged]):
+    """`min_probability` is not reached by one sweep: no early answer, the whole one requests another sweep; fused with
+    that, the answer is early."""
     simulated = simulated_slides(slid(30), slid(30), new_object=(0,))
     verdicts = all_of(rigged(simulated, (*SETS, "classifier.min_probability=0.99"), toy()))
     assert [(str(v.status), v.fused, v.share) for v in verdicts] == [("unsure", 1, 1.0), ("ok", 2, 0.2)]
 
 
 def test_a_bundle_without_heads_says_so(rigged: Callable[..., Rigged]):
-    """At start, naming the bundle, the setting and the way out."""
+    """At start, naming the bundle, the setting and what to do."""
     with pytest.raises(BundleError, match=r"toy 1 has no early heads.*classifier\.early = false"):
         rigged(simulated_slides(slid(60)), SETS, toy(early=False))
 
 
 class Ticking(rig.VirtualClock):
-    """Every look at it takes a microsecond, so that what happens in one turn has several times, as on a real machine."""
+    """Each call takes a microsecond, so that the events of one turn have different times, as on a real machine."""
 
     def now_ns(self) -> int:
         """A little later than before."""
@@ -438,15 +445,15 @@ def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_pat
         again += replayed.step()
     assert {v.share for v in first} >= {0.4, 0.6, 1.0}
     assert len(first) == 20
-    assert [(v.sweep, v.fused, v.lost, *told([v])) for v in again] == [
-        (v.sweep, v.fused, v.lost, *told([v])) for v in first
+    assert [(v.sweep, v.fused, v.lost, *summary([v])) for v in again] == [
+        (v.sweep, v.fused, v.lost, *summary([v])) for v in first
     ]
     assert [v.scores.tobytes() for v in again] == [v.scores.tobytes() for v in first]
     assert [s.frames.taxels.tobytes() for s in kept] == [s.frames.taxels.tobytes() for s in box.kept]
 
 
 def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_path: Path):
-    """What was kept of an early answer is what it saw; read again it is decided again, with the same scores."""
+    """The frames of an early answer are kept; replayed they give the same answer with the same scores."""
     box = rigged(simulated_slides(slid(-10, 60)), SETS, toy())
     (verdict,) = all_of(box)
     save(tmp_path / "sweep-000001.npy", box.kept[0], FMT)
@@ -455,7 +462,7 @@ def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_p
     assert round((sweep.stop_ns - sweep.start_ns) / FMT.period_ns) == LEAD + 39
     again = Decider(Classifier(toy(), rig.VirtualClock()))(sweep)
     assert again is not None
-    assert told([again]) == told([verdict])
+    assert summary([again]) == summary([verdict])
     assert again.scores.tobytes() == verdict.scores.tobytes()
     assert Decider(Classifier(toy((0.99,) * STEPS), rig.VirtualClock()))(sweep) is None
 
@@ -472,21 +479,21 @@ def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.Capt
     np.savez(tmp_path / "s.npz", samples=windows, labels=[0, 0, 0], materials=["left", "right"], rate_hz=100.0)
     sets = ["--set", f"classifier.bundle={tmp_path / 'toy'}", "--set", "classifier.early=true"]
 
-    def said(*args: str) -> list[list[str]]:
+    def printed(*args: str) -> list[list[str]]:
         assert main([*args, *sets]) == 0
         answers = [line.split(",") for line in capsys.readouterr().out.splitlines() if ",RES," in line]
         return [[a[2], *a[4:10], a[13]] for a in answers]
 
     kept, capture = tmp_path / "black-box", tmp_path / "capture"
     sets += ["--set", f"store.folder={tmp_path}", "--set", "store.black_box=9"]
-    first = said("run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--capture", str(capture))
+    first = printed("run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--capture", str(capture))
     assert [(a[1], a[-1]) for a in first] == [("ok", "0.20"), ("ok", "1.00"), ("ok", "0.40")]
-    assert said("replay", str(capture)) == first
-    assert [said("replay", str(path))[0] for path in sorted(kept.glob("*.npy"))] == first
+    assert printed("replay", str(capture)) == first
+    assert [printed("replay", str(path))[0] for path in sorted(kept.glob("*.npy"))] == first
 
 
 def test_the_demo_shows_what_it_saves(rigged: Callable[..., Rigged]):
-    """The share beside an early answer, and the mean touch time below; neither where nothing was early."""
+    """The share beside an early answer, and the mean touch time below; neither without early answers."""
     for slides, early in (((slid(60), slid(10)), 1), ((slid(10), slid(10)), 0)):
         simulated = simulated_slides(*slides)
         box, out = rigged(simulated, SETS, toy()), io.StringIO()
@@ -510,8 +517,8 @@ def test_a_set_is_played_so_that_early_answers_see_it(tmp_path: Path):
 
 
 @pytest.mark.parametrize("stop", ["STOP", ""])
-def test_the_robot_of_the_rig_stops_once(stop: str):
-    """Two lines or one: what was planned is taken back, the stop edge comes after the reaction, frames are left out."""
+def test_the_simulated_robot_stops_once(stop: str):
+    """Two lines or one: scheduled edges are cancelled, the stop edge comes after the reaction, frames are omitted."""
     clock = rig.VirtualClock(0)
     lines = gpio.SimGpio(clock, {"/dev/gpiochip0": ["START", "STOP"]})
     robot = rig.Robot(iter(acts(slid(60))), lines, start="START", stop=stop)
@@ -529,7 +536,7 @@ def test_the_robot_of_the_rig_stops_once(stop: str):
     assert (robot.played[0].stop, len(robot.played[0].frames)) == (72, 40 + 32 + 40)
 
 
-def test_the_robot_of_the_rig_does_not_stop_later_than_planned():
+def test_the_simulated_robot_does_not_stop_later_than_planned():
     """DECIDED just before the end of a slide changes nothing."""
     lines = gpio.SimGpio(rig.VirtualClock(0), {"/dev/gpiochip0": ["START", "STOP"]})
     robot = rig.Robot(iter(acts(slid(60))), lines, start="START", stop="STOP")

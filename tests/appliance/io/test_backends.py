@@ -1,7 +1,7 @@
-"""One contract, many backends: what the drivers hold over the simulator, umockdev, the virtual box and a real board.
+"""One contract, many backends: the drivers' behaviour on the simulator, umockdev, the virtual box and a real board.
 
-PALPATE_BACKEND chooses one a process, the simulator by default (`backends`). What a bus, a chip or a port can do in
-detail, to the microsecond, is held in virtual time by test_sensor.py, test_trigger.py and test_sink.py.
+PALPATE_BACKEND chooses one backend per process, the simulator by default (`backends`). Details of bus, chip and port,
+to the microsecond, are tested in virtual time by test_usb_sensor.py, test_gpio.py and test_robot_link.py.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def chosen() -> Iterator[Backend]:
 
 @pytest.fixture
 def need(chosen: Backend) -> Need:
-    """Gives the backend as it is at the start of a test, to tests that ask no more of it than it can."""
+    """Returns the reset backend; skips a test that needs what this backend cannot do."""
 
     def able(*wanted: str) -> Backend:
         if lacking := [what for what in wanted if what not in chosen.can]:
@@ -64,12 +64,12 @@ def now(u: Backend) -> int:
 
 
 def limit(u: Backend) -> int:
-    """The time at which to give up."""
+    """The time at which a test gives up."""
     return now(u) + round((LIMIT_S + u.slack_s) * SECOND)
 
 
 def until(u: Backend, done: Callable[[], Any], step_s: float = 0.002) -> None:
-    """Ask again and again until it is so; fails after LIMIT_S of the backend's time."""
+    """Poll a condition until it is true; fails after LIMIT_S of the backend's time."""
     end_ns = limit(u)
     while not done():
         assert now(u) < end_ns, "it did not happen"
@@ -80,7 +80,7 @@ def until(u: Backend, done: Callable[[], Any], step_s: float = 0.002) -> None:
 
 
 class Reader:
-    """A sensor that is read on and on. No read may last longer than all its timeouts together."""
+    """Reads a sensor continuously. No read may last longer than all its timeouts together."""
 
     def __init__(self, u: Backend, **settings: Any) -> None:
         self.settings = replace(u.sensor, **{"timeout_ms": 50, "retry_ms": 100} | settings)
@@ -101,14 +101,14 @@ class Reader:
         return frames
 
     def seconds(self, seconds: float) -> Frames:
-        """Everything that comes in so long a time."""
+        """All frames of this time."""
         end_ns, parts = now(self._u) + round(seconds * SECOND), []
         while now(self._u) < end_ns:
             parts.append(self.once())
         return Frames.joined(parts)
 
     def frames(self, n: int) -> Frames:
-        """`n` frames or some more."""
+        """At least `n` frames."""
         end_ns, parts = limit(self._u), [self.once()]
         while sum(map(len, parts)) < n:
             assert now(self._u) < end_ns, f"{self.sensor.state}: {self.sensor.trouble}"
@@ -130,13 +130,14 @@ class Reader:
 
 
 def check_content(u: Backend, frames: Frames) -> None:
-    """Each frame holds what the skin has taken under that number."""
+    """Each frame has the content that the skin gave this number."""
     if "numbered" in u.can:
         assert (frames.taxels == skins.counts(frames.seq, u.format)).all()
 
 
 def test_streams_without_a_gap(need: Need):
-    """Every frame once and in order, its time later than the one before and never in the future; then it is let go."""
+    """Every frame once and in order, its time later than the one before and never in the future; then the skin is
+    released."""
     u = need("skin")
     with Reader(u) as reader:
         reader.seconds(SETTLE_S)
@@ -157,7 +158,7 @@ def test_streams_without_a_gap(need: Need):
 
 
 def test_absent_then_plugged(need: Need):
-    """No skin: state absent, the ids are named, nothing comes; it is taken up when it is plugged in."""
+    """No skin: state absent, the ids are named, no frames; it is used when it is plugged in."""
     u = need("plug")
     u.unplug()
     with Reader(u) as reader:
@@ -169,7 +170,7 @@ def test_absent_then_plugged(need: Need):
 
 
 def test_unplugged_in_mid_read(need: Need):
-    """The cable is pulled while frames come: lost, then absent; plugged in again it is a new epoch, and right."""
+    """The cable is pulled while frames come: lost, then absent; plugged in again, a new epoch with correct frames."""
     u = need("plug")
     with Reader(u) as reader:
         first = reader.frames(100)
@@ -191,7 +192,7 @@ def test_unplugged_in_mid_read(need: Need):
 
 
 def test_serial_number_chooses(need: Need):
-    """Only the skin with the configured serial number is taken; another is not, and the message says what was seen."""
+    """Only the skin with the configured serial number is used; for another the message says what was found."""
     u = need("plug")
     u.plug(Skin(serial="0042"))
     with Reader(u, serial="0043") as reader:
@@ -214,7 +215,7 @@ def test_serial_number_chooses(need: Need):
     ],
 )
 def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: str):
-    """A skin that speaks or sends otherwise is refused, both sides named; a fitting one is taken up after it."""
+    """A skin with another protocol or format is refused, naming both sides; a matching one is used after it."""
     u = need("plug")
     u.plug(Skin(**change))
     with Reader(u) as reader:
@@ -229,8 +230,8 @@ def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: st
     ("control", "state", "code", "hint"),
     [("hold", "busy", 16, "another program"), ("deny", "denied", 13, "udev rule")],
 )
-def test_a_skin_that_cannot_be_had(need: Need, control: str, state: str, code: int, hint: str):
-    """Held by another program, or not allowed: its own state, what to do, and frames once that is over."""
+def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code: int, hint: str):
+    """Held by another program, or not allowed: its own state, advice, and frames once that is over."""
     u = need("skin", control)
     refuse = getattr(u, control)
     refuse(True)
@@ -247,7 +248,7 @@ def test_a_skin_that_cannot_be_had(need: Need, control: str, state: str, code: i
 
 
 def test_a_silent_skin_is_started_again(need: Need):
-    """A skin that is there but sends nothing: silent after `silence_ms`, then it is started anew, without a person."""
+    """A connected skin that sends nothing: silent after `silence_ms`, then it is started again automatically."""
     u = need("silence")
     with Reader(u, silence_ms=300) as reader:
         reader.frames(100)
@@ -259,7 +260,7 @@ def test_a_silent_skin_is_started_again(need: Need):
 
 
 def test_garbage_on_the_cable(need: Need):
-    """Spoilt transfers are counted in bytes, and in the frames that are missing; what is intact is right."""
+    """Corrupted transfers are counted in bytes and in missing frames; intact frames are correct."""
     u = need("garble")
     with Reader(u) as reader:
         reader.frames(100)
@@ -278,41 +279,42 @@ def test_garbage_on_the_cable(need: Need):
 
 
 class Watcher:
-    """A trigger that is asked every two milliseconds."""
+    """Polls a trigger every two milliseconds."""
 
     def __init__(self, u: Backend, **settings: Any) -> None:
         self.config = replace(u.trigger, **settings)
         self.trigger = GpioTrigger(self.config, u.gpio)
-        self.told: list[tuple[EdgeKind, int]] = []
+        self.reported: list[tuple[EdgeKind, int]] = []
         self._u = u
 
     def look(self) -> None:
-        """One call. What it tells has held its level for `glitch_us`, with the stamp of the edge itself."""
+        """One call. The edges that it reports have held their level for `glitch_us`, and have the time of the edge
+        itself."""
         now_ns = now(self._u)
         for edge in self.trigger.edges(now_ns):
             if edge.kind is not EdgeKind.LOST:
                 assert now_ns - edge.t_ns >= self.config.glitch_us * 1000
-            self.told.append((edge.kind, edge.t_ns))
+            self.reported.append((edge.kind, edge.t_ns))
 
     def edges(self, n: int) -> list[tuple[EdgeKind, int]]:
-        """What was told, once it is `n` edges."""
+        """The reported edges, once there are `n`."""
 
         def enough() -> bool:
             self.look()
-            return len(self.told) >= n
+            return len(self.reported) >= n
 
         until(self._u, enough)
-        told, self.told = self.told, []
-        return told
+        reported, self.reported = self.reported, []
+        return reported
 
     def seconds(self, seconds: float) -> list[tuple[EdgeKind, int]]:
-        """What is told in so long a time."""
+        """The edges that are reported in this time."""
         end_ns = now(self._u) + round(seconds * SECOND)
         while now(self._u) < end_ns:
             self.look()
             self._u.wait(0.002)
-        told, self.told = self.told, []
-        return told
+        reported, self.reported = self.reported, []
+        return reported
 
     def __enter__(self) -> Watcher:
         return self
@@ -322,7 +324,7 @@ class Watcher:
 
 
 def pulse(u: Backend, line: str) -> tuple[int, int]:
-    """Drive a line high and low again; the times before and after."""
+    """Drive a line high and low again; returns the times before and after."""
     before = now(u)
     u.drive(line, True)
     u.wait(u.pulse_s)
@@ -332,21 +334,22 @@ def pulse(u: Backend, line: str) -> tuple[int, int]:
 
 
 def test_start_and_stop(need: Need):
-    """NEW OBJECT, START, STOP as they were driven, in order, each stamped while it was driven; falls say nothing."""
+    """NEW OBJECT, START, STOP as they were driven, in order, each with a time while it was driven; falls have no
+    meaning."""
     u = need("lines")
     t = u.trigger
     roles = [(t.new_object, EdgeKind.NEW_OBJECT), (t.start, EdgeKind.START), (t.stop, EdgeKind.STOP)]
     wired = [(line, kind) for line, kind in roles if line]
     with Watcher(u) as watcher:
         spans = [pulse(u, line) for line, _ in wired]
-        told = watcher.edges(len(wired)) + watcher.seconds(0.1)
-    assert [kind for kind, _ in told] == [kind for _, kind in wired]
-    for (before, after), (_, t_ns) in zip(spans, told, strict=True):
+        reported = watcher.edges(len(wired)) + watcher.seconds(0.1)
+    assert [kind for kind, _ in reported] == [kind for _, kind in wired]
+    for (before, after), (_, t_ns) in zip(spans, reported, strict=True):
         assert before <= t_ns < after
 
 
 def test_one_line(need: Need):
-    """On one line a rise is START and a fall is STOP, told between two calls or one by one."""
+    """On one line a rise is START and a fall is STOP, reported in one call or one by one."""
     u = need("lines")
     with Watcher(u, mode="one-line") as watcher:
         before, after = pulse(u, u.trigger.start)
@@ -360,7 +363,7 @@ def test_one_line(need: Need):
 
 
 def test_glitches(need: Need):
-    """A pulse shorter than `glitch_us` is counted and is nothing else; the edge after it is told."""
+    """A pulse shorter than `glitch_us` is only counted; the edge after it is reported."""
     u = need("lines")
     with Watcher(u, mode="one-line", glitch_us=1_000_000) as watcher:
         pulse(u, u.trigger.start)
@@ -383,13 +386,13 @@ def test_high_at_the_start(need: Need):
 
 
 def test_more_edges_than_the_kernel_keeps(need: Need):
-    """What the queue has dropped is one LOST, and counted; when the line is quiet, edges are told again."""
+    """Edges that the queue dropped are one LOST, and counted; when the line is quiet, edges are reported again."""
     u = need("lines", "overrun")
     with Watcher(u) as watcher:
         u.storm(u.trigger.start, 3000)
         assert [kind for kind, _ in watcher.edges(1)] == [EdgeKind.LOST]
         until(u, lambda: (watcher.look(), not watcher.trigger.blind)[1])
-        assert watcher.told == []
+        assert watcher.reported == []
         assert 0 < watcher.trigger.edge_counters.lost_edges < 3000
         pulse(u, u.trigger.start)
         assert [kind for kind, _ in watcher.edges(1)] == [EdgeKind.START]
@@ -424,12 +427,12 @@ def seen(u: Backend) -> set[str]:
 
 
 def check_seen(u: Backend, *wanted: str) -> None:
-    """Outside, these outputs are high and no others; those that are not wired are not looked at."""
+    """Outside, exactly these outputs are high; unwired ones are ignored."""
     until(u, lambda: seen(u) == set(filter(None, wanted)))
 
 
 def test_outputs(need: Need):
-    """All low at first; then as `show` and `result` say; low again once closed."""
+    """All low at first; then as set by `show` and `result`; low again once closed."""
     u = need("lines")
     o = u.output
     with Lines(o, u.gpio, u.clock) as lines:
@@ -472,7 +475,7 @@ class Peer:
         self._u, self._sink = u, sink
 
     def turn(self) -> None:
-        """The box looks for commands, the peer listens."""
+        """The box reads commands, the peer reads sentences."""
         self.commands += self._sink.commands()
         self.heard += self._u.hear()
 
@@ -497,16 +500,16 @@ def sink_on() -> Iterator[Callable[..., SerialSink]]:
 
 
 def test_sentences_arrive_whole(need: Need, sink_on: Callable[..., SerialSink]):
-    """What is said is heard, byte by byte, none twice and none missing."""
+    """All sentences that were sent are received, byte by byte, none twice and none missing."""
     u = need("serial")
     sink = sink_on(u)
     peer = Peer(u, sink)
-    said = [sentence("ANS", "ID", "ok", i, "x" * (i % 90)) for i in range(60)]
+    sent = [sentence("ANS", "ID", "ok", i, "x" * (i % 90)) for i in range(60)]
     for i in range(0, 60, 10):
-        for line in said[i : i + 10]:
+        for line in sent[i : i + 10]:
             sink.say(line)
         peer.until(lambda i=i: peer.heard.count(b"\n") >= i + 10)
-    assert peer.heard == b"".join(said)
+    assert peer.heard == b"".join(sent)
     assert sink.dropped == 0
     assert sink.trouble == ""
 
@@ -526,7 +529,7 @@ def test_commands_come_in(need: Need, sink_on: Callable[..., SerialSink]):
 
 
 def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink]):
-    """It costs sentences, oldest first, and they are counted; no call waits, and what comes out at last is whole."""
+    """Sentences are dropped, the oldest first, and counted; no call waits, and sentences that are sent are complete."""
     u = need("serial", "stall")
     sink = sink_on(u, queue=8)
     total = 2000
@@ -550,7 +553,7 @@ def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink
 
 
 def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSink]):
-    """Pulled out while open: the next sentence meets it, trouble is told; put in again, that sentence is sent whole."""
+    """Unplugged while open: the next sentence fails and `trouble` says so; plugged in again, it is sent completely."""
     u = need("serial", "pull")
     sink = sink_on(u)
     peer = Peer(u, sink)
@@ -571,7 +574,7 @@ def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSin
 
 
 def test_controls_over_a_wire():
-    """Each control of the virtual box reaches the bench outside, with what it is given and gives; a failure is told."""
+    """Each control of the virtual box reaches the bench outside, with arguments and results; a failure is reported."""
     asked: list[tuple[Any, ...]] = []
 
     class FakeControls:
@@ -609,8 +612,8 @@ def test_controls_over_a_wire():
 @pytest.mark.parametrize(
     ("name", "there", "hint"), [("wired", "/dev/gpiochip0", "wired as tests"), ("remote", remote.PORT, "make test-rig")]
 )
-def test_what_is_missing_is_said(name: str, there: str, hint: str):
-    """Where a backend cannot be had, one line says what to do."""
+def test_a_missing_backend_says_what_to_do(name: str, there: str, hint: str):
+    """If a backend is not available, one line says what to do."""
     if os.path.exists(there):
         pytest.skip(f"{there} is here")
     with pytest.raises(backends.BackendMissing, match=hint), backends.opened(name):
@@ -618,7 +621,7 @@ def test_what_is_missing_is_said(name: str, there: str, hint: str):
 
 
 def test_an_unknown_backend(monkeypatch: pytest.MonkeyPatch):
-    """A name that is none is refused, and the names are told."""
+    """An unknown name is refused, and the known names are listed."""
     monkeypatch.setenv(backends.VARIABLE, "real")
     with pytest.raises(backends.BackendMissing, match="'real' is unknown; known are simulated, mocked, remote, wired"):
         backends.chosen()

@@ -1,4 +1,4 @@
-"""The trigger room against the simulated gpiod: edges, glitches, losses and storms in; outputs in their order."""
+"""Trigger and output lines on the simulated gpiod: edges, glitches, losses and storms in; outputs in their order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from appliance.core.config import OutputConfig, TriggerConfig
 from appliance.core.errors import LineError
 from appliance.core.types import EdgeKind
-from appliance.io import gpio_lines as room
+from appliance.io import gpio_lines
 from appliance.io.gpio_lines import Lines, check_binding, find_lines
 from appliance.io.trigger import GpioTrigger
 from appliance.sim.gpio import SimGpio, SimRequest
@@ -47,7 +47,7 @@ def output_config(**changes: Any) -> OutputConfig:
 
 
 class TriggerSetup:
-    """A simulated gpiod, a trigger on it and their clock. Times count from `t0`; line `high` is high by then."""
+    """A simulated gpiod, a trigger on it and their clock. Times count from `t0`; line `high` is high from then on."""
 
     def __init__(
         self, chips: dict[str, tuple[str, ...]] | None = None, *, high: str = "", queue: int = 1024, **changes: Any
@@ -57,7 +57,7 @@ class TriggerSetup:
         self.gpio = SimGpio(self.clock, chips or {CHIP0: INPUTS + OUTPUTS})
         if high:
             self.drive(high, 0)
-        with mock.patch.object(room, "QUEUE", queue):
+        with mock.patch.object(gpio_lines, "QUEUE", queue):
             self.trigger = GpioTrigger(trigger_config(**changes), self.gpio)
 
     def drive(self, name: str, *times_ns: int, level: bool = True) -> None:
@@ -66,12 +66,12 @@ class TriggerSetup:
             self.gpio.drive(name, level ^ i % 2, self.t0 + t_ns)
 
     def poll(self, t_ns: int) -> list[tuple[EdgeKind, int]]:
-        """What one call at `t_ns` tells."""
+        """The edges that one call at `t_ns` returns."""
         self.clock.sleep_until(self.t0 + t_ns)
         return [(edge.kind, edge.t_ns - self.t0) for edge in self.trigger.edges(self.clock.now_ns())]
 
     def run(self, until_ns: int, step_ns: int = MS) -> list[tuple[EdgeKind, int]]:
-        """What calls at every step until `until_ns` tell."""
+        """The edges that calls at every step until `until_ns` return."""
         now_ns = self.clock.now_ns() - self.t0
         return [edge for t_ns in range(now_ns, until_ns + step_ns, step_ns) for edge in self.poll(t_ns)]
 
@@ -87,7 +87,8 @@ class TriggerSetup:
 
 
 def test_two_lines() -> None:
-    """A rise of START is START, a rise of STOP is STOP, with the kernel's stamps; falls and NEW say their part."""
+    """A rise of START is START, a rise of STOP is STOP, with the kernel's time stamps; a rise of NEW is NEW OBJECT,
+    falls have no meaning."""
     setup = TriggerSetup(new_object="NEW")
     setup.drive("NEW", 3 * MS + 1, 5 * MS)
     setup.drive("START", 10 * MS + 7, 30 * MS)
@@ -96,28 +97,28 @@ def test_two_lines() -> None:
 
 
 def test_one_line() -> None:
-    """A rise is START and a fall is STOP; a stop line that is named anyway is not asked for."""
+    """A rise is START and a fall is STOP; a configured stop line is not requested."""
     setup = TriggerSetup(mode="one-line", stop="NOWHERE")
     setup.drive("START", 10 * MS + 7, 200 * MS + 13)
     assert setup.run(300 * MS) == [(START, 10 * MS + 7), (STOP, 200 * MS + 13)]
 
 
-def test_told_when_settled() -> None:
-    """A clean edge is held back until exactly `glitch_us` after it, and told once."""
+def test_reported_when_settled() -> None:
+    """A clean edge is reported exactly `glitch_us` after it, and once."""
     setup = TriggerSetup()
     setup.drive("START", MS)
     assert [setup.poll(t) for t in (MS, MS + GLITCH - 1, MS + GLITCH, 9 * MS)] == [[], [], [(START, MS)], []]
 
 
 def test_start_and_stop_in_one_call() -> None:
-    """Whole sweeps that lie between two calls come out of the second one, in order."""
+    """Complete sweeps between two calls are reported by the second one, in order."""
     setup = TriggerSetup(mode="one-line", stop="")
     setup.drive("START", 10 * MS, 200 * MS, 300 * MS, 400 * MS)
     assert setup.poll(500 * MS) == [(START, 10 * MS), (STOP, 200 * MS), (START, 300 * MS), (STOP, 400 * MS)]
 
 
 def test_both_edges_undebounced() -> None:
-    """The kernel is asked for both edges on the monotonic clock, without its debouncing, and for a long queue."""
+    """The request is for both edges on the monotonic clock, without debouncing, and with a long queue."""
     for request in TriggerSetup().gpio.requests:
         (settings,) = request.settings.values()
         assert settings.direction is gpiod.line.Direction.INPUT
@@ -128,7 +129,7 @@ def test_both_edges_undebounced() -> None:
 
 
 def test_a_request_for_each_line() -> None:
-    """Each input is requested by itself, also on one chip: then the kernel numbers what it tells, without a hole."""
+    """Each input has its own request, also on one chip: the kernel then numbers its events without gaps."""
     setup = TriggerSetup(new_object="NEW")
     assert [request.names for request in setup.gpio.requests] == [{1: "START"}, {2: "STOP"}, {3: "NEW"}]
 
@@ -143,7 +144,7 @@ def test_bias(bias: str, wanted: str) -> None:
 
 
 def test_active_low() -> None:
-    """With active_low and a pull-up a fall is START; the high level at rest is none."""
+    """With active_low and a pull-up a fall is START; the high level at rest is no edge."""
     setup = TriggerSetup(mode="one-line", stop="", active_low=True, bias="pull-up")
     setup.drive("START", 10 * MS, 200 * MS, level=False)
     assert setup.run(300 * MS) == [(START, 10 * MS), (STOP, 200 * MS)]
@@ -172,7 +173,7 @@ def test_bounce_keeps_first_stamp() -> None:
 @pytest.mark.parametrize("width_ns", [10 * US, 100 * US, GLITCH - 1])
 @pytest.mark.parametrize("high", [False, True])
 def test_glitch(width_ns: int, high: bool) -> None:
-    """A pulse shorter than `glitch_us`, up or down, is counted and is nothing else."""
+    """A pulse shorter than `glitch_us`, up or down, is only counted."""
     setup = TriggerSetup(high="START" if high else "", mode="one-line", stop="")
     setup.drive("START", 10 * MS, 10 * MS + width_ns, level=not high)
     assert setup.run(20 * MS) == []
@@ -180,14 +181,14 @@ def test_glitch(width_ns: int, high: bool) -> None:
 
 
 def test_pulse_of_glitch_us() -> None:
-    """A pulse of exactly `glitch_us` is real."""
+    """A pulse of exactly `glitch_us` is an edge."""
     setup = TriggerSetup(mode="one-line", stop="")
     setup.drive("START", 10 * MS, 10 * MS + GLITCH)
     assert setup.run(20 * MS) == [(START, 10 * MS), (STOP, 10 * MS + GLITCH)]
 
 
 def test_level_seen_too_late() -> None:
-    """The kernel may look when the level is gone: the same edge twice is one, and one back to the level is none."""
+    """The kernel may read the level too late: the same edge twice is one edge, and a return to the level is none."""
     setup = TriggerSetup()
     setup.queue((False, MS, 1), (False, MS + US, 2))
     assert setup.poll(3 * MS) == []
@@ -201,7 +202,7 @@ def test_level_seen_too_late() -> None:
 
 @pytest.mark.parametrize("chips", [{CHIP0: INPUTS}, {CHIP0: ("START",), CHIP1: ("NEW", "STOP")}])
 def test_order_across_lines(chips: dict[str, tuple[str, ...]]) -> None:
-    """A clean STOP waits for the older START that still bounces; on one chip and on two."""
+    """A clean STOP waits for an older START that still bounces, on one chip and on two."""
     setup = TriggerSetup(chips)
     setup.drive("START", *(10 * MS + us * US for us in (0, 400, 800, 1200, 1600)))
     setup.drive("STOP", 10 * MS + 100 * US)
@@ -211,7 +212,7 @@ def test_order_across_lines(chips: dict[str, tuple[str, ...]]) -> None:
 
 
 def test_interrupts_overtake() -> None:
-    """An edge that the kernel's thread hands over late, but within `glitch_us`, is told in its order and is no loss."""
+    """An edge that the kernel's thread delivers late, but within `glitch_us`, is reported in order and is no loss."""
     setup = TriggerSetup()
     setup.drive("START", MS)
     setup.drive("STOP", MS + 5 * US)
@@ -227,11 +228,12 @@ def test_interrupts_overtake() -> None:
 
 
 def test_edges_that_the_kernel_joins() -> None:
-    """Two interrupts before their thread has run are one event with the level after both: no loss, be it a glitch or not."""
+    """Two interrupts before their thread has run are one event with the level after both: no loss, whether it is a
+    glitch or not."""
     setup = TriggerSetup()
     rise, fall = gpiod.EdgeEvent.Type.RISING_EDGE.value, gpiod.EdgeEvent.Type.FALLING_EDGE.value
-    told = (fall, MS + 20 * US, 2, 1), (rise, 5 * MS + 20 * US, 5, 2)  # kind, stamp, edges so far, events so far
-    setup.gpio.requests[0].queue.extend(gpiod.EdgeEvent(k, setup.t0 + t, 1, edges, n) for k, t, edges, n in told)
+    reported = (fall, MS + 20 * US, 2, 1), (rise, 5 * MS + 20 * US, 5, 2)  # kind, stamp, edges so far, events so far
+    setup.gpio.requests[0].queue.extend(gpiod.EdgeEvent(k, setup.t0 + t, 1, edges, n) for k, t, edges, n in reported)
     assert setup.poll(9 * MS) == [(START, 5 * MS + 20 * US)]
     assert (setup.trigger.edge_counters.lost_edges, setup.trigger.edge_counters.glitches) == (0, 1)
 
@@ -249,20 +251,20 @@ def test_event_numbers_wrap() -> None:
 
 
 def test_overrun() -> None:
-    """Dropped events are counted and told as one LOST; nothing is made up from what is left or from the level."""
+    """Dropped events are counted and reported as one LOST; no edge is derived from the rest or from the level."""
     setup = TriggerSetup(mode="one-line", stop="", queue=4)
     setup.drive("START", 5 * MS)
     assert setup.run(6 * MS) == [(START, 5 * MS)]
     setup.drive("START", *(t * MS for t in range(10, 17)), level=False)
     assert setup.poll(20 * MS) == [(LOST, 13 * MS)]  # the first that was left
     assert setup.trigger.edge_counters.lost_edges == 3
-    setup.drive("START", 30 * MS, 40 * MS)  # it is low now, though a START was told last
+    setup.drive("START", 30 * MS, 40 * MS)  # it is low now, though a START was reported last
     assert setup.run(50 * MS) == [(START, 30 * MS), (STOP, 40 * MS)]
     assert setup.trigger.edge_counters.glitches == setup.trigger.edge_counters.storms == 0
 
 
 def test_blind_until_quiet() -> None:
-    """After a loss nothing counts until all lines have been quiet for `glitch_us`; then the levels are read anew."""
+    """After a loss nothing counts until all lines have been quiet for `glitch_us`; then the levels are read again."""
     setup = TriggerSetup(mode="one-line", stop="", queue=4)
     setup.drive("START", *(t * 100 * US for t in (100, 110, 120, 130, 140, 144, 148)))
     assert (setup.poll(14_500 * US), setup.trigger.blind) == ([(LOST, 12 * MS)], True)
@@ -274,7 +276,7 @@ def test_blind_until_quiet() -> None:
 
 
 def test_loss_upon_loss() -> None:
-    """A loss is told at once where it must be one, and losses that follow before it is quiet are only counted."""
+    """A loss is reported as soon as it is certain; further losses before the lines are quiet are only counted."""
     setup = TriggerSetup(queue=32)
     setup.drive("START", *(10 * MS + i * US for i in range(100)))
     assert setup.poll(10 * MS + 49 * US) == [(LOST, 10 * MS + 18 * US)]
@@ -284,7 +286,7 @@ def test_loss_upon_loss() -> None:
 
 
 def test_loss_ends_what_is_open() -> None:
-    """A loss drops bursts that are still open; an edge that only waited for them had settled, and comes before it."""
+    """A loss discards bursts that are still open; a settled edge that waited for them is reported before it."""
     setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
     setup.drive("START", *(t * 100 * US for t in (50, 54, 58, 62, 66, 70, 74, 78)))
     setup.drive("STOP", 5_100 * US)
@@ -294,7 +296,7 @@ def test_loss_ends_what_is_open() -> None:
 
 
 def test_nothing_between_loss_and_quiet() -> None:
-    """An edge of another chip that came after the loss is not told: its STOP might be among what is lost."""
+    """An edge of another chip that came after the loss is not reported: its STOP might be among the lost events."""
     setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
     setup.drive("STOP", *(t * MS for t in range(10, 15)))
     setup.drive("START", 15 * MS, 17 * MS)
@@ -304,7 +306,7 @@ def test_nothing_between_loss_and_quiet() -> None:
 
 @pytest.mark.parametrize("step_ns", [US, 10 * US])
 def test_storm(step_ns: int) -> None:
-    """10,000 edges in a burst are one LOST at the first that is too many; the line works again when it is quiet."""
+    """10,000 edges in a burst are one LOST at the first one above the limit; the line works again when it is quiet."""
     setup = TriggerSetup(mode="one-line", stop="")
     setup.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
     assert setup.run(200 * MS) == [(LOST, 10 * MS + 2000 * step_ns)]
@@ -341,23 +343,23 @@ def test_reading_is_bounded() -> None:
 
 
 def test_unread_rest_of_a_burst() -> None:
-    """A burst whose rest is still in the queue has not settled, though the call is long after it."""
+    """A burst with events still in the queue is not settled, though the call is long after it."""
     setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=3)  # one event of each chip a call
     setup.drive("START", 10 * MS, 10 * MS + 100 * US, 10 * MS + 200 * US)
     setup.drive("STOP", 11 * MS)
-    told = [setup.poll((50 + i) * MS) for i in range(5)]
-    assert [edge for edges in told for edge in edges] == [(START, 10 * MS), (STOP, 11 * MS)]
-    assert told[0] == told[1] == []
+    reported = [setup.poll((50 + i) * MS) for i in range(5)]
+    assert [edge for edges in reported for edge in edges] == [(START, 10 * MS), (STOP, 11 * MS)]
+    assert reported[0] == reported[1] == []
     assert setup.trigger.edge_counters.glitches == 0
 
 
 def test_unread_edges_of_another_chip() -> None:
-    """While one chip's queue is being worked off, edges come out as they become certain, and later ones wait."""
+    """While one chip's queue is being read, edges are reported as they become certain, and later ones wait."""
     setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2)  # one event of each chip a call
     setup.drive("START", 10 * MS, 20 * MS)
     setup.drive("STOP", *(t * MS for t in (1, 2, 3, 4)))
-    told = [setup.poll((50 + i) * MS) for i in range(6)]
-    assert told == [[], [(STOP, 1 * MS)], [], [(STOP, 3 * MS)], [(START, 10 * MS)], []]
+    reported = [setup.poll((50 + i) * MS) for i in range(6)]
+    assert reported == [[], [(STOP, 1 * MS)], [], [(STOP, 3 * MS)], [(START, 10 * MS)], []]
 
 
 def test_three_chips() -> None:
@@ -370,7 +372,7 @@ def test_three_chips() -> None:
 
 
 def test_chip_pulled_out() -> None:
-    """A chip that goes away while it is read is a LineError that names a line of it and the errno."""
+    """A chip that is unplugged while it is read is a LineError that names its line and the errno."""
     setup = TriggerSetup()
     setup.gpio.refuse[CHIP0] = 19
     with pytest.raises(LineError, match=r"cannot read gpio lines START: .*errno 19.*plug it in"):
@@ -388,7 +390,7 @@ def toggles(gaps_us: list[int]) -> list[int]:
 
 
 def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
-    """By the book: (first edge, level) of each burst that changes the level of a line that was low."""
+    """Reference implementation: (first edge, level) of each burst that changes the level of a line that was low."""
     bursts: list[list[int]] = []
     for t_ns in times_ns:
         if bursts and t_ns - bursts[-1][-1] < GLITCH:
@@ -406,31 +408,32 @@ def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
 @settings(deadline=None)
 @given(st.tuples(gaps, gaps, gaps), st.integers(20, 5000))
 def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) -> None:
-    """Whatever three lines on two chips do and whenever calls come: the edges by the book, in order of time."""
+    """For any edges on three lines of two chips and any times of calls: the edges of the reference, in order of
+    time."""
     setup = TriggerSetup({CHIP0: ("NEW", "STOP"), CHIP1: ("START",)}, new_object="NEW")
     wanted = []
     for name, kind, gaps_us in zip(("START", "STOP", "NEW"), (START, STOP, NEW_OBJECT), lines, strict=True):
         setup.drive(name, *toggles(gaps_us))
         wanted += [(kind, t_ns) for t_ns, level in settled(toggles(gaps_us)) if level]
-    told = setup.run(max(sum(gaps_us) for gaps_us in lines) * US + MS, step_us * US)
-    assert sorted(told) == sorted(wanted)
-    assert [t_ns for _, t_ns in told] == sorted(t_ns for _, t_ns in wanted)
+    reported = setup.run(max(sum(gaps_us) for gaps_us in lines) * US + MS, step_us * US)
+    assert sorted(reported) == sorted(wanted)
+    assert [t_ns for _, t_ns in reported] == sorted(t_ns for _, t_ns in wanted)
 
 
 @settings(deadline=None)
 @given(gaps, st.integers(20, 5000), st.integers(2, 30), st.sampled_from([2, 8, 64]), st.booleans())
 def test_any_losses(gaps_us: list[int], step_us: int, storm_edges: int, queue: int, high: bool) -> None:
-    """START and STOP alternate unless LOST lies between, stamps never go back, nothing too short makes an edge."""
+    """START and STOP alternate unless LOST is between them, times never go back, no short pulse makes an edge."""
     setup = TriggerSetup(high="START" if high else "", mode="one-line", stop="", storm_edges=storm_edges, queue=queue)
     times = toggles(gaps_us)
     setup.drive("START", *times, level=not high)
-    told = setup.run((sum(gaps_us) + 1500 + 50 * step_us) * US, step_us * US)
-    assert all(a != b or a is LOST for (a, _), (b, _) in pairwise(told))
-    assert all(a <= b for (_, a), (_, b) in pairwise(told))
+    reported = setup.run((sum(gaps_us) + 1500 + 50 * step_us) * US, step_us * US)
+    assert all(a != b or a is LOST for (a, _), (b, _) in pairwise(reported))
+    assert all(a <= b for (_, a), (_, b) in pairwise(reported))
     by_the_book = {(START if level != high else STOP, t_ns) for t_ns, level in settled(times)}
-    assert {edge for edge in told if edge[0] is not LOST} <= by_the_book
+    assert {edge for edge in reported if edge[0] is not LOST} <= by_the_book
     lost = setup.trigger.edge_counters.lost_edges + setup.trigger.edge_counters.storms
-    assert bool(lost) == any(kind is LOST for kind, _ in told)
+    assert bool(lost) == any(kind is LOST for kind, _ in reported)
     assert not setup.trigger.blind
 
 
@@ -443,7 +446,7 @@ def sim(chips: dict[str, tuple[str, ...]]) -> SimGpio:
 
 
 def test_find_on_two_chips() -> None:
-    """Lines are found by name, wherever they are; chip numbers may have holes."""
+    """Lines are found by name on any chip; chip numbers may have gaps."""
     gpio = sim({"/dev/gpiochip4": ("", "STOP"), "/dev/gpiochip11": ("START",)})
     assert find_lines(gpio, ["START", "STOP"]) == {"START": ("/dev/gpiochip11", 0), "STOP": ("/dev/gpiochip4", 1)}
 
@@ -460,13 +463,13 @@ def test_find_through_link() -> None:
 
 
 def test_missing_line() -> None:
-    """A missing line is named together with the nearest names there are."""
+    """A missing line is named together with the most similar names."""
     with pytest.raises(LineError, match=r"no gpio line is named 'GPIO71'; nearest: GPIO17"):
         find_lines(sim({CHIP0: ("", "ID_SDA", "GPIO17")}), ["GPIO71"])
 
 
 def test_nothing_like_it() -> None:
-    """Where no name is near, some names show what lines are called here."""
+    """If no name is similar, some existing names are listed."""
     with pytest.raises(LineError, match=r"'START'; nearest: PA0, PA1, PA2;"):
         find_lines(sim({CHIP0: ("PA0", "PA1", "PA2", "PA3")}), ["START"])
 
@@ -485,7 +488,7 @@ def test_nameless_line() -> None:
     ],
 )
 def test_ambiguous_line(chips: dict[str, tuple[str, ...]], where: str) -> None:
-    """A name that two lines have is refused, and both are named."""
+    """A name of two lines is refused, naming both."""
     with pytest.raises(LineError, match=f"'A' is ambiguous: {where}"):
         find_lines(sim(chips), ["A"])
 
@@ -498,7 +501,7 @@ def test_one_line_two_roles() -> None:
 
 @pytest.mark.parametrize("number", [1, 13])
 def test_permission_denied(number: int) -> None:
-    """A chip that may not be opened is named with what to do, where the line is on no other chip."""
+    """A chip that may not be opened is named with advice, if the line is on no other chip."""
     gpio = sim({CHIP0: ("START",), CHIP1: ("STOP",)})
     gpio.refuse[CHIP1] = number
     assert find_lines(gpio, ["START"]) == {"START": (CHIP0, 0)}
@@ -515,7 +518,7 @@ def test_unreadable_chip() -> None:
 
 
 def test_no_chip() -> None:
-    """A machine without GPIO says so, unless nothing is wanted of it."""
+    """A machine without GPIO is an error, unless no line is wanted."""
     with pytest.raises(LineError, match="no /dev/gpiochip"):
         find_lines(sim({}), ["START"])
     assert find_lines(sim({}), []) == {}
@@ -523,7 +526,7 @@ def test_no_chip() -> None:
 
 @pytest.mark.parametrize("module", [SimpleNamespace(__version__="1.6.3", Chip=object), SimpleNamespace()])
 def test_binding_of_libgpiod_1(module: Any) -> None:
-    """The old binding, or something else of that name, is refused with its version and the way out."""
+    """The old binding, or another module of that name, is refused with its version and advice."""
     version = getattr(module, "__version__", "of unknown version")
     with pytest.raises(LineError, match=f"module gpiod {version} is not.*pip install 'gpiod>=2'"):
         GpioTrigger(trigger_config(), module)
@@ -532,13 +535,13 @@ def test_binding_of_libgpiod_1(module: Any) -> None:
 
 
 def test_real_binding() -> None:
-    """The installed gpiod is the right one, and so is the double."""
+    """The installed gpiod is accepted, and so is the double."""
     check_binding(gpiod)
     check_binding(sim({}))
 
 
 def test_busy_line() -> None:
-    """A line that somebody holds is a LineError with errno 16, and the lines that were free are given back."""
+    """A line that is in use is a LineError with errno 16, and the free lines are released."""
     gpio = sim({CHIP0: ("START",), CHIP1: ("STOP",)})
     with GpioTrigger(trigger_config(stop="", start="STOP", mode="one-line"), gpio):
         with pytest.raises(LineError, match=r"cannot request gpio lines STOP: .*errno 16.*gpioinfo"):
@@ -559,7 +562,7 @@ def panel() -> tuple[SimGpio, VirtualClock, Lines]:
 
 
 def test_outputs_begin_low(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """All outputs are requested low, one request a chip, and nothing needs to be written."""
+    """All outputs are requested low, with one request per chip, and nothing is written."""
     gpio, _, _ = panel
     settings = [s for request in gpio.requests for s in request.settings.values()]
     assert [request.path for request in gpio.requests] == [CHIP0, CHIP1]
@@ -570,7 +573,7 @@ def test_outputs_begin_low(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
 
 
 def test_only_changes_are_written(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """READY, BUSY and FAULT are written when they change and only then."""
+    """READY, BUSY and FAULT are written only when they change."""
     gpio, clock, lines = panel
     lines.show(ready=True, busy=False, fault=False)
     clock.sleep_until(MS)
@@ -604,7 +607,7 @@ def test_class_bits_settle_first(panel: tuple[SimGpio, VirtualClock, Lines]) -> 
 
 
 def test_same_code_again(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """The same code once more is a new RESULT VALID all the same."""
+    """The same code again also gives a new RESULT VALID."""
     gpio, _, lines = panel
     lines.result(0)
     lines.result(0)
@@ -612,7 +615,7 @@ def test_same_code_again(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
 
 
 def test_no_result(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """None lets RESULT VALID fall at once and touches no bit."""
+    """With None RESULT VALID falls at once and no bit changes."""
     gpio, clock, lines = panel
     lines.result(1)
     gpio.written.clear()
@@ -623,7 +626,7 @@ def test_no_result(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
 
 @pytest.mark.parametrize("code", [-1, 8])
 def test_code_that_does_not_fit(panel: tuple[SimGpio, VirtualClock, Lines], code: int) -> None:
-    """A code too large for the bits is a LineError and leaves RESULT VALID low."""
+    """A code that is too large for the bits is a LineError and leaves RESULT VALID low."""
     gpio, _, lines = panel
     assert lines.capacity == 8
     lines.result(7)
@@ -634,7 +637,7 @@ def test_code_that_does_not_fit(panel: tuple[SimGpio, VirtualClock, Lines], code
 
 
 def test_not_wired() -> None:
-    """Lines without a name are neither looked for nor written; a box without any output needs no chip."""
+    """Lines without a name are neither searched nor written; a box without outputs needs no chip."""
     gpio = SimGpio(VirtualClock(0), {CHIP0: ("READY",)})
     lines = Lines(output_config(busy="", result_valid="", fault="", class_bits=()), gpio, VirtualClock(0))
     lines.show(ready=True, busy=True, fault=True)

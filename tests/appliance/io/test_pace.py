@@ -1,4 +1,4 @@
-"""A board's clock and its count, held against each other; and its hindrances that end by themselves. In virtual time.
+"""Comparison of a board's clock with its frame count, and faults that end by themselves. In virtual time.
 
 In: a board whose packets are altered on the cable. Out: states, and no frame whose host time is wrong.
 """
@@ -42,13 +42,13 @@ def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> tuple[
 
 
 def late_ms(frames: Frames, simulated: SimDevices) -> np.ndarray:
-    """By how many ms each frame's stamp [n] is later than the moment at which the board took it."""
+    """Delay in ms [n] of each frame's time stamp after the time at which the board took it."""
     taken_ns = [simulated.backend.board.frame_ns(int(seq) & ((1 << EPOCH_BITS) - 1)) for seq in frames.seq]
     return (frames.t_ns - np.array(taken_ns)) / 1e6
 
 
-def alter(simulated: SimDevices, how: Alter, packets: int) -> None:
-    """The next packets get another number and another time, as `how` says of (a packet, the first one)."""
+def alter(simulated: SimDevices, change: Alter, packets: int) -> None:
+    """The next packets get another number and another time, as `change` says of (a packet, the first one)."""
     first: list[wire.Packet] = []
 
     def mangle(data: bytes) -> bytes:
@@ -56,7 +56,7 @@ def alter(simulated: SimDevices, how: Alter, packets: int) -> None:
         first.append(packet)
         if len(first) > packets:
             return data
-        seq, t_us = how(packet, first[0])
+        seq, t_us = change(packet, first[0])
         return wire.pack(seq % COUNTS, t_us % COUNTS, packet.taxels, packet.flags)
 
     simulated.backend.mangle = mangle
@@ -64,7 +64,7 @@ def alter(simulated: SimDevices, how: Alter, packets: int) -> None:
 
 @pytest.mark.parametrize("packet_frames", [1, 6])
 @pytest.mark.parametrize(
-    ("how", "packets"),
+    ("change", "packets"),
     [
         pytest.param(lambda p, first: (p.seq, p.t_us + 3_000_000), 1, id="one packet 3 s ahead"),
         pytest.param(lambda p, first: (p.seq, p.t_us + 1_000_000), 10**9, id="1 s ahead from then on"),
@@ -75,12 +75,13 @@ def alter(simulated: SimDevices, how: Alter, packets: int) -> None:
         pytest.param(lambda p, first: (p.seq, p.t_us + (p.t_us - first.t_us) // 20), 2000, id="5 % fast"),
     ],
 )
-def test_a_clock_that_cannot_be_right(how: Alter, packets: int, packet_frames: int):
-    """Where the board's clock parts from its count: mismatch, no frame gets a wrong time, and it streams again after."""
+def test_a_clock_that_cannot_be_right(change: Alter, packets: int, packet_frames: int):
+    """If the board's clock disagrees with its count: mismatch, no frame gets a wrong time, and it streams again
+    afterwards."""
     simulated = idle_devices(packet_frames=packet_frames)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 3)
-    alter(simulated, how, packets)
+    alter(simulated, change, packets)
     frames, states = read_for(sensor, simulated, 4)
     assert states == {"streaming", "mismatch"}
     assert np.abs(late_ms(frames, simulated)).max(initial=0) < 50
@@ -93,7 +94,7 @@ def test_a_clock_that_cannot_be_right(how: Alter, packets: int, packet_frames: i
 
 @pytest.mark.parametrize("ahead", [1_000, 10_000, 1 << 30])
 def test_a_count_that_jumps(ahead: int):
-    """A count that jumps ahead while the clock does not is no loss of so many frames: mismatch, and started anew."""
+    """A count that jumps ahead while the clock does not is no loss of frames: mismatch, and the board is restarted."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -122,7 +123,8 @@ def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
 
 @pytest.mark.parametrize(("rate_hz", "packet_frames"), [(2000, 1), (2000, 8), (35.61, 1)])
 def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
-    """A board that stamps late by up to 4 ms and in whole milliseconds, so that time seems to stand or go back: no refusal."""
+    """A board that stamps late by up to 4 ms and in whole milliseconds, so that time seems to stand or go back: no
+    refusal."""
     rng = np.random.default_rng(8)
     fmt = SweepFormat(4, 4, rate_hz, 1500, "uint8")
     simulated = idle_devices(60, fmt, packet_frames=packet_frames)
@@ -168,7 +170,8 @@ def test_a_serial_number_that_is_no_text(string: bytes, state: str):
 
 @pytest.mark.parametrize("ppm", [-80, 80])
 def test_windows_over_many_offsets(ppm: float):
-    """80 ppm, one packet in a hundred 50 to 200 ms late: 120 windows with edges anywhere, each within a frame of the middle."""
+    """80 ppm, one packet in a hundred 50 to 200 ms late: 120 windows with edges anywhere, each within a frame of the
+    middle."""
     rng = np.random.default_rng(11)
     late = (150_000 + int(rng.integers(50, 200)) * 1_000_000 * (rng.random() < 0.01) for _ in iter(int, 1))
     simulated = idle_devices(ppm=ppm, latency=lambda: next(late), fifo_frames=3000, packet_frames=6)

@@ -1,4 +1,4 @@
-"""The wire: whatever comes, intact frames come out exactly and everything else is counted."""
+"""Packets: for any bytes, intact frames are returned exactly and everything else is counted."""
 
 import itertools
 import struct
@@ -18,7 +18,7 @@ PROTOCOL = ROOT / "firmware_config" / "PROTOCOL.md"
 
 
 def stream(count: int, frames: int = 3, first: int = 0, dtype: str = "uint8") -> list[bytes]:
-    """`count` packets of 2x3 taxels whose every digit names its frame."""
+    """`count` packets of 2x3 taxels, each count equal to the number of its frame."""
     packets = []
     for k in range(count):
         seq = first + k * frames
@@ -54,8 +54,8 @@ def test_document_names_the_numbers():
 
 
 @pytest.mark.parametrize("dtype", DATA_TYPES)
-def test_every_digit_type_survives(dtype: str):
-    """Digits of each type arrive as they were sent."""
+def test_every_data_type_survives(dtype: str):
+    """Raw counts of each type arrive as they were sent."""
     sent = stream(2, dtype=dtype)
     got = wire.unpack(b"".join(sent))
     assert [p.taxels.dtype.name for p in got.packets] == [dtype, dtype]
@@ -90,20 +90,21 @@ def test_any_split_gives_the_same(cuts: list[int], data: st.DataObject):
     )
 )
 def test_only_intact_frames_and_all_bytes_accounted(pieces):
-    """Repeated, truncated, corrupted packets and garbage: no frame is made up, no intact one is missed, bytes add up."""
+    """Repeated, truncated, corrupted packets and garbage: no frame is invented, no intact one is missed, bytes add
+    up."""
     sent = stream(20)
     wanted, data = {}, b""
-    for what, how in pieces:
+    for what, argument in pieces:
         if what == "packet":
-            wanted |= frames_of(wire.unpack(sent[how]).packets)
-            data += sent[how]
+            wanted |= frames_of(wire.unpack(sent[argument]).packets)
+            data += sent[argument]
         elif what == "garbage":
-            data += how
+            data += argument
         elif what == "cut":
-            data += sent[how[0]][: how[1]]
+            data += sent[argument[0]][: argument[1]]
         else:
-            broken = bytearray(sent[how[0]])
-            broken[how[1] % len(broken)] ^= how[2]
+            broken = bytearray(sent[argument[0]])
+            broken[argument[1] % len(broken)] ^= argument[2]
             data += broken
     # a broken header may announce up to MAX_PAYLOAD bytes: with that much after it, all is decided
     got = wire.unpack(data + bytes(wire.MAX_PAYLOAD + 64))
@@ -117,7 +118,7 @@ def test_only_intact_frames_and_all_bytes_accounted(pieces):
 
 @given(st.binary(max_size=3000))
 def test_garbage_never_raises_and_is_counted(data: bytes):
-    """Random bytes give no frames; each byte is garbage or waits."""
+    """Random bytes give no frames; each byte is garbage or part of the rest."""
     got = wire.unpack(data)
     assert got.packets == []
     assert got.garbage + len(got.leftover) == len(data)
@@ -125,7 +126,7 @@ def test_garbage_never_raises_and_is_counted(data: bytes):
 
 @given(st.lists(st.integers(0, 30), max_size=40), st.integers(0, 2**32 - 1))
 def test_follow_accounts_for_every_frame(order: list[int], first: int):
-    """In whatever order packets come: numbers rise, and fresh + lost frames span exactly what was seen."""
+    """For any order of packets: numbers rise, and fresh + lost frames span exactly what was seen."""
     packets = [wire.Packet((first + 3 * k) % 2**32, 0, wire.Flag(0), np.zeros((3, 1, 1), np.uint8)) for k in order]
     fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     starts = [s for s, _ in fresh]
@@ -153,7 +154,7 @@ def test_follow_takes_a_count_far_back_as_restart():
 
 
 def test_unknown_version_is_garbage_but_its_reply_is_read():
-    """Frames of another protocol version are not guessed at; a reply is read, so that the version can be named."""
+    """Frames of another protocol version are not parsed; a reply is read, so that the version can be named."""
     packet = bytearray(stream(1)[0])
     packet[2] = 9
     assert wire.unpack(bytes(packet) + bytes(50)).packets == []
@@ -177,12 +178,12 @@ def test_identity_and_format_survive():
     ],
 )
 def test_broken_replies_are_named(call, value, hint):
-    """A reply that is too short or names an unknown type says so."""
+    """A reply that is too short or has an unknown data type is a FormatError that says so."""
     with pytest.raises(FormatError, match=hint):
         call(value)
 
 
 def test_too_large_a_packet_is_refused():
-    """A packet that no box would take is not built."""
+    """A packet that no box would accept is not built."""
     with pytest.raises(FormatError, match="4096"):
         wire.pack(0, 0, np.zeros((255, 5, 5), np.uint8))

@@ -1,4 +1,5 @@
-"""The sinks: sentences that others can read, a port that is never waited for, class bits that settle first."""
+"""Serial line and class bits: sentences that others can parse, a port that is never waited for, bits that settle
+first."""
 
 import fcntl
 import itertools
@@ -48,7 +49,7 @@ def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: st
 
 
 def test_result_is_the_documents_example():
-    """The RES sentence in PROTOCOL.md is what the code sends, with the checksum that belongs there."""
+    """The RES sentence in PROTOCOL.md is what the code sends, with the correct checksum."""
     line = result(verdict(), "usb").decode().strip()
     assert f"`{line[:-2]}hh`" in PROTOCOL
 
@@ -67,7 +68,7 @@ def test_every_command_is_documented():
 
 @given(st.text(max_size=200), st.text(max_size=40), st.sampled_from(list(Status)))
 def test_pynmea2_parses_every_sentence(detail: str, label: str, status: Status):
-    """Whatever the texts are, an independent parser accepts the checksum and finds the fields in their places."""
+    """For any texts an independent parser accepts the checksum and finds all fields."""
     line = result(verdict(label, status, detail), "sim").decode("ascii")
     assert len(line) <= MAX_LINE
     parsed = pynmea2.parse(line.strip(), check=True)
@@ -96,7 +97,8 @@ def test_checksums_agree(text: str):
     ],
 )
 def test_commands_are_read(line: bytes, want: Command):
-    """With checksum or without, as a program or a person sends it; what a break or noise left before the $ is nothing."""
+    """With checksum or without, as a program or a person sends it; bytes of a break or noise before the $ are
+    ignored."""
     assert parse(line + b"\r\n") == ([want], b"")
 
 
@@ -118,7 +120,7 @@ def test_bad_commands_are_answered(line: bytes, hint: str):
 
 
 def test_a_line_without_end_is_dropped():
-    """Noise without a line end is told once and does not pile up."""
+    """Noise without a line end is reported once and does not accumulate."""
     (command,), rest = parse(b"x" * 1000)
     assert "without an end" in command.error
     assert len(rest) == MAX_LINE + 1
@@ -129,7 +131,7 @@ def test_a_line_without_end_is_dropped():
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 300), max_size=5))
 def test_parse_never_raises_and_splits_anywhere(data: bytes, cuts: list[int]):
-    """Any bytes, cut anywhere, give the same commands as at once."""
+    """Any bytes, split anywhere, give the same commands as in one piece."""
     edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
     rest, got = b"", []
     for a, b in itertools.pairwise(edges):
@@ -144,7 +146,8 @@ def sink_on(name: str, clock=None, **settings) -> SerialSink:
 
 
 def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
-    """A missing port is named with what to do, sentences wait up to the queue's length, and it is opened when it comes."""
+    """A missing port is named with what to do, sentences wait up to the queue's length, and it is opened when it
+    comes."""
     clock = rig.VirtualClock()
     sink = sink_on(str(tmp_path / "ttyUSB0"), clock)
     sink.send(verdict())
@@ -162,7 +165,7 @@ def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
 
 
 def test_a_port_that_goes_away_while_open():
-    """The other end closes (an adapter is pulled): trouble is told, nothing is raised, the next port is opened."""
+    """The other end closes (an adapter is pulled): `trouble` says so, nothing is raised, the next port is opened."""
     clock = rig.VirtualClock()
     with pseudo_terminal.pair() as (_, name):
         sink = sink_on(name, clock)
@@ -174,12 +177,12 @@ def test_a_port_that_goes_away_while_open():
 
 
 def test_a_port_that_another_program_holds():
-    """A second program on the port: the error is told, not raised."""
+    """A second program on the port: the error is in `trouble`, not raised."""
     with pseudo_terminal.pair() as (_, name):
         first, second = sink_on(name), sink_on(name)
         first.commands()
         second.commands()
-        # root may open a port that is held exclusively (TIOCEXCL), so flock has to tell
+        # root may open a port that is held exclusively (TIOCEXCL), so flock has to detect it
         assert "end the program that has it" in second.trouble
         first.close()
 
@@ -190,7 +193,8 @@ def is_shut(port: int) -> bool:
 
 
 def test_a_port_is_kept_from_others(monkeypatch: pytest.MonkeyPatch):
-    """While the box has a port the kernel refuses it to others; when it is closed it is free, also if one had it open."""
+    """While the box has a port the kernel refuses it to others; after closing it is free, even if another had it
+    open."""
     monkeypatch.setattr(sink_room, "PSEUDO_TERMINALS", range(0))
     with pseudo_terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
         sink = sink_on(name)
@@ -202,7 +206,7 @@ def test_a_port_is_kept_from_others(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_pseudo_terminal_is_not_shut():
-    """It would stay so, also for the box, when the box is killed while the other end is open."""
+    """Otherwise it would stay locked, also for the box, if the box is killed while the other end is open."""
     with pseudo_terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
         sink = sink_on(name)
         sink.commands()
@@ -242,7 +246,7 @@ def lines_on(bits: int) -> tuple[Lines, gpio.SimGpio]:
 
 
 def levels(chip: gpio.SimGpio) -> dict[str, bool]:
-    """Where the lines are now."""
+    """The present levels of the lines."""
     return {name: level for _, name, level in chip.written}
 
 

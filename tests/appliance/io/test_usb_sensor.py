@@ -1,4 +1,5 @@
-"""The sensor over the real usb.core: every way a bus can fail has its state and message, and ends by itself."""
+"""The sensor over the real usb.core: each failure of a bus has its state and message, and the sensor recovers by
+itself."""
 
 import errno
 from dataclasses import replace
@@ -34,7 +35,7 @@ def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> Frames
 
 
 def check_content(frames: Frames) -> None:
-    """Each frame holds what the board has taken under that number."""
+    """Each frame has the content that the board gave this number."""
     for seq, taxels in zip(frames.seq[::37], frames.taxels[::37], strict=True):
         frame = int(seq) & ((1 << EPOCH_BITS) - 1)
         assert (taxels == numbered(1, first=frame % 97)[0]).all()
@@ -42,7 +43,7 @@ def check_content(frames: Frames) -> None:
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_streams_without_loss(acm: bool):
-    """A healthy board, vendor class or CDC-ACM: every frame in order, its time within a millisecond of the truth."""
+    """A healthy board, vendor class or CDC-ACM: every frame in order, its time correct to a millisecond."""
     simulated = idle_devices(acm=acm)
     sensor = sensor_on(simulated)
     frames = read_for(sensor, simulated, 5)
@@ -67,7 +68,7 @@ def test_acm_takes_the_board_from_the_kernel():
 
 
 def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
-    """A machine without libusb is told which package to install."""
+    """Without libusb the message names the package to install."""
 
     def no_backend(*args, **kwargs):
         raise usb.core.NoBackendError("No backend available")
@@ -91,7 +92,7 @@ def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
     ],
 )
 def test_failures_have_their_state_and_end(call: str, code: int, state: str, hint: str):
-    """An errno at open, claim, request or read: its own state and message; when it is over, frames come again."""
+    """An errno at open, claim, request or read: its own state and message; afterwards frames come again."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     simulated.backend.errors[call] = code
@@ -105,7 +106,7 @@ def test_failures_have_their_state_and_end(call: str, code: int, state: str, hin
 
 @pytest.mark.parametrize("code", [errno.EACCES, errno.EIO])
 def test_serial_number_that_cannot_be_read(code: int):
-    """A board whose descriptors may not be read is a board that is denied or failing, not another board."""
+    """A board whose descriptors may not be read is denied or failing, not absent."""
     simulated = idle_devices()
     simulated.backend.errors["control"] = code
     sensor = sensor_on(simulated, serial="SIM0001")
@@ -134,17 +135,17 @@ def test_unplug_and_replug_in_mid_read():
 
 
 def test_timeouts_with_partial_data():
-    """Transfers cut anywhere by a timeout: the rest is put to what came before, no frame is lost or counted."""
+    """Transfers cut anywhere by a timeout: the parts are joined, no frame is lost or counted."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     rng = np.random.default_rng(0)
-    held = b""
+    rest = b""
 
     def torn(data: bytes) -> bytes:
-        nonlocal held
-        data = held + data
+        nonlocal rest
+        data = rest + data
         cut = int(rng.integers(1, len(data)))
-        held = data[cut:]
+        rest = data[cut:]
         return data[:cut]
 
     simulated.backend.mangle = torn
@@ -187,7 +188,7 @@ def test_overflow_loses_one_transfer():
 
 
 def test_garbage_on_the_cable():
-    """Corrupted transfers are counted in bytes and frames; what is intact is right."""
+    """Corrupted transfers are counted in bytes and frames; intact frames are correct."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     count = iter(range(10**6))
@@ -220,7 +221,7 @@ def test_a_host_that_pauses_too_long():
     ],
 )
 def test_a_board_that_does_not_fit(change: dict, hint: str):
-    """Another protocol, grid, digit type or rate: state mismatch, both sides named; a fitting board is taken up."""
+    """Another protocol, grid, data type or rate: state mismatch, naming both sides; a matching board is used."""
     simulated = idle_devices()
     board = simulated.backend.board
     before = {name: getattr(board, name) for name in change}
@@ -277,7 +278,7 @@ def test_acm_board_that_never_answers():
 
 
 def test_acm_board_that_answers_a_byte_at_a_time():
-    """A reply that never gets whole is given up after its half second, however much of it still comes."""
+    """A reply that never becomes complete is given up after half a second, even if bytes still come."""
     simulated = idle_devices(acm=True)
     sensor = sensor_on(simulated)
     backend = simulated.backend
@@ -308,7 +309,8 @@ def test_another_format_is_not_other_code():
 
 @pytest.mark.parametrize("replugged", [True, False])
 def test_a_board_whose_clock_starts_anew(replugged: bool):
-    """After a replug, or a crash of the firmware that USB does not notice, times and numbers begin a new epoch, and are right."""
+    """After a replug, or a crash of the firmware that USB does not notice, times and numbers begin a new epoch and are
+    correct."""
     simulated = idle_devices(first_seq=1_000_000)
     sensor = sensor_on(simulated)
     now = simulated.clock.now_ns()

@@ -1,4 +1,4 @@
-"""The black box: which sweeps it holds, over restarts and on a full disk, and that nothing of it can harm the box."""
+"""The black box: which sweeps it keeps, over restarts and on a full disk, and that its errors never stop the box."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def judged(number: int, status: Status = Status.OK, window: bool = True) -> tupl
     return sweep, Verdict(number, 5, status, "", 0.0, 0.0, np.empty(0), 0, 0, 1, "b"), {"bundle": "b"}
 
 
-def held(folder: Path) -> list[int]:
+def numbers(folder: Path) -> list[int]:
     """The numbers of the sweeps in a folder, each whole."""
     numbers = sorted(int(path.stem[6:]) for path in folder.glob("*.npy"))
     assert sorted(path.name for path in folder.iterdir()) == sorted(
@@ -42,25 +42,25 @@ def held(folder: Path) -> list[int]:
     return numbers
 
 
-def test_the_last_sweeps_are_held_over_restarts(tmp_path: Path):
-    """Each new one drives the oldest out, in a later run too, whatever its status; one without a window does not."""
+def test_the_last_sweeps_are_kept_over_restarts(tmp_path: Path):
+    """Each new one displaces the oldest, also in a later run and for any status; one without a window does not."""
     first = box(tmp_path / "b")
     for n in range(1, 6):
         first.sweep(*judged(n, Status.STUCK_TAXEL if n == 4 else Status.OK))
     first.sweep(*judged(6, Status.SHORT, window=False))
-    assert held(tmp_path / "b") == [3, 4, 5]
+    assert numbers(tmp_path / "b") == [3, 4, 5]
     assert sidecar(tmp_path / "b" / "sweep-000004.npy")["verdict"]["status"] == "stuck-taxel"
     first.close()
     second = box(tmp_path / "b")
     second.sweep(*judged(1))
-    assert held(tmp_path / "b") == [4, 5, 6]
+    assert numbers(tmp_path / "b") == [4, 5, 6]
     second.close()
     box(tmp_path / "b", most=1).sweep(*judged(1))
-    assert held(tmp_path / "b") == [7]
+    assert numbers(tmp_path / "b") == [7]
 
 
 def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """At every moment the last sweeps are there: nothing is removed before the new one has its name."""
+    """The last sweeps exist at every moment: nothing is removed before the new one has its name."""
     black = box(tmp_path)
     for n in range(1, 4):
         black.sweep(*judged(n))
@@ -77,12 +77,12 @@ def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: py
 
 
 def test_a_full_disk_drops_the_oldest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
-    """A new sweep is worth more than the oldest; where even that makes no room it is said once, and once that it is over."""
+    """A new sweep displaces the oldest; if that does not help, one line is logged, and one when it works again."""
     black = box(tmp_path)
-    room = [2]
+    limit = [2]
 
     def tight(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, object]) -> None:
-        if len(list(tmp_path.glob("*.npy"))) >= room[0]:
+        if len(list(tmp_path.glob("*.npy"))) >= limit[0]:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         save(path, sweep, fmt, about)
 
@@ -90,25 +90,23 @@ def test_a_full_disk_drops_the_oldest_first(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(recording, "save", tight)
     for n in range(1, 5):
         black.sweep(*judged(n))
-    assert held(tmp_path) == [3, 4]
+    assert numbers(tmp_path) == [3, 4]
     assert logged == []
-    room[0] = 0
+    limit[0] = 0
     for n in range(5, 8):
         black.sweep(*judged(n))
-    assert held(tmp_path) == []
-    room[0] = 9
+    assert numbers(tmp_path) == []
+    limit[0] = 9
     for n in range(8, 10):
         black.sweep(*judged(n))
-    assert held(tmp_path) == [8, 9]
+    assert numbers(tmp_path) == [8, 9]
     assert logged == [
         f"<4>black box: no sweep is kept: No space left on device; see to {tmp_path}", "black box: sweeps are kept again"
     ]  # fmt: skip
 
 
-def test_another_trouble_costs_no_sweep_that_is_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
-):
-    """A disk that fails for another reason than room: what is held stays."""
+def test_another_error_removes_no_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
+    """A disk that fails for another reason than being full: existing sweeps are kept."""
     black = box(tmp_path)
     black.sweep(*judged(1))
 
@@ -117,12 +115,12 @@ def test_another_trouble_costs_no_sweep_that_is_there(
 
     monkeypatch.setattr(recording, "save", broken)
     black.sweep(*judged(2))
-    assert held(tmp_path) == [1]
+    assert numbers(tmp_path) == [1]
     assert "Input/output error" in logged[0]
 
 
 def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
-    """A file in its place, another program in it: the box starts all the same, it is said once each, and then goes well."""
+    """A file in its place, another program in it: the box starts all the same, one line each, and later it works."""
     (tmp_path / "b").write_text("in the way")
     black = box(tmp_path / "b")
     for n in (1, 2):
@@ -133,23 +131,23 @@ def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
     black.sweep(*judged(3))
     other.close()
     black.sweep(*judged(4))
-    assert held(tmp_path / "b") == [1, 5]
+    assert numbers(tmp_path / "b") == [1, 5]
     assert [line.split(": ", 2)[-1].split(";")[0] for line in logged] == [
         "File exists", "another program keeps sweeps there", "sweeps are kept again"
     ]  # fmt: skip
 
 
 def test_its_folder_is_ready_before_the_first_sweep(tmp_path: Path):
-    """What takes the disk's time at the start is done before the box runs, and it is given back at the end."""
+    """Slow disk accesses of the start are done before the box runs, and the folder is released at the end."""
     black = box(tmp_path / "b")
     assert (tmp_path / "b").is_dir()
     black.close()
     box(tmp_path / "b").sweep(*judged(1))
-    assert held(tmp_path / "b") == [1]
+    assert numbers(tmp_path / "b") == [1]
 
 
 def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tmp_path: Path):
-    """The sentence is on the line before the disk is asked for anything; and the sweep is in the box."""
+    """The sentence is sent before any access to the disk; and the sweep is stored."""
     simulated = devices.build(skin.FORMAT, script.tubes(1, 2), rig.VirtualClock(), "sim")
     made: Rigged
     black = BlackBox(tmp_path, skin.FORMAT, 1)
@@ -162,5 +160,5 @@ def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tm
     made = rigged(simulated, observers=[OnSweep(listen), black])
     made.until(lambda: simulated.finished(made.box.answered))
     assert heard_before == [1, 2]
-    assert held(tmp_path) == [2]
+    assert numbers(tmp_path) == [2]
     black.close()

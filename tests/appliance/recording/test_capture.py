@@ -1,4 +1,4 @@
-"""Captures and saved sweeps: what was seen once can be judged again, bit for bit."""
+"""Captures and saved sweeps: replaying gives the same results bit for bit."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
 def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
-    """Drift, spikes, lost transfers, an unplugged skin, NEW OBJECT: windows, times and scores are the same when replayed."""
+    """Drift, spikes, lost transfers, an unplugged skin, NEW OBJECT: windows, times and scores are the same when
+    replayed."""
     rng = np.random.default_rng(5)
     acts = list(script.tubes(1010, 8))
     acts[3] = rig.Act(acts[3].frames, acts[3].start, acts[3].stop, acts[3].label, new_object=True)

@@ -1,4 +1,4 @@
-"""Recordings: which sweep a label is of, what is told of each, and a disk that is full, shut or taken."""
+"""Recordings: which labels a sweep gets, what REC reports, and a disk that is full, read-only or in use."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ WOOD, NONE = Labels("wood"), Labels()
 
 
 class Desk:
-    """A recording without a box: what it sends, and a clock that stands where a test puts it."""
+    """A recording without a box: the sentences that it sends, and a clock that a test sets."""
 
     def __init__(self, folder: Path, labels: Labels = WOOD) -> None:
-        self.t_ns, self.said = 0, []
+        self.t_ns, self.sentences = 0, []
         self.recording = RecordingSession(folder, toy_bundle.FORMAT, labels, self, self.hear)
 
     def now_ns(self) -> int:
@@ -40,8 +40,8 @@ class Desk:
         """Clock."""
 
     def hear(self, line: bytes) -> None:
-        """Take a sentence apart: its fields after the kind."""
-        self.said.append(line.decode().split("*")[0].split(",")[2:])
+        """Store the fields of a sentence after its kind."""
+        self.sentences.append(line.decode().split("*")[0].split(",")[2:])
 
     def do(self, name: str, text: str = "") -> list[object]:
         """Carry out a command."""
@@ -50,11 +50,11 @@ class Desk:
     def sweep(self, number: int, start_ns: int = 0, status: Status = Status.OK) -> list[str]:
         """Give a sweep; the REC sentence's fields."""
         self.recording.sweep(*judged(number, start_ns, status), {"bundle": "b"})
-        return self.said[-1]
+        return self.sentences[-1]
 
 
 def judged(number: int, start_ns: int = 0, status: Status = Status.OK) -> tuple[Sweep, Verdict]:
-    """A sweep with a window where the status has one, and a verdict on it."""
+    """A sweep, with a window if the status has one, and a verdict on it."""
     windowless = status in (Status.SHORT, Status.GAP)
     frames = Frames.empty(toy_bundle.FORMAT) if windowless else toy_bundle.sweep(0, 0).frames
     sweep = Sweep(number, start_ns, start_ns + 1, status if windowless else Status.OK, frames)
@@ -63,7 +63,7 @@ def judged(number: int, start_ns: int = 0, status: Status = Status.OK) -> tuple[
 
 
 def names(folder: Path) -> list[str]:
-    """What lies in a folder."""
+    """The names in a folder."""
     return sorted(path.name for path in folder.iterdir())
 
 
@@ -90,8 +90,8 @@ def heard(box: Rigged) -> list[list[str]]:
     return [line.split("*")[0].split(",")[2:] for line in box.heard if ",REC," in line]
 
 
-def test_a_label_is_of_the_sweeps_that_start_after_it(recorded: Callable[..., Rigged], tmp_path: Path):
-    """Over the serial line, with real edges: what is sent while a sweep is open is of the next one."""
+def test_a_label_applies_to_sweeps_that_start_after_it(recorded: Callable[..., Rigged], tmp_path: Path):
+    """Over the serial line, with real edges: a label that is sent during a sweep applies to the next one."""
     first, *others = script.tubes(1, 3)
     before = np.zeros((3 * 750, 4, 4), np.uint8)  # time enough for the first command
     first = rig.Act(np.concatenate([before, first.frames]), len(before) + first.start, len(before) + first.stop, "")
@@ -115,7 +115,7 @@ def test_a_label_is_of_the_sweeps_that_start_after_it(recorded: Callable[..., Ri
         pynmea2.parse(line, check=True)
 
 
-def test_a_sidecar_tells_all(recorded: Callable[..., Rigged], tmp_path: Path):
+def test_a_sidecar_holds_everything(recorded: Callable[..., Rigged], tmp_path: Path):
     """Verdict bit for bit, board, clock, tare, rule, bundle and run stand beside the frames, in plain JSON."""
     simulated = devices.build(skin.FORMAT, script.tubes(2, 1), rig.VirtualClock(), "sim")
     box = recorded(simulated, Labels("wood", "3", "monday"))
@@ -154,11 +154,11 @@ def test_a_recording_is_a_set_to_train_on(recorded: Callable[..., Rigged], tmp_p
 
 
 def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
-    """Stored with its count, its labels and its file; a doubt about the window; skipped where there is none."""
+    """Stored with its count, labels and file; a fault of the window; skipped without a window."""
     desk = Desk(tmp_path, Labels("wood", "3", "a b"))
     assert desk.sweep(1) == ["1", "stored", "1", "wood", "3", "a b", "sweep-000001"]
     assert desk.sweep(2, status=Status.SHORT) == ["2", "skipped", "1", "wood", "3", "a b", "short"]
-    assert desk.sweep(3, status=Status.NO_CONTACT)[1:3] + desk.said[-1][6:] == [
+    assert desk.sweep(3, status=Status.NO_CONTACT)[1:3] + desk.sentences[-1][6:] == [
         "stored",
         "2",
         "sweep-000003 no-contact",
@@ -174,7 +174,7 @@ def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
 
 
 def test_the_label_at_the_start_edge_counts(tmp_path: Path):
-    """Whatever came since: each sweep has what held when it began, also where it is answered after a younger one."""
+    """Each sweep has the labels that applied when it began, also if it is answered after a later sweep."""
     desk = Desk(tmp_path, Labels())
     for t_ns, material in ((100, "a"), (200, "b"), (300, "c")):
         desk.t_ns = t_ns
@@ -182,8 +182,8 @@ def test_the_label_at_the_start_edge_counts(tmp_path: Path):
     assert [desk.sweep(n, start)[3] for n, start in ((1, 299), (2, 100), (3, 99), (4, 300))] == ["b", "a", "", "c"]
 
 
-def test_more_changes_than_are_remembered_lose_labels_and_mix_none(tmp_path: Path):
-    """A sweep that began before all changes that are remembered is told as unlabelled, not as what came later."""
+def test_more_changes_than_are_kept_lose_labels_and_mix_none(tmp_path: Path):
+    """A sweep that began before all kept changes is stored without labels, not with later ones."""
     desk = Desk(tmp_path)
     for desk.t_ns in range(1, recording.MOST_CHANGES + 1):
         desk.do("MATERIAL", "metal")
@@ -196,7 +196,7 @@ def test_more_changes_than_are_remembered_lose_labels_and_mix_none(tmp_path: Pat
     [("1", "2"), ("9", "10"), ("09", "10"), ("", None), ("left", None), ("2.5", None), ("9" * 24, None)],
 )
 def test_next_position(tmp_path: Path, text: str, after: str | None):
-    """A whole number counts on by one; anything else says why not, and stays."""
+    """A whole number is increased by one; anything else is an error and stays."""
     desk = Desk(tmp_path, Labels("wood", text))
     if after:
         assert desk.do("NEXT") == ["wood", after, ""]
@@ -236,7 +236,8 @@ def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
 
 
 def test_discard_that_fails_can_be_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A disk that fails in the middle is told; the sweep still counts as stored, and DISCARD takes the rest of it."""
+    """A disk that fails in the middle is an error; the sweep still counts as stored, and DISCARD can remove the
+    rest."""
     desk = Desk(tmp_path)
     desk.sweep(1)
     with monkeypatch.context() as broken:
@@ -249,7 +250,7 @@ def test_discard_that_fails_can_be_repeated(tmp_path: Path, monkeypatch: pytest.
 
 
 def failing(unlink: Callable[..., None], suffix: str) -> Callable[..., None]:
-    """`Path.unlink` on a disk that fails for names that end so."""
+    """A `Path.unlink` that fails for names with this ending."""
 
     def broken(path: Path, missing_ok: bool = False) -> None:
         if path.suffix == suffix:
@@ -260,7 +261,7 @@ def failing(unlink: Callable[..., None], suffix: str) -> Callable[..., None]:
 
 
 def test_a_later_run_writes_nothing_over(tmp_path: Path):
-    """It counts on from what it finds; half a file of a killed run goes, and nothing else; a half sweep keeps its number."""
+    """Numbers continue; only unfinished files of a killed run are removed; an incomplete sweep keeps its number."""
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()
@@ -277,7 +278,7 @@ def test_a_later_run_writes_nothing_over(tmp_path: Path):
 
 
 def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
-    """A second one would count from the same number on; it is told, and the first goes on."""
+    """A second one would use the same numbers; it is refused, and the first continues."""
     first = Desk(tmp_path)
     with pytest.raises(ConfigError, match="another program keeps sweeps there"):
         Desk(tmp_path)
@@ -294,13 +295,14 @@ def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
 def test_no_room_for_the_system_stops_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blocks: int, left: int, detail: str, logged: list[str]
 ):
-    """Below what is kept free nothing is written; it is told, logged once, tried again with the next sweep, and logged."""
+    """Below the reserved space nothing is written: REC says so, one log line, a new try with each sweep, one log
+    line."""
     free = [left]
     monkeypatch.setattr(
         os, "statvfs", lambda path: os.statvfs_result((4096, 4096, blocks, blocks, free[0], 9, 9, 9, 0, 255))
     )
     desk = Desk(tmp_path)
-    assert [desk.sweep(n)[1:3] + desk.said[-1][6:] for n in (1, 2)] == [["full", "0", detail]] * 2
+    assert [desk.sweep(n)[1:3] + desk.sentences[-1][6:] for n in (1, 2)] == [["full", "0", detail]] * 2
     assert names(tmp_path) == []
     free[0] += 1
     assert desk.sweep(3)[1:3] == ["stored", "1"]
@@ -328,7 +330,7 @@ def test_a_disk_that_refuses(
 
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]):
-    """The disk ends after n bytes, for n across both files: failed, nothing stays, what was there is whole."""
+    """The disk is full after n bytes, for n across both files: failed, nothing stays, existing files are complete."""
     desk = Desk(tmp_path)
     desk.sweep(1)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -345,10 +347,10 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]
 
 
 def test_a_folder_that_is_taken_away(tmp_path: Path, logged: list[str]):
-    """Its sweeps fail and say so; once it is there again recording goes on."""
+    """Its sweeps fail with a report; once the folder is back, recording continues."""
     desk = Desk(tmp_path / "a" / "b")
     shutil.rmtree(tmp_path / "a")
-    assert desk.sweep(1)[1:3] + desk.said[-1][6:] == ["failed", "0", "No such file or directory"]
+    assert desk.sweep(1)[1:3] + desk.sentences[-1][6:] == ["failed", "0", "No such file or directory"]
     (tmp_path / "a" / "b").mkdir(parents=True)
     assert desk.sweep(2)[1] == "stored"
     assert "stored again" in logged[-1]
@@ -356,13 +358,13 @@ def test_a_folder_that_is_taken_away(tmp_path: Path, logged: list[str]):
 
 @pytest.mark.parametrize("folder", ["/proc/x", "/dev/null"])
 def test_a_folder_that_cannot_be_made(folder: str):
-    """It is told before the robot has swept."""
+    """Reported before the robot sweeps."""
     with pytest.raises(ConfigError, match=f"--out {folder}: .*name a folder that can be written"):
         Desk(Path(folder))
 
 
 def test_folders_are_on_the_disk_before_their_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Each is synced into the one above it, at every start: a power cut cannot take them all away later."""
+    """Each is synced into its parent, at every start: a power failure cannot remove them all later."""
     synced: list[Path] = []
     monkeypatch.setattr(recording.storage, "sync", synced.append)
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""The recorder: every trigger gets one answer, and the window is the middle of the sweep to the frame."""
+"""SweepCutter: every trigger gets one answer, and the window is the middle of the sweep to the frame."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ PERIOD = FMT.period_ns
 
 
 def t_ns(frame: float) -> int:
-    """When a frame is taken."""
+    """The time at which a frame is taken."""
     return 10 * SECOND + round(frame * PERIOD)
 
 
@@ -28,7 +28,7 @@ def frames(first: int, n: int, drop: tuple[int, ...] = (), epoch: int = 0, fmt: 
 
 
 class Bench:
-    """A recorder with its own time."""
+    """A SweepCutter with its own time."""
 
     def __init__(self, fmt: SweepFormat = FMT, **settings) -> None:
         self.recorder = SweepCutter(fmt, SweepConfig(**settings))
@@ -61,7 +61,7 @@ def sweep_of(drop: tuple[int, ...] = (), start: int = 500, stop: int = 2750) -> 
 
 
 def test_middle_window():
-    """Start at frame 500, stop at 2750: the window is frames 875 to 2374, as they were."""
+    """Start at frame 500, stop at 2750: the window is frames 875 to 2374, unchanged."""
     sweep = sweep_of()
     assert sweep.status is Status.OK
     assert (sweep.frames.seq == np.arange(875, 2375)).all()
@@ -109,7 +109,7 @@ def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
 
 
 @pytest.mark.parametrize("first", [873, 875, 1500, 2372, 2374])
-def test_wider_gaps_are_not_guessed(first: int):
+def test_wider_gaps_are_not_interpolated(first: int):
     """Three frames in a row that are missing, wholly or partly in the window, make the status `gap`, without frames."""
     sweep = sweep_of(tuple(range(first, first + MAX_GAP + 1)))
     assert sweep.status is Status.GAP
@@ -118,12 +118,12 @@ def test_wider_gaps_are_not_guessed(first: int):
 
 
 def test_gap_outside_the_window_does_not_matter():
-    """Frames that the network does not see may be missing."""
+    """Frames that the network does not need may be missing."""
     assert sweep_of(tuple(range(600, 800))).status is Status.OK
 
 
 def test_frames_that_come_after_the_stop_edge_are_waited_for():
-    """The window's last frames are late: no answer until they come; its time in hand is when they do."""
+    """The window's last frames are late: no answer until they come; `complete_ns` is the time at which they do."""
     bench = Bench()
     bench.put(frames(0, 2000))
     bench.edge(EdgeKind.START, 500)
@@ -137,7 +137,7 @@ def test_frames_that_come_after_the_stop_edge_are_waited_for():
 
 
 def test_frames_that_never_come():
-    """After `late_ms` the sweep is answered `gap`, not waited for without end."""
+    """After `late_ms` the sweep is answered `gap`."""
     bench = Bench(late_ms=500)
     bench.put(frames(0, 2000))
     bench.edge(EdgeKind.START, 500)
@@ -175,7 +175,8 @@ def test_short():
 
 
 def test_start_without_stop():
-    """No stop edge within `max_duration_s`: `long`, once; the late stop edge closes it silently, the next sweep is fine."""
+    """No stop edge within `max_duration_s`: `long`, once; the late stop edge gives no answer, the next sweep is cut as
+    usual."""
     bench = Bench(max_duration_s=4)
     bench.put(frames(0, 3000))
     bench.edge(EdgeKind.START, 100)
@@ -277,8 +278,8 @@ def test_objects_are_counted():
     assert seen == [0, 1]
 
 
-def test_the_ring_forgets_what_is_old_and_nothing_else():
-    """After many turns of the ring a window is still cut right; one that has been overwritten is a `gap`."""
+def test_the_ring_overwrites_only_old_frames():
+    """After many turns of the ring a window is still cut correctly; one that was overwritten is a `gap`."""
     bench = Bench(max_duration_s=4)
     for first in range(0, 30_000, 750):
         bench.put(frames(first, 750))
@@ -289,8 +290,8 @@ def test_the_ring_forgets_what_is_old_and_nothing_else():
     assert (sweep.frames.taxels == numbered(30_000)[27_250:28_750]).all()
 
 
-def test_latest_is_whole_or_nothing():
-    """A tare gets the newest frames, or None where one is missing."""
+def test_latest_is_complete_or_none():
+    """The newest frames, or None if one is missing."""
     bench = Bench()
     assert bench.recorder.latest(10) is None
     bench.put(frames(0, 100))
@@ -328,7 +329,7 @@ def test_an_open_sweep_so_far(packet: int):
 
 
 def test_steps_of_a_window_that_does_not_divide():
-    """Ten frames in three steps: 3, 5 and 8 of them, so that a head never lacks a frame that it may see."""
+    """Ten frames in three steps: 3, 5 and 8 of them, so that no head lacks a frame of its step."""
     fmt = SweepFormat(4, 4, 750.0, 10, "uint8")
     bench = Bench(fmt, lead_ms=0)
     bench.edge(EdgeKind.START, 0)
@@ -339,7 +340,7 @@ def test_steps_of_a_window_that_does_not_divide():
 
 
 def test_no_step_lies_beyond_a_gap():
-    """Three missing frames end the steps, also those that come later; two are filled, seen from both sides."""
+    """Three missing frames end the steps, also later ones; two are interpolated, from both sides."""
     bench = Bench(lead_ms=0)
     bench.edge(EdgeKind.START, 0)
     bench.put(frames(0, 1000, (148, 149, 400, 401, 402)))
@@ -351,7 +352,7 @@ def test_no_step_lies_beyond_a_gap():
 
 
 def test_a_sweep_that_is_settled_has_had_its_answer():
-    """No further step, a silent stop edge, and nothing that goes wrong later brings an answer."""
+    """No further step, no answer to the stop edge or to any later fault."""
     bench = Bench(lead_ms=0)
     bench.put(frames(0, 400))
     bench.edge(EdgeKind.START, 0)
@@ -380,7 +381,7 @@ def test_a_sweep_whose_answer_is_still_to_come_goes_first():
 
 
 def test_steps_begin_with_a_new_enumeration():
-    """A skin that was plugged in again: its frames are not those of the sweep that was open before."""
+    """Frames of a skin that was plugged in again do not belong to the sweep that was open before."""
     bench = Bench(lead_ms=0)
     bench.put(frames(0, 100))
     bench.edge(EdgeKind.START, 0)
@@ -398,7 +399,7 @@ def test_steps_begin_with_a_new_enumeration():
     )
 )
 def test_every_start_gets_exactly_one_answer(script):
-    """Whatever edges come in whatever order, some sweeps settled at a step: each number is answered once."""
+    """For any edges in any order, with some sweeps settled at a step: each number is answered once."""
     bench = Bench(max_duration_s=5, lead_ms=0)
     frame = starts = 0
     answers: list[Sweep] = []

@@ -1,4 +1,4 @@
-"""appliance/features.py against the paper's formulas written out as loops, and against scipy."""
+"""Features against the paper's formulas written out as loops, and against scipy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RATE, FRAMES = 750.0, 1500
 
 
 def _sweep(frames: int = FRAMES, rows: int = 2, cols: int = 3, seed: int = 1) -> np.ndarray:
-    """Uint8 digits [frames, rows, cols]: drift, a tone and noise, another mean on each taxel."""
+    """Raw counts uint8 [frames, rows, cols]: drift, a tone and noise, another mean on each taxel."""
     rng = np.random.default_rng(seed)
     t = np.arange(frames)[:, None, None] / RATE
     level = rng.uniform(20, 120, (1, rows, cols))
@@ -27,23 +27,23 @@ def _sweep(frames: int = FRAMES, rows: int = 2, cols: int = 3, seed: int = 1) ->
 
 
 def _tone(hz: float, rate_hz: float, frames: int, amplitude: float = 50.0) -> np.ndarray:
-    """One taxel that swings about 100 digits."""
+    """One taxel that oscillates around 100 counts."""
     t = np.arange(frames) / rate_hz
     return (100 + amplitude * np.sin(2 * np.pi * hz * t)).astype(np.float32).reshape(-1, 1, 1)
 
 
 def test_weights_are_equation_4() -> None:
-    """Each weight is the taxel's sum of digits over the sum of all digits, row by row."""
+    """Each weight is the taxel's sum of counts over the sum of all counts, row by row."""
     x = _sweep()
     total = sum(int(v) for v in x.ravel())
     want = [sum(int(v) for v in x[:, r, c]) / total for r in range(2) for c in range(3)]
     np.testing.assert_allclose(features.taxel_weights(x), want, rtol=1e-12)
 
 
-@pytest.mark.parametrize("digits", [np.zeros((5, 2, 2), np.uint8), np.full((5, 2, 2), -7, np.int16)])
-def test_weights_without_contact_are_uniform(digits: np.ndarray) -> None:
-    """No activation, or a negative one, tells nothing of the taxels: 1 / M each."""
-    np.testing.assert_array_equal(features.taxel_weights(digits), [0.25] * 4)
+@pytest.mark.parametrize("counts", [np.zeros((5, 2, 2), np.uint8), np.full((5, 2, 2), -7, np.int16)])
+def test_weights_without_contact_are_uniform(counts: np.ndarray) -> None:
+    """Without activation, or with a negative one, all weights are 1 / M."""
+    np.testing.assert_array_equal(features.taxel_weights(counts), [0.25] * 4)
 
 
 def test_a_negative_taxel_weighs_nothing() -> None:
@@ -146,21 +146,21 @@ def test_a_slow_tone_moves_the_low_centroid() -> None:
 
 
 def test_drift_does_not_leak_into_the_low_band() -> None:
-    """A ramp of 60 digits changes none of the three features by more than rounding."""
+    """A ramp of 60 counts changes none of the three features by more than rounding."""
     tone = _tone(11.0, RATE, FRAMES) + 10 * _tone(90.0, RATE, FRAMES, 1.0)
     ramp = np.linspace(-30, 30, FRAMES, dtype=np.float32).reshape(-1, 1, 1)
     np.testing.assert_allclose(features.l_features(tone + ramp, RATE), features.l_features(tone, RATE), rtol=1e-5)
 
 
 def test_a_gain_adds_to_the_roughness_only() -> None:
-    """Digits three times as large: roughness + 2 log 3, centroids and H-features as before."""
+    """Counts three times as large: roughness + 2 log 3, centroids and H-features as before."""
     x = _sweep().astype(np.int16)
     small, large = features.l_features(x, RATE), features.l_features(3 * x, RATE)
     np.testing.assert_allclose(large - small, [2 * math.log(3), 0, 0], atol=1e-6)
     np.testing.assert_allclose(features.h_features(3 * x, RATE), features.h_features(x, RATE), atol=1e-12)
 
 
-def test_neither_set_cares_which_taxel_is_where() -> None:
+def test_the_order_of_taxels_does_not_matter() -> None:
     """Taxels in another order give the same features, as the paper's sums over taxels do."""
     x = _sweep()
     other = x[:, ::-1, ::-1].transpose(0, 2, 1)
@@ -169,8 +169,8 @@ def test_neither_set_cares_which_taxel_is_where() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_a_silent_or_saturated_skin_has_plain_answers(level: int) -> None:
-    """Constant digits: the floor's logarithm, the middle of each band, and H-features of zero."""
+def test_a_silent_or_saturated_skin_has_finite_features(level: int) -> None:
+    """Constant counts: the floor's logarithm, the middle of each band, and H-features of zero."""
     x = np.full((FRAMES, 4, 4), level, np.uint8)
     want = [math.log(16 * features.FLOOR * 711 / 710), (20 + 375) / 2, (2 + 20) / 2]
     np.testing.assert_allclose(features.l_features(x, RATE), want)
@@ -203,8 +203,8 @@ _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
 
 @settings(max_examples=60, deadline=None)
 @given(_DIGITS, st.floats(20, 300))
-def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float) -> None:
-    """Weights sum to 1, centroids stay below Nyquist, H-features are as many as told, 0 to 1."""
+def test_results_are_finite_for_any_counts(taxels: np.ndarray, rate_hz: float) -> None:
+    """Weights sum to 1, centroids stay below Nyquist, H-features are as many as `h_shape` says, 0 to 1."""
     weights = features.taxel_weights(taxels)
     assert weights.sum() == pytest.approx(1)
     assert weights.min() >= 0
@@ -237,7 +237,7 @@ def test_the_number_of_h_features_follows_from_frames_and_rate(
 
 
 def test_dimensions_and_type_are_those_of_the_paper() -> None:
-    """3 and 760 float32 values for the paper's 1500 x 4 x 4 digits at 750 Hz."""
+    """3 and 760 float32 values for the paper's 1500 x 4 x 4 counts at 750 Hz."""
     x = _sweep(rows=4, cols=4)
     low, high = features.compute("L", x, RATE), features.compute("H", x, RATE)
     assert (low.shape, high.shape) == ((3,), (760,))
@@ -261,8 +261,8 @@ def test_what_cannot_be_computed_is_named(kind: str, shape: tuple[int, ...], rat
         features.compute(kind, np.ones(shape, np.uint8), rate_hz)
 
 
-def test_digits_that_are_no_numbers_and_unknown_windows_are_refused() -> None:
-    """NaN among float32 digits, and a window function that is not offered."""
+def test_counts_that_are_no_numbers_and_unknown_windows_are_refused() -> None:
+    """NaN among float32 counts, and an unknown window function."""
     x = np.ones((80, 2, 2), np.float32)
     with pytest.raises(FormatError, match="'hamming' is unknown; use rect or hann"):
         features.h_features(x, RATE, "hamming")

@@ -1,4 +1,4 @@
-"""The virtual box's own rooms, without a guest: names of images, lines that are held, replies that cross, the table."""
+"""Modules of the virtual box, without a guest: names of images, levels that are held, replies that cross, the table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.rig.usbredir import BULK, CANCEL, HELLO, UsbRedirPeer
 
 
 def test_an_image_is_named_by_what_goes_in(monkeypatch: pytest.MonkeyPatch):
-    """Another package, another ground; and another ground, another box on it."""
+    """Another package gives another base image; another base image gives another box."""
     ground, box = image._ground_name(), image._box_name()
     assert (image._ground_name(), image._box_name()) == (ground, box)
     monkeypatch.setattr(image, "PACKAGES", (*image.PACKAGES, "nano"))
@@ -30,7 +30,7 @@ def test_an_image_is_named_by_what_goes_in(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
-    """A step that fails names its command and its words; no folder is there that looks like an image."""
+    """A step that fails names its command and output; no folder is left that looks like an image."""
 
     def fail(part: Path) -> None:
         (part / "half").touch()
@@ -42,7 +42,7 @@ def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
 
 
 def test_the_table_keeps_the_longest_run(tmp_path: Path):
-    """Of one fault the run with most repetitions counts, and of such the last."""
+    """Of several runs of a fault the one with most repetitions counts, and of equal ones the last."""
     file = tmp_path / "faults.jsonl"
     for outcome, times in (("early", 100), ("late", 100), ("short", 6)):
         notes.write("tests/rig/test_a.py::test", "pulled", outcome, times, file)
@@ -52,7 +52,7 @@ def test_the_table_keeps_the_longest_run(tmp_path: Path):
 
 @pytest.fixture
 def qtest() -> Iterator[tuple[GuestLines, list[tuple[float, str]]]]:
-    """Lines on a socket that says OK to everything, and what it was asked, with times."""
+    """Lines on a socket that answers OK to everything, and the requests that it got, with times."""
     ours, theirs = socket.socketpair()
     asked: list[tuple[float, str]] = []
 
@@ -83,7 +83,7 @@ def test_a_level_is_held_however_late_it_came(qtest: tuple[GuestLines, list[tupl
 
 
 def test_a_line_that_the_box_drives_is_seen():
-    """The test socket's words become levels and a log."""
+    """Messages of the test socket become levels and a log."""
     ours, theirs = socket.socketpair()
     threading.Thread(target=lambda: (theirs.recv(99), theirs.sendall(b"OK\nIRQ raise 1\n")), daemon=True).start()
     lines = GuestLines(ours, "/chip", ["START", "READY"])
@@ -130,7 +130,7 @@ class Guest:
 
 
 def test_a_reply_that_crosses_a_cancellation_comes_again():
-    """What QEMU throws away is not lost: the next transfer has the same frames, the one after it the next ones."""
+    """A reply that QEMU discards is not lost: the next transfer has the same frames, the one after it the next ones."""
     guest = Guest()
     clock = SystemClock()
     hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()

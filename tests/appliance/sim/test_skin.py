@@ -16,12 +16,12 @@ STILL = World(off=frozenset(EFFECTS))
 
 
 def only(*effects: str) -> World:
-    """A world in which nothing but `effects` happens."""
+    """A World with no effects but `effects`."""
     return World(off=frozenset(EFFECTS) - set(effects))
 
 
 def rng(seed: int = 3) -> np.random.Generator:
-    """The same draws for everybody who asks."""
+    """A random generator that always gives the same numbers."""
     return np.random.default_rng(seed)
 
 
@@ -33,7 +33,7 @@ def centre(frames: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("material", MATERIALS)
 def test_a_sweep_rests_slides_and_rests(material: str) -> None:
-    """Shape and type are the format's, and only the slide shakes the taxels."""
+    """Shape and type are the format's, and only the slide makes the taxels vibrate."""
     taxels = skin.sweep(material, PLACE, rng(), only("texture", "vibration"))
     assert taxels.shape == (2700, 4, 4)
     assert taxels.dtype == FORMAT.digits
@@ -47,7 +47,7 @@ def test_lengths_of_rest_and_slide_are_taken_from_the_caller() -> None:
     assert len(skin.sweep("wood", PLACE, rng(), rest_s=0.1, slide_s=0.4, after_s=0.2)) == 75 + 300 + 150
 
 
-def test_the_same_seed_gives_the_same_digits() -> None:
+def test_the_same_seed_gives_the_same_counts() -> None:
     """A sweep, a window, an idle skin and a set repeat exactly; another seed differs."""
     for make in (
         lambda seed: skin.sweep("foam", PLACE, rng(seed)),
@@ -60,7 +60,7 @@ def test_the_same_seed_gives_the_same_digits() -> None:
 
 
 def test_an_idle_skin_reads_zero_and_noise() -> None:
-    """Without contact digits are 0 with an occasional 1 or 2; without noise they are 0."""
+    """Without contact counts are 0 with an occasional 1 or 2; without noise they are 0."""
     idle = skin.idle(3000, rng())
     assert idle.shape == (3000, 4, 4)
     assert idle.mean() < 1
@@ -68,7 +68,7 @@ def test_an_idle_skin_reads_zero_and_noise() -> None:
     assert not skin.idle(10, rng(), STILL).any()
 
 
-def test_a_world_without_effects_is_still_and_centred() -> None:
+def test_without_effects_the_load_is_constant_and_centred() -> None:
     """With everything off the load is constant and symmetric about the middle of the skin."""
     frames = skin.window("metal", PLACE, rng(), STILL)
     assert (np.ptp(frames, axis=0) == 0).all()
@@ -78,7 +78,7 @@ def test_a_world_without_effects_is_still_and_centred() -> None:
 
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_every_effect_changes_the_signal(effect: str) -> None:
-    """Taking any one effect away is seen in the digits."""
+    """Removing any one effect changes the counts."""
     assert not np.array_equal(
         skin.sweep("paper", PLACE, rng()), skin.sweep("paper", PLACE, rng(), World(off=frozenset({effect})))
     )
@@ -97,7 +97,7 @@ def test_every_effect_changes_the_signal(effect: str) -> None:
     ],
 )
 def test_a_switch_reaches_its_own_effect_only(effect: str, call) -> None:
-    """The effect is the same whether all others are on or off, and is neutral where it is off itself."""
+    """An effect is the same whether all others are on or off, and neutral if it is off itself."""
     alone = call(only(effect))
     assert np.array_equal(alone, call(World()))
     assert not np.array_equal(alone, call(STILL))
@@ -105,8 +105,8 @@ def test_a_switch_reaches_its_own_effect_only(effect: str, call) -> None:
 
 
 @pytest.mark.parametrize("effect", ["drift", "spot", "texture", "vibration"])
-def test_an_effect_taken_away_leaves_the_draws_of_the_others(effect: str) -> None:
-    """The readout's noise, seen as what it adds to the rest, is the same with and without another effect."""
+def test_removing_an_effect_keeps_the_random_numbers_of_the_others(effect: str) -> None:
+    """The readout noise, as the difference with and without it, is the same with and without another effect."""
     loud = World(noise_counts=2.0)
     noisy, clean = (replace(loud, off=frozenset(off)) for off in ({effect}, {effect, "noise"}))
     added = [skin.window("metal", PLACE, rng(), w).astype(float) for w in (noisy, clean)]
@@ -117,15 +117,15 @@ def test_an_effect_taken_away_leaves_the_draws_of_the_others(effect: str) -> Non
     assert alike > 0.9  # not 1: each of the four is rounded to whole digits
 
 
-def test_noise_alone_is_white_and_as_loud_as_said() -> None:
-    """Noise differs between taxels and has the standard deviation of the world, plus that of rounding."""
+def test_noise_alone_is_white_and_has_its_standard_deviation() -> None:
+    """Noise differs between taxels and has the standard deviation of the World, plus that of rounding."""
     taxels = skin.window("metal", PLACE, rng(), only("noise")).reshape(-1, 16).astype(float)
     assert taxels.std(0).mean() == pytest.approx(np.hypot(World().noise_counts, 12**-0.5), rel=0.05)
     assert abs(np.corrcoef(taxels.T) - np.eye(16)).max() < 0.15
 
 
 def test_vibration_alone_shakes_all_taxels_together_by_their_pressure() -> None:
-    """What friction adds is one signal for all taxels, in proportion to what each carries."""
+    """Friction adds one signal to all taxels, in proportion to their pressure."""
     loud = replace(only("vibration"), counts_per_kpa=25.0)
     taxels = skin.window("plastic rough", PLACE, rng(), loud).reshape(-1, 16).astype(float)
     assert np.corrcoef(taxels.T).min() > 0.95
@@ -147,8 +147,8 @@ def test_vibration_is_where_the_material_puts_it() -> None:
     assert spectra["plastic smooth"][hz > 350].sum() > 0.001 * spectra["plastic smooth"].sum()
 
 
-def test_the_pad_swallows_more_vibration_further_ahead() -> None:
-    """A skin one row ahead gets less of the high vibrations than one in the middle."""
+def test_the_pad_damps_vibration_more_further_forward() -> None:
+    """A skin one row forward gets less of the high vibrations than one in the middle."""
     power = []
     for dx_mm in (0.0, skin.PITCH_MM):
         frames = skin.window("metal", Placement(dx_mm), rng(), only("position", "vibration"))[:, 1, 1:3].astype(float)
@@ -156,8 +156,8 @@ def test_the_pad_swallows_more_vibration_further_ahead() -> None:
     assert power[1] < 0.75 * power[0]
 
 
-def test_the_relief_is_felt_more_further_ahead() -> None:
-    """A skin one row ahead feels the same relief higher, by as much as the world says for 4 mm."""
+def test_the_relief_is_higher_further_forward() -> None:
+    """A skin one row forward gets the same relief higher, by as much as the World says for 4 mm."""
     tube, felt = World().tube("plastic rough"), []
     for dx_mm in (0.0, skin.PITCH_MM):
         x = skin.position(Placement(dx_mm), World())[0]
@@ -180,7 +180,7 @@ def test_rows_see_the_texture_one_after_another() -> None:
 
 
 def test_a_taxel_averages_the_texture_over_its_length() -> None:
-    """A relief much finer than a taxel is hardly felt; one much coarser is felt as high as it is."""
+    """A relief much finer than a taxel is averaged out; a much coarser one has its full height."""
     x = skin.position(Placement(), STILL)[0]
     felt = []
     for pitch_mm in (0.7, 25.0):
@@ -191,7 +191,7 @@ def test_a_taxel_averages_the_texture_over_its_length() -> None:
 
 
 def test_force_keeps_within_a_fifth() -> None:
-    """However bad the controller, forces stay within 20 % of 1 N; they differ between sweeps and move slowly."""
+    """For any error of the controller forces stay within 20 % of 1 N; they differ between sweeps and vary slowly."""
     for world in (World(), World(force_spread=0.5)):
         force = np.array([skin.drift(1500, rng(seed), world) for seed in range(40)])
         assert force.min() >= 0.8
@@ -212,7 +212,7 @@ def test_the_springs_carry_the_force(kpa_per_mm: float) -> None:
 
 
 def test_the_pressure_centre_moves_against_the_skin() -> None:
-    """A skin that sits further ahead (or across) finds the contact at lower rows (or columns)."""
+    """A skin that is further forward (or across) has the contact at lower rows (or columns)."""
     still = only("position")
     middle = centre(skin.window("metal", Placement(), rng(), still))
     ahead = centre(skin.window("metal", Placement(dx_mm=1.0), rng(), still))
@@ -225,7 +225,7 @@ def test_the_pressure_centre_moves_against_the_skin() -> None:
 
 
 def test_a_row_leaves_the_contact_when_the_skin_sits_a_row_ahead() -> None:
-    """In T-HARD the leading row hangs over the end of the pad, and the others still carry."""
+    """In T-HARD the leading row is beyond the end of the pad, and the others are still loaded."""
     samples, _, _ = skin.sweep_set("T-HARD", 0, 1)
     load = samples.mean((1, 3))
     assert (load[:, 3] < 1).all()
@@ -239,7 +239,7 @@ def test_softer_tubes_spread_the_pressure() -> None:
     assert foam.max() < metal.max()
 
 
-def test_reattaching_changes_the_load_but_not_the_place() -> None:
+def test_reattaching_changes_the_load_but_not_the_position() -> None:
     """Another seed of the placement gives other gains; the same seed the same."""
     first, again, other = (
         skin.window("wood", Placement(seed=s), rng(), only("attachment"))[0].astype(float) for s in (1, 1, 2)
@@ -259,7 +259,7 @@ def test_a_window_looks_like_the_middle_of_a_sweep() -> None:
 
 @pytest.mark.parametrize("name", ["T-LAB", "T-REAL"])
 def test_loads_are_in_the_range_of_the_converter(name: skin.SetName) -> None:
-    """Middle taxels carry, none saturates for long, and none that is loaded stands still."""
+    """Middle taxels are loaded, none saturates for long, and no loaded one is constant."""
     samples, _, _ = skin.sweep_set(name, 0, 2)
     load = samples.mean(1)
     assert 30 < load[:, 1:3, 1:3].mean() < 160
@@ -281,7 +281,7 @@ def test_sets_have_the_papers_counts(name: skin.SetName, places: int, each: int)
 
 
 def test_positions_are_those_of_the_paper() -> None:
-    """T-REAL sits nine times within 1 mm, T-HARD a row further ahead, and no two share an attachment."""
+    """T-REAL has nine positions within 1 mm, T-HARD one a row further forward, and no two share an attachment."""
     lab, real, hard = (skin.placements(name, 5) for name in ("T-LAB", "T-REAL", "T-HARD"))
     assert [len(lab), len(real), len(hard)] == [1, 9, 1]
     assert max(np.hypot(p.dx_mm, p.dy_mm) for p in lab + real) <= 1
@@ -293,7 +293,7 @@ def test_positions_are_those_of_the_paper() -> None:
 
 
 def test_a_set_is_made_of_windows_at_its_positions() -> None:
-    """In a still world each window shows its material and its position and nothing else."""
+    """Without random effects each window depends only on its material and position."""
     world = only("position", "attachment")
     samples, labels, positions = skin.sweep_set("T-REAL", 5, 1, world)
     places = skin.placements("T-REAL", 5)
