@@ -69,6 +69,7 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
         left = kept
 
 
+@pytest.mark.slow
 def test_no_module_imports_itself_through_others():
     """No circle between modules, type hints and imports in functions included; one that is there would be found."""
     graph = module_imports("appliance", "train")
@@ -98,6 +99,7 @@ def test_no_test_imports_another(path: Path):
     assert not named
 
 
+@pytest.mark.slow
 def test_a_fresh_process_loads_nothing_of_the_desktop():
     """After a whole virtual run, PyTorch, scikit-learn, scipy and train are not in the process."""
     code = (
@@ -197,6 +199,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_the_appliance_alone(wheel: Path):
     """appliance with its bundle and licence; no train, no tests."""
     names = zipfile.ZipFile(wheel).namelist()
@@ -209,6 +212,7 @@ def test_the_wheel_holds_the_appliance_alone(wheel: Path):
     assert any(n.endswith("licenses/LICENSE") for n in names)
 
 
+@pytest.mark.slow
 def test_the_wheel_works_in_a_clean_environment(wheel: Path, tmp_path: Path):
     """Locked dependencies with hashes, the wheel, nothing else: `palpate check` on the rig says ok, away from the checkout."""
     run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)

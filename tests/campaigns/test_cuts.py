@@ -18,7 +18,7 @@ from tests.cuts import black_box, calls, delivery, recording, scene, tree
 from tests.cuts.calls import NotFollowed
 from tests.cuts.scene import CrashPoint, CutScene, Found, ScenePlay, SceneStep
 
-pytestmark = pytest.mark.skipif(bool(calls.lacking()), reason=f"needs {calls.lacking()}")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(calls.lacking()), reason=f"needs {calls.lacking()}")]
 
 Makes = Callable[..., ScenePlay]
 

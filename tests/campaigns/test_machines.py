@@ -26,6 +26,8 @@ from train.models.compact import fit
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import TENSOR
 
+pytestmark = pytest.mark.slow
+
 EIGHT_BITS = "eight bits"
 INSIDE = ("default", "int16")
 SHOWN_SWEEPS = 8

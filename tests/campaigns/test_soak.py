@@ -378,6 +378,7 @@ def test_the_script_tells_what_is_touched_and_what_the_network_says():
     assert sum(sweeps[k].alone == sweeps[k].label for k in range(1, 13)) >= 8
 
 
+@pytest.mark.slow
 def test_a_simulated_world_that_remembers_nothing_stays_as_large_as_it_is():
     """Of twenty sweeps one act and no written line are held; the script has ended, and its end is known all the same."""
     sim = devices.build(skin.FORMAT, script.tubes(1, 20), VirtualClock(), "sim", remember=False)
@@ -401,6 +402,7 @@ def test_a_process_is_read_from_proc():
     )
 
 
+@pytest.mark.slow
 def test_this_machine_sweeps_answers_and_ends():
     """The installed command on a pseudo-terminal: an answer, a look at its process, and an orderly end."""
     box, sweeps, lines = ThisMachine(), Script(1), []

@@ -37,13 +37,18 @@ class Own:
     manifest: Manifest
 
 
+def own_default() -> Own:
+    """The default bundle's model."""
+    default = bundle.load(bundle.DEFAULT)
+    return Own("default", default.model, default.manifest)
+
+
 def own_models(names: tuple[str, ...] = ()) -> list[Own]:
     """The default bundle's model and those of these methods, or of all, hardly trained on a small skin."""
     from tests.factories.sweep_sets import tones
     from train.models import methods
 
-    default, sweeps = bundle.load(bundle.DEFAULT), tones()
-    found = [Own("default", default.model, default.manifest)]
+    sweeps, found = tones(), [own_default()]
     for name, method in methods.every(methods.Effort(0.02, 2)).items():
         if method.input in bundle.INPUTS and name in (names or methods.every()):
             given = methods.model_inputs(method.input, sweeps)

@@ -456,6 +456,7 @@ for outputs in ({"looking at its system": "Alpine Linux v3.19\\n"}, {"looking at
     ]
 
 
+@pytest.mark.slow
 def test_a_box_is_named_as_for_ssh():
     """USER@HOST:PORT, where user and port may be missing; anything else is refused."""
     code = """
@@ -467,6 +468,7 @@ for text in ("pi@box", "Box.lab:2222", "pi@[fe80::1]:22", "pi@", "a@b@c"):
     assert run_here(code).splitlines() == ["pi|box|", "|Box.lab|2222", "pi|[fe80::1]|22", "None", "None"]
 
 
+@pytest.mark.slow
 def test_the_lock_is_read_for_the_box_not_for_the_desktop():
     """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay with their packages."""
     for python, numpy in (("3.11.2", "2.4"), ("3.13.5", "2.5")):

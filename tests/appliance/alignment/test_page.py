@@ -259,6 +259,7 @@ class Seen:
         return str(self.page.inner_text(where)).replace("\xa0", " ")
 
 
+@pytest.mark.slow
 def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     """The real command: the page waits for contact, advises, follows the next touch; when it ends, "no connection"."""
     run, address = box
@@ -351,6 +352,7 @@ def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypa
     context.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, height: int, scheme: str):
@@ -387,6 +389,7 @@ def contrast(seen: Seen, what: str) -> float:
     return (light + 0.05) / (dark + 0.05)
 
 
+@pytest.mark.slow
 def test_without_a_browser_the_command_ends_at_sigterm(box: tuple[subprocess.Popen[bytes], str]):
     """SIGTERM ends it with 0 while connections are open; nothing keeps the port."""
     run, address = box

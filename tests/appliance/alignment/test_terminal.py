@@ -256,6 +256,7 @@ def terminal() -> Iterator[tuple[int, int]]:
     os.close(far)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["xterm-256color", "dumb"])
 def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal: tuple[int, int], kind: str):
     """The command in a terminal: exit code 0; the alternate screen is left at the end; a dumb terminal gets none."""

@@ -130,6 +130,7 @@ def taken(target: str, data: bytes, folder: Path) -> bool:
         return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_the_corpus_reaches_what_lies_behind_the_checks(target: str, tmp_path: Path) -> None:
     """Several inputs are taken and several refused: a corpus of nothing but broken files would prove little."""
@@ -273,6 +274,7 @@ def test_another_error_is_not_kept_back(
         check_inputs(target, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_changes_keep_the_form(target: str, tmp_path: Path) -> None:
     """A mutator gives the same for the same seed, and a good part of its outputs is still accepted."""

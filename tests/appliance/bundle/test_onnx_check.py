@@ -39,6 +39,13 @@ def owns() -> list[mutated_models.Own]:
     return mutated_models.own_models(mutated_models.QUICK)
 
 
+@pytest.fixture(scope="module")
+def default() -> mutated_models.Own:
+    """The model of the default bundle alone: nothing is trained for it."""
+    return mutated_models.own_default()
+
+
+@pytest.mark.slow
 def test_our_own_models_pass(owns: list[mutated_models.Own]):
     """The default bundle's, those of all kinds of methods, and a graph of opset 18."""
     for own in owns:
@@ -52,6 +59,7 @@ def test_a_harmless_model_of_the_hostile_kind_passes():
     check.check(hostile.model([hostile.node("Relu", ["x"], ["y"])]).SerializeToString(), MANIFEST)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_model_is_refused(name: str):
     """With one printable line that says why and what to try, and within a second."""
@@ -102,12 +110,11 @@ def test_152_bytes_would_take_6_gigabytes():
     assert most_mb < 2
 
 
-def test_a_file_that_ends_anywhere_is_refused(owns: list[mutated_models.Own]):
+def test_a_file_that_ends_anywhere_is_refused(default: mutated_models.Own):
     """The default bundle's model, cut off at every byte."""
-    own = owns[0]
-    for end in range(len(own.model)):
+    for end in range(len(default.model)):
         with pytest.raises(BundleError):
-            check.check(own.model[:end], own.manifest)
+            check.check(default.model[:end], default.manifest)
 
 
 def test_a_link_and_a_file_beside_the_model_are_never_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -141,6 +148,7 @@ def heavy(kind: str) -> bytes:
     return model([*start, pooled], {"n": [1, 1, 8_000_000]}).SerializeToString()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["MatMul", "TopK", "ConstantOfShape", "MaxPool"])
 def test_what_passes_takes_no_more_than_was_counted(kind: str):
     """The check's account of memory is above what onnxruntime takes, and that below 256 MB."""
@@ -157,11 +165,11 @@ def test_what_passes_takes_no_more_than_was_counted(kind: str):
 
 
 @pytest.mark.parametrize("limit", ["MOST_MEMORY", "MOST_WORK", "MOST_NODES", "MOST_CONSTANTS", "MOST_TENSOR"])
-def test_every_cap_caps(limit: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
+def test_every_cap_caps(limit: str, default: mutated_models.Own, monkeypatch: pytest.MonkeyPatch):
     """Our own model is refused where a cap is lower than what it needs."""
     monkeypatch.setattr(check, limit, 20)
     with pytest.raises(BundleError, match="limit 20"):
-        check.check(owns[0].model, owns[0].manifest)
+        check.check(default.model, default.manifest)
 
 
 def test_a_file_that_is_too_large_is_not_read(monkeypatch: pytest.MonkeyPatch):
@@ -171,11 +179,11 @@ def test_a_file_that_is_too_large_is_not_read(monkeypatch: pytest.MonkeyPatch):
         check.check(bytes(100), MANIFEST)
 
 
-def test_values_are_counted(owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
+def test_values_are_counted(default: mutated_models.Own, monkeypatch: pytest.MonkeyPatch):
     """A file is read value by value only so far."""
     monkeypatch.setattr(reader, "MOST_VALUES", 100)
     with pytest.raises(BundleError, match="more than 100 values"):
-        check.check(owns[0].model, owns[0].manifest)
+        check.check(default.model, default.manifest)
 
 
 def test_the_manifest_decides_what_goes_in_and_comes_out():
@@ -217,6 +225,7 @@ def test_a_parse_takes_no_memory_before_it_is_counted(field: bytes):
     assert most_mb < 16
 
 
+@pytest.mark.slow
 def test_grown_models_pass_and_run():
     """Random operators in any order, as far as the rules let them: most of them onnxruntime opens and runs."""
     ran = 0
@@ -228,6 +237,7 @@ def test_grown_models_pass_and_run():
     assert ran >= 10
 
 
+@pytest.mark.slow
 def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
     """150 of the campaign's kind, in children of limited memory and time; enough of them get as far as onnxruntime."""
     record = hostile_fuzz.fresh(3)
@@ -238,6 +248,7 @@ def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
     assert record["outcomes"]["ran"] >= 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["dies", "hangs", "swells"])
 def test_the_campaign_would_tell(how: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
     """A child that dies, hangs or takes too much memory is told, with its number, and the next model is tried."""

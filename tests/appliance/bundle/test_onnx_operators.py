@@ -105,6 +105,7 @@ def test_a_rule_refuses(words: str, name: str, inputs: list[Value], given: dict[
         operator.rule(Call(inputs, given))
 
 
+@pytest.mark.slow
 def test_all_rules_say_what_onnxruntime_gives():
     """Models of random operators: type and shape of everything that a sweep moves, as the rules have it and as it is."""
     seen: set[str] = set()

@@ -38,6 +38,7 @@ def test_run_prints_sentences_and_ends_with_its_script(capsysbinary: pytest.Capt
     assert all(",sim," in line for line in results)
 
 
+@pytest.mark.slow
 def test_run_ends_within_a_second_of_sigterm():
     """SIGTERM: exit code 0 within a second, in real time with a streaming skin."""
     with subprocess.Popen([sys.executable, "-m", "appliance", "run", "--sim", "skin"], stdout=subprocess.PIPE) as run:
@@ -50,6 +51,7 @@ def test_run_ends_within_a_second_of_sigterm():
         assert time.monotonic() - start < 1
 
 
+@pytest.mark.slow
 def test_run_on_a_serial_port():
     """With serial.port set the sentences come out there, and standard output stays empty."""
     with pseudo_terminal.pair() as (far, name):
@@ -94,6 +96,7 @@ def test_a_full_disk_costs_the_recording_never_the_classifying(
     assert output.err.count("capture: /dev/full cannot be written: No space left on device") == 1
 
 
+@pytest.mark.slow
 def test_a_log_on_a_full_disk_costs_the_log_alone():
     """Where standard error cannot be written, sweeps are answered all the same, and the exit code is 0."""
     command = [sys.executable, "-m", "appliance", "run", "--sim", "skin", *VIRTUAL, "--capture", "/dev/full"]
@@ -121,6 +124,7 @@ def test_replay_of_a_sweep_set(
     assert results[len(want)][5].decode() == want[-1]
 
 
+@pytest.mark.slow
 def test_the_sequential_test_is_configured(
     tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
 ):
@@ -271,6 +275,7 @@ def test_unknown_arguments_are_usage_errors():
     assert e.value.code == 2
 
 
+@pytest.mark.slow
 def test_output_that_nobody_reads():
     """`palpate … | head` ends without a traceback."""
     command = f"{sys.executable} -m appliance run --sim skin --virtual --sweeps 30 | head -n 1"

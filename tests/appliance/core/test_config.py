@@ -196,6 +196,7 @@ def test_files_that_cannot_be_read_are_named(folder: Path) -> None:
 _NAMES = ["sensor.serial", "serial.baud", "output.class_bits", "trigger.mode", "x.y"]
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.text(max_size=30), st.sampled_from(_NAMES))
 def test_any_set_text_is_a_value_or_a_config_error(text: str, name: str) -> None:

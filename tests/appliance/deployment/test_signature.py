@@ -42,6 +42,7 @@ def signers(tmp_path: Path) -> Signers:
     return Signers(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ed25519", "rsa", "ecdsa"])
 def test_a_signer_is_named(tmp_path: Path, kind: str):
     """The file has several signers, comments, empty lines, and the namespace in an option."""

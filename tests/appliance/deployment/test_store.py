@@ -42,6 +42,7 @@ def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
     assert nowhere.candidate() is None
 
 
+@pytest.mark.slow
 def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery, logged: list[str]):
     """Install, start on trial, commit, the next one, commit, and back and forth between the two."""
     one = box.installed(1)
@@ -69,6 +70,7 @@ def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
     assert box.store.rollback() == one == box.start()
 
 
+@pytest.mark.slow
 def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
     """The fourth start runs the committed bundle and logs one line; `palpate bundles` has the reason."""
     one, two = box.committed(1), box.installed(2)
@@ -83,6 +85,7 @@ def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
     assert told[one].role == "current"
 
 
+@pytest.mark.slow
 def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
     """It does not go back to the first trial, which was never committed."""
     one, two, three = box.committed(1), box.installed(2), box.installed(3)
@@ -93,6 +96,7 @@ def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
     assert box.store.rollback() == PACKAGED
 
 
+@pytest.mark.slow
 def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
     """The bundle before the committed one is still there, however many were tried in between."""
     one, two = box.committed(1), box.committed(2)
@@ -102,6 +106,7 @@ def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
     assert box.store.rollback() == one == box.start()
 
 
+@pytest.mark.slow
 def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
     """A bundle was committed, rolled back by hand, deployed again and failed: a rollback does not lead to it."""
     one, two = box.committed(1), box.committed(2)
@@ -132,6 +137,7 @@ def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
     assert not box.store.state.of(two).committed
 
 
+@pytest.mark.slow
 def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
     """The counter must be above all committed ones, also after a rollback; the newest bundle itself may be installed again."""
     one, two = box.committed(1), box.committed(2)
@@ -144,6 +150,7 @@ def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
     assert box.start() == two
 
 
+@pytest.mark.slow
 def test_a_trial_does_not_raise_the_least_counter(box: Delivery):
     """A bundle that was never committed may be replaced by one with a lower counter."""
     box.committed(1)
@@ -276,6 +283,7 @@ def test_a_model_that_hangs_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
         Delivery(tmp_path, hang).installed(1)
 
 
+@pytest.mark.slow
 def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: Delivery, logged: list[str]):
     """Damaged files, other results for the golden sweeps, or unfit settings: the committed bundle runs."""
     one = box.committed(1)
@@ -332,6 +340,7 @@ def test_leftovers_and_old_bundles_go_at_the_next_install(box: Delivery):
     assert box.store.rollback() == shas[2]
 
 
+@pytest.mark.slow
 def test_a_candidate_waits_and_is_promoted(box: Delivery):
     """It does not change which bundle runs; once promoted it is on trial."""
     one = box.committed(1)
@@ -363,6 +372,7 @@ def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
         box.store.commit()
 
 
+@pytest.mark.slow
 def test_a_disk_that_takes_no_note_runs_what_was_committed(
     box: Delivery, monkeypatch: pytest.MonkeyPatch, logged: list[str]
 ):
@@ -410,6 +420,7 @@ def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
     assert one[:8] in lines[2]
 
 
+@pytest.mark.slow
 def test_no_altered_bundle_is_accepted(tmp_path: Path):
     """A sample of `make flips`: bits of each file, files swapped with another signed bundle's, cut, unsigned, older."""
     found = flips.campaign(tmp_path, 50, seed=2)

@@ -206,6 +206,7 @@ def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
     assert box.standing.starts == 0
 
 
+@pytest.mark.slow
 def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
     """Another bundle was deployed, or a person rolled back, while this one still runs."""
     for way in (lambda: box.installed(3), box.store.rollback):

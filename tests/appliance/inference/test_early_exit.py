@@ -419,6 +419,7 @@ class Ticking(rig.VirtualClock):
         return super().now_ns()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packet_frames", [1, 30])
 def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_path: Path, packet_frames: int):
     """Lost packets, early and whole answers, fused ones, a stop edge beside a step: replayed, all is the same."""

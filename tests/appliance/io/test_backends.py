@@ -627,6 +627,7 @@ def test_an_unknown_backend(monkeypatch: pytest.MonkeyPatch):
         backends.chosen()
 
 
+@pytest.mark.slow
 def test_over_umockdev():
     """The same contract over unmodified libusb, pyusb, libgpiod and gpiod, in a process of its own."""
     if os.environ.get(backends.VARIABLE):

@@ -62,6 +62,7 @@ def alter(simulated: SimDevices, change: Alter, packets: int) -> None:
     simulated.backend.mangle = mangle
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packet_frames", [1, 6])
 @pytest.mark.parametrize(
     ("change", "packets"),
@@ -105,6 +106,7 @@ def test_a_count_that_jumps(ahead: int):
     assert sensor.counters.enumerations == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ppm", [-500, 0, 500])
 @pytest.mark.parametrize("packet_frames", [1, 6, 255])
 def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
@@ -121,6 +123,7 @@ def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
     assert sensor.counters.enumerations == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate_hz", "packet_frames"), [(2000, 1), (2000, 8), (35.61, 1)])
 def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
     """A board that stamps late by up to 4 ms and in whole milliseconds, so that time seems to stand or go back: no

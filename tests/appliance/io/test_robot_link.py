@@ -66,6 +66,7 @@ def test_every_command_is_documented():
     assert tuple(re.findall(r"^\| `([A-Z]+)` \|", table, re.M)) == COMMANDS
 
 
+@pytest.mark.slow
 @given(st.text(max_size=200), st.text(max_size=40), st.sampled_from(list(Status)))
 def test_pynmea2_parses_every_sentence(detail: str, label: str, status: Status):
     """For any texts an independent parser accepts the checksum and finds all fields."""
@@ -78,6 +79,7 @@ def test_pynmea2_parses_every_sentence(detail: str, label: str, status: Status):
     assert parsed.data[4] == status
 
 
+@pytest.mark.slow
 @given(st.text(alphabet=st.characters(codec="latin-1")))
 def test_checksums_agree(text: str):
     """Ours and pynmea2's exclusive or are the same."""

@@ -300,6 +300,7 @@ def test_state_is_sent_once_a_second(rigged: Callable[..., Rigged]):
     assert {s[3] for s in states[1:]} == {"streaming"}
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]):
     """The line is full: sentences are dropped and counted, every frame and every sweep is still taken."""
     simulated = simulated_devices(script.tubes(1006, 20))

@@ -68,6 +68,7 @@ def change(path: Path, **values: object) -> None:
     beside.write_text(json.dumps(json.loads(beside.read_text()) | values))
 
 
+@pytest.mark.slow
 def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle: bundle.Bundle):
     """Fused and early ones, whatever the settings are now: the very sentences that went out, times included."""
     folder, heard = in_service

@@ -214,6 +214,7 @@ def test_sets_without_positions():
     assert np.stack([found.rows_mm, found.cols_mm]) == pytest.approx(np.full((2, 2), 6.0), abs=1.5)
 
 
+@pytest.mark.slow
 def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     """A skin in place is not flagged, one that is a row forward always is; figures, picture and lines agree."""
     monkeypatch.setattr(contact_positions, "OFF_MM", (5.0,))

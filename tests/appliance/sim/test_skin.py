@@ -268,6 +268,7 @@ def test_loads_are_in_the_range_of_the_converter(name: skin.SetName) -> None:
     assert (np.ptp(samples, axis=1) > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "places", "each"), [("T-LAB", 1, 40), ("T-REAL", 9, 10), ("T-HARD", 1, 10)])
 def test_sets_have_the_papers_counts(name: skin.SetName, places: int, each: int) -> None:
     """Every tube is swept equally often at every position."""

@@ -14,6 +14,7 @@ from appliance.sim import script
 from appliance.tools import bench, bench_process
 
 
+@pytest.mark.slow
 def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """A small bench: every key that scripts rely on, in JSON, with commit, seed and machine."""
     for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
@@ -39,6 +40,7 @@ def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "fp32 and paper_int8 were not measured" in out
 
 
+@pytest.mark.slow
 def test_bench_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """Memory and processor share, in short."""
     monkeypatch.setattr(bench_process, "MEMORY_SWEEPS", 20)

@@ -35,6 +35,7 @@ def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
     assert capsys.readouterr().out == first
 
 
+@pytest.mark.slow
 def test_demo_paints_on_a_terminal():
     """On a terminal the skin is drawn in 16 shaded cells and painted over."""
     far, near = os.openpty()

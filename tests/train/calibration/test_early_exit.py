@@ -101,6 +101,7 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
         assert (share[i], named[i]) == ((step + 1) / 10, p[i, step].argmax())
 
 
+@pytest.mark.slow
 def test_temperatures_make_each_step_honest():
     """Crossed over places, the mean of the highest probability is what is right, at every step."""
     x, y, at = tenths(40)
@@ -112,6 +113,7 @@ def test_temperatures_make_each_step_honest():
     assert np.abs(p.max(2).mean(0) - right).max() < 0.04
 
 
+@pytest.mark.slow
 def test_each_step_has_its_own_temperature():
     """The last temperature is the whole sweep's, each other one its own step's."""
     x, y, at = tenths(10, seed=3)
@@ -124,6 +126,7 @@ def test_each_step_has_its_own_temperature():
     assert np.allclose(done.steps.weight * cooler[:-1, None, None], raw.weight, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_material_of_one_place_and_two_materials():
     """A material that only one place has is still learned; of two materials, too: nothing is NaN."""
     x, y, at = tenths(20)

@@ -112,6 +112,7 @@ def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
     assert ground.same()
 
 
+@pytest.mark.slow
 def test_a_connection_that_breaks_off_leaves_whole_pairs(ground: Ground):
     """Wherever the stream ends: what is here is the box's, byte for byte and in pairs, and the next call has the rest."""
     whole = sum(len(data) for data in files(ground.box).values()) + 8 * 512

@@ -82,6 +82,7 @@ def test_what_is_no_set_at_all_is_refused(tmp_path: Path):
             sets.load(str(tmp_path / name))
 
 
+@pytest.mark.slow
 def test_simulated_sets_have_their_worlds():
     """Sizes of the paper's sets, the seed's place, and positions of joined worlds that stay apart."""
     real = sets.load("sim:T-REAL:5-6:1")
@@ -146,6 +147,7 @@ def test_select_names_what_is_wrong(condition: str, message: str):
         easy(8).select([condition])
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 7), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1))
 def test_split_never_separates_a_recording(pieces: int, share: float, seed: int):

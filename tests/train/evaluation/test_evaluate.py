@@ -30,6 +30,7 @@ def every(sweeps: Dataset, where: Where, *names: str, **plan) -> list[evaluate.R
 HERE = Where(jobs=1, cache=None)
 
 
+@pytest.mark.slow
 def test_it_finds_what_is_there_to_find():
     """Hums of three pitches are distinguished under every protocol, by window and by recording."""
     for result in every(
@@ -50,6 +51,7 @@ def test_it_finds_nothing_where_there_is_nothing():
     assert 8 <= result.json()["window"]["right"] <= 32
 
 
+@pytest.mark.slow
 def test_removed_means_are_gone():
     """A material known by its offset alone is not known any more."""
     hidden = tones(offset=40.0, noise=60.0)
@@ -61,6 +63,7 @@ def test_removed_means_are_gone():
     assert np.abs(without.sweeps.samples.mean(axis=1)).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_the_counts_are_those_of_the_logits():
     """Windows by the largest logit, recordings by the product of their probabilities, the confusion matrix of both."""
     sweeps = tones(noise=150.0)
@@ -80,6 +83,7 @@ def test_the_counts_are_those_of_the_logits():
     assert low <= figures["window"]["right"] / 36 <= high
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
     """Where it runs does not change what comes out."""
     one, two = (every(tones(), Where(jobs, cache=None), "L-svm", protocols=("random:3",)) for jobs in (1, 2))
@@ -177,6 +181,7 @@ def command(*args: str, cache: Path) -> int:
     return main(["evaluate", *args, "--jobs", "1", "--cache", str(cache)])
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_scripts_rely_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A list of results with the keys of the manual, one for each method and seed, in the order asked for."""
     tones(offset=9.0).save(tmp_path / "tones.npz")

@@ -25,6 +25,8 @@ from train.evaluation import evaluate, parallel
 from train.evaluation.evaluate import Plan, Where
 from train.models import methods
 
+pytestmark = pytest.mark.slow
+
 
 def add(task: int, data: np.ndarray) -> float:
     """A task."""

@@ -71,6 +71,7 @@ def test_a_world_is_the_same_for_all_who_draw_it_and_others_differ() -> None:
     assert np.array_equal(one.labels, other.labels)
 
 
+@pytest.mark.slow
 def test_what_is_measured_is_complete_and_adds_up(measured: dict) -> None:
     """Four figures by five methods of shares, their differences and what they come to; it is JSON."""
     assert json.loads(json.dumps(measured)) == measured
@@ -83,6 +84,7 @@ def test_what_is_measured_is_complete_and_adds_up(measured: dict) -> None:
     assert measured["mean"] == pytest.approx(abs(away).mean())
 
 
+@pytest.mark.slow
 def test_every_effect_is_switched_off_in_turn(measured: dict) -> None:
     """Each row holds the accuracies without the effect and their change; each effect changes some of them."""
     assert tuple(measured["without"]) == EFFECTS
@@ -91,6 +93,7 @@ def test_every_effect_is_switched_off_in_turn(measured: dict) -> None:
         assert np.any(row["change"])
 
 
+@pytest.mark.slow
 def test_accuracies_count_right_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sweeps whose features all equal their label are all named rightly; with shifted labels in the test sets none is."""
     monkeypatch.setattr(sim_calibration, "FIGURES", FIGURES[3:])
@@ -108,6 +111,7 @@ def test_accuracies_count_right_answers(monkeypatch: pytest.MonkeyPatch) -> None
     assert (sim_calibration.accuracies(replace(sweeps, labels=labels), SEED) == 0).all()
 
 
+@pytest.mark.slow
 def test_the_table_shows_every_number(measured: dict) -> None:
     """A row a figure and a row an effect, each number beside the printed one."""
     text = sim_calibration.table(measured)

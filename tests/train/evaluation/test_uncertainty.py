@@ -17,6 +17,8 @@ from train.evaluation.uncertainty_cases import NONE_LEFT_OUT, Case
 from train.models.methods import Effort
 from train.reports import uncertainty_report
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("a", "b", "c", "d")
 
 

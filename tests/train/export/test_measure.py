@@ -48,6 +48,7 @@ def test_all_take_turns():
     assert {name: (len(ms), bool((ms > 0).all())) for name, ms in took.items()} == dict.fromkeys("abc", (6, True))
 
 
+@pytest.mark.slow
 def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
     """Costs of a real bundle: the keys that the issue names, resident memory of Python with numpy and onnxruntime."""
     made = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
@@ -60,6 +61,7 @@ def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_p
     assert not model_forms._costs(made[0], Measurement(1.0, 1.0, 10, 20, 400.0, ("torch",)))["runs_on_box"]
 
 
+@pytest.mark.slow
 def test_what_does_not_run_by_itself_is_named(tmp_path: Path):
     """A bundle that was altered on disk is refused with its name and reason."""
     one, _ = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
@@ -86,6 +88,7 @@ def test_torch_runs_what_was_trained(tmp_path: Path):
     assert measure.load(tmp_path)(counts).tolist() == counts.ravel()[:2].tolist()
 
 
+@pytest.mark.slow
 def test_aeon_runs_what_was_trained(tmp_path: Path):
     """aeon's transform with the head that was trained on our graph of it gives the graph's logits."""
     pytest.importorskip("aeon")

@@ -17,6 +17,8 @@ from train.cli.main import main
 from train.export import pack
 from train.models import methods
 
+pytestmark = pytest.mark.slow
+
 HARDLY = methods.Effort(0.1, 20)
 METHODS = methods.every(HARDLY)
 ON_THE_BOX = [name for name, method in METHODS.items() if method.runs_on_the_box]

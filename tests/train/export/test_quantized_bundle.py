@@ -37,6 +37,8 @@ from train.models.linear_head import closed_form_head, hold_out
 from train.onnx_tools import graph_builder, parity
 from train.onnx_tools.parity import Layer
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def fitted() -> Fit:

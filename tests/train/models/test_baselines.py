@@ -83,6 +83,7 @@ def test_every_method_learns(method: Method, tubes: World):
     assert tubes.accuracy(method) > 0.4
 
 
+@pytest.mark.slow
 @by_name
 @pytest.mark.parametrize("removed", [False, True])
 def test_every_method_takes_another_skin(method: Method, removed: bool):
@@ -230,6 +231,7 @@ def test_without_anything_to_hold_out_the_temperature_is_one(tubes: World):
     np.testing.assert_array_equal(baselines.learn(Gauss, sweeps, given, 0).logits(given), want)
 
 
+@pytest.mark.slow
 def test_probabilities_are_honest():
     """Labels that are drawn by lot are believed to about one half of two; those that are clear nearly to one."""
     rng = np.random.default_rng(2)

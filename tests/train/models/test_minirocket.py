@@ -63,6 +63,7 @@ def test_the_graph_is_the_definition(dtype: str):
     np.testing.assert_allclose(graph_builder.run(graph, sweep[None])[0], by_definition(sweep, found), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
     """Every share, in aeon's order: whole digits exactly, others but where a frame lies on a bias within rounding."""

@@ -87,6 +87,7 @@ def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
         assert not torch.equal(net(digits), before)
 
 
+@pytest.mark.slow
 def test_the_loop_is_adam_as_the_paper_prints_it():
     """Against PyTorch's Adam, step by step: batches in sequence from a shuffled set, shuffled again after each round."""
     s, r = made((6, 12, 2, 1), "float32", 2), replace(neural_methods.PAPER_RECIPE, steps=5, batch=4, dropout=0.0)
@@ -129,6 +130,7 @@ def test_adversarial_training_sees_the_worse_sweep():
         torch.testing.assert_close(p.grad, gradient)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     ("shape", "dtype", "classes"),
@@ -143,6 +145,7 @@ def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str
     check_agrees(model, np.zeros_like(s.samples[:1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
     """Real sizes with random weights, or the smallest training: 1500 x 4 x 4 of uint8."""
@@ -160,6 +163,7 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
     check_agrees(neural_methods.NetworkModel(net.eval(), ""), digits)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_easy_is_learnt(name: str):
     """Three tones on sweeps of another seed; the cost falls; what was run is told."""
@@ -176,6 +180,7 @@ def test_what_is_easy_is_learnt(name: str):
     assert "float32 on c" in model.ran
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_same_again_for_the_same_seed(name: str):
     """Bit for bit, whatever the state outside, which stays as it was; another seed gives another network."""
@@ -202,6 +207,7 @@ def test_a_material_that_never_came_is_never_given(name: str):
     check_agrees(model, s.samples[:2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_small_sets_are_trained_whole(name: str):
     """Two recordings of one sweep each cannot be parted; one position alone does not forbid parting by recording."""
@@ -214,6 +220,7 @@ def test_small_sets_are_trained_whole(name: str):
         train(name, easy(4).take(np.arange(4)))
 
 
+@pytest.mark.slow
 def test_one_sweep_of_each_is_too_little_for_a_discriminant():
     """Named instead of scikit-learn's own words; copies as the scene varies, or gradient heads, take what there is."""
     one, labels = np.eye(3), np.arange(3)
@@ -235,6 +242,7 @@ def test_silence_is_no_trouble(name: str):
     check_agrees(model, s.samples[:2])
 
 
+@pytest.mark.slow
 def test_probabilities_come_from_what_was_held_out():
     """Labels drawn by lot: a network that learns its training sweeps by heart is made unsure by those it never saw."""
     s = easy(40)
@@ -244,6 +252,7 @@ def test_probabilities_come_from_what_was_held_out():
     assert softmax(model.logits(other.samples)).max(1).mean() < 0.6
 
 
+@pytest.mark.slow
 def test_compact_is_what_palpate_train_fits():
     """The same network and int8 head as `fit` gives, float logits moved; on a grid and along a line."""
     s = easy(12)
@@ -258,6 +267,7 @@ def test_compact_is_what_palpate_train_fits():
         np.testing.assert_allclose(model.logits(given.samples), said, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_window_too_short_is_named():
     """The compact network needs 16 frames; the others take what there is."""
     s = made((12, 7, 2, 2), "int16")
@@ -267,6 +277,7 @@ def test_a_window_too_short_is_named():
         check_agrees(train(name, s), s.samples[:1])
 
 
+@pytest.mark.slow
 def test_bfloat16_is_used_where_it_is_asked_for_and_there():
     """It is told, its answers stay float32 and near, and a processor without it says so."""
     s = easy(8)

@@ -147,6 +147,7 @@ def test_a_material_not_trained_on_is_never_said():
     assert np.mean(logits[sweeps.labels != 1].argmax(1) == two.labels) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", SETS)
 def test_any_set_can_be_trained_on(dtype: str):
     """Grid, length and digits of the user's, even a silent skin: finite logits, the same for the same seed."""

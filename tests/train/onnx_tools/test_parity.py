@@ -21,6 +21,8 @@ from train.onnx_tools import parity
 from train.onnx_tools.parity import Layer
 from train.onnx_tools.quantize import quantize
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def fitted() -> Fit:

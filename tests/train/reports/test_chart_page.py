@@ -239,6 +239,7 @@ def test_the_table_is_sorted_by_what_was_chosen(seen: Seen):
     assert "time, median" in seen.page.inner_text("th[aria-sort=ascending]")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [360, 800])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: str):
@@ -261,6 +262,7 @@ def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: st
     context.close()
 
 
+@pytest.mark.slow
 def test_without_scripts_there_is_a_picture_and_a_table(browser: Any, file: str):
     """No control that does nothing."""
     context = browser.new_context(java_script_enabled=False)

@@ -12,6 +12,7 @@ from appliance.sim import skin
 from train.reports import overview_plot
 
 
+@pytest.mark.slow
 def test_it_shows_the_verdict_and_every_label():
     """Each label once with its probability, the winner in the title too; it says that the sweep is simulated."""
     svg = overview_plot.draw("paper")
@@ -23,6 +24,7 @@ def test_it_shows_the_verdict_and_every_label():
     assert f"raw counts at {skin.FORMAT.rate_hz:g} Hz (simulated)" in svg
 
 
+@pytest.mark.slow
 def test_an_unknown_material_is_named():
     """With what may be used instead."""
     with pytest.raises(FormatError, match=r"'cheese' is not simulated; use one of .*wood"):

@@ -194,6 +194,7 @@ def test_the_page_shows_every_figure_with_printed_beside_ours(told, made):
         assert said in text
 
 
+@pytest.mark.slow
 def test_only_a_quick_run_says_that_it_means_nothing(told, made):
     """The banner is there for --quick and not otherwise."""
     assert "quick run" not in made[0]
@@ -207,6 +208,7 @@ def test_hard_protocols_come_first(made):
     assert pictures["methods"].index(">leave position<") < pictures["methods"].index(">random<")
 
 
+@pytest.mark.slow
 def test_a_plan_without_the_network_still_makes_a_page():
     """Figures 9 to 11 need the paper's CNN; all others are there."""
     html, pictures = paper_report.render(summary(cnn=""))
@@ -214,6 +216,7 @@ def test_a_plan_without_the_network_still_makes_a_page():
     assert not Reader(html).wrong
 
 
+@pytest.mark.slow
 def test_the_network_without_means_is_called_so():
     """Where only sweeps without means were given to it, the page shows that and says so."""
     html, pictures = paper_report.render(summary(cnn=paper_values.CNNS[1]))
@@ -245,6 +248,7 @@ def test_plans_name_methods_and_parts_that_exist():
         } <= ran
 
 
+@pytest.mark.slow
 def test_run_writes_everything_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A tiny plan writes page, pictures and results; a second run takes the kept folds and gives the same figures."""
     real, one = "sim:T-REAL:100{w}:2", ("position<=1",)

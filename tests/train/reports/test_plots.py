@@ -71,6 +71,7 @@ def test_pictures_are_whole_alike_and_need_nothing(name: str):
     assert all(float(size) >= 7 for size in re.findall(r"font-size: ([\d.]+)px", svg))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURES)
 def test_no_text_leaves_the_picture(name: str):
     """Every text begins inside of the picture, and ends there by a cautious guess of its width."""

@@ -75,6 +75,7 @@ def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
         assert text not in told
 
 
+@pytest.mark.slow
 def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
     """Well-formed, titled, drawn twice the same, in roles of colour, its pixels in itself, no text beyond its edges."""
     fmt = SweepFormat(12, 12, 50.0, 40, "float32")
@@ -126,6 +127,7 @@ def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
     assert density.max() == pytest.approx(8 / np.sqrt(2) / np.sqrt(1.5), rel=0.01)  # Hann's noise width is 1.5 bins
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rows", "cols", "window", "dtype"),
     [(1, 1, 1, "uint8"), (1, 1, 7, "float32"), (1, 64, 8, "int16"), (9, 1, 9, "uint16"), (8, 8, 30, "uint8"),
@@ -151,6 +153,7 @@ def test_a_silent_skin_can_be_drawn(tmp_path: Path, digits: int):
     assert "no spectrum: less than 8 frames, or nothing moves" in told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", [(2, 2), (9, 9)])
 def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: tuple[int, int]):
     """Where the numbers jump there is a bar, as wide as the gap lasted; the spectrum is of the longest run without one."""

@@ -362,6 +362,7 @@ def test_less_does_not_fall_below_what_is_wanted(fakes):
     assert reduction_curves._fine(trials, asked(accuracy=1.0), less, less)
 
 
+@pytest.mark.slow
 def test_materials_that_look_alike_are_proposed_as_one(fakes):
     """Only the first taxel has information: a and c, b and d are the same to it. Proposed, not applied."""
     sweeps = skin(taxels=(0, 0))
@@ -375,6 +376,7 @@ def test_materials_that_look_alike_are_proposed_as_one(fakes):
     assert not reduced(two(), reduce=("classes",), accuracy=0.9)["classes"]["proposed"]
 
 
+@pytest.mark.slow
 def test_what_was_interrupted_goes_on(fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Trainings that are done are not done again, and the choice is the same."""
     where, calls, train = Where(jobs=1, cache=tmp_path), [], evaluate.run
@@ -394,6 +396,7 @@ def test_what_was_interrupted_goes_on(fakes, tmp_path: Path, monkeypatch: pytest
     assert len(calls) == 8 + 2 * 6 - 7
 
 
+@pytest.mark.slow
 def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
     """Real methods on a real bundle: L-features suffice, so they are deployed; the page needs nothing from outside."""
     skin().save(tmp_path / "skin.npz")
@@ -431,6 +434,7 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
     assert json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"] == result["rungs"]
 
 
+@pytest.mark.slow
 def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     """The best is reported and packed all the same."""
     monkeypatch.setattr(measure, "memory", lambda folder, sweeps: {"rss_mib": 50.0, "foreign": []})

@@ -64,6 +64,7 @@ def test_no_random_state_outside_is_read_or_changed():
         assert torch.equal(vary(sweeps(), 4, Augmentation(), torch.Generator().manual_seed(6)), first)
 
 
+@pytest.mark.slow
 def test_a_shift_reads_between_rows_and_fills_the_edge():
     """Each row becomes a mixture of two neighbours, the same in all rows; what comes in is part of the edge's row."""
     x = sweeps(200, frames=50).view(200, 4, 200)
@@ -123,6 +124,7 @@ def test_a_stretch_changes_the_rate_by_no_more_than_asked():
     assert peaks.max() > 23
 
 
+@pytest.mark.slow
 def test_damping_takes_high_rates_and_colour_any():
     """Damping lowers the highest rates of its share of the sweeps, never the lowest; colour raises some bands as well."""
     x = sweeps(200, frames=512)

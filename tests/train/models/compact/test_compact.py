@@ -113,6 +113,7 @@ def test_rounding_to_zero_sums_moves_as_little_as_it_can():
     np.testing.assert_array_equal(graph.zero_sum_taps(whole), whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("int8", [False, True])
 @pytest.mark.parametrize(("window", "dtype"), [(1500, "uint8"), (128, "int16"), (25, "float32")])
 def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: str):
@@ -190,6 +191,7 @@ def test_tenths_are_means_of_what_was_known():
     np.testing.assert_allclose(half, seen(model, digits[:, :400]), atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNGS)
 def test_a_rung_costs_what_it_says(name: str):
     """Weights of the float graph, multiply-accumulates of its convolutions and head; within what the issue allows."""
@@ -224,6 +226,7 @@ def test_every_operator_of_int8_is_fused(tmp_path: Path):
     assert done["Transpose"] == 0
 
 
+@pytest.mark.slow
 def test_the_method_is_its_int8_graph():
     """Logits are the graph's to the bit; the float form is the fit's network; the same fit gives the same head."""
     s = easy(12)
@@ -256,6 +259,7 @@ FIRST, SECOND, THIRD, BANDS = (np.repeat(np.arange(4), (6, 8, 8, 5)) == k for k 
 """Columns of what the heads of SMALL see of 64 frames."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("useful", "depth", "banded"),
     [
@@ -319,6 +323,7 @@ def bare() -> family.CompactModel:
         return methods.find(["compact"], Effort(share=0.01))[0].train(s, s.samples, 1)
 
 
+@pytest.mark.slow
 def test_the_box_s_own_may_end_without_a_convolution(bare: family.CompactModel):
     """Then nothing in its graph is int8, its float form says the same, and it learns what is easy."""
     assert bare.made.shape == DEFAULT.cut(0, spectrum=True)

@@ -101,6 +101,7 @@ def test_a_head_of_two_classes_has_two_logits():
     assert np.mean((seen @ weight.T + bias).argmax(1) == labels) > 0.8
 
 
+@pytest.mark.slow
 def test_a_fit_learns_what_is_easy(fitted: Fit):
     """Far above the third of chance on sweeps of another seed, with calibrated probabilities."""
     other = easy(seed=9)
@@ -112,6 +113,7 @@ def test_a_fit_learns_what_is_easy(fitted: Fit):
     assert fitted.about["validation"]["accuracy"] > 0.9
 
 
+@pytest.mark.slow
 def test_a_fit_is_its_seed_s_alone(fitted: Fit):
     """The same bits again, whatever the state outside, which stays as it was; another seed gives others."""
     torch.manual_seed(99)
@@ -124,6 +126,7 @@ def test_a_fit_is_its_seed_s_alone(fitted: Fit):
     assert not np.array_equal(fit.fit(easy(), 2, QUICK).weights["convs.0.weight"], fitted.weights["convs.0.weight"])
 
 
+@pytest.mark.slow
 def test_positions_are_held_out_where_there_are_several():
     """The figures of validation are of positions that training never saw."""
     s = easy()
