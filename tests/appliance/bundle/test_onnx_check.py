@@ -59,7 +59,6 @@ def test_a_harmless_model_of_the_hostile_kind_passes():
     check.check(hostile.model([hostile.node("Relu", ["x"], ["y"])]).SerializeToString(), MANIFEST)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_model_is_refused(name: str):
     """With one printable line that says why and what to try, and within a second."""
