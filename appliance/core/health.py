@@ -1,4 +1,5 @@
-"""How the box is at the end of a turn of its loop: what observers get, and what the STA sentence and the status show."""
+"""How the box is at the end of a turn of its loop: what observers get, and what the STA sentence and the status
+show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The log of the box: one line an event. In: records of the logger `log`. Out: standard error, for a terminal or the journal.
+"""The log of the box: one line an event. In: records of the logger `log`. Out: standard error, for a terminal or the
+journal.
 
 The levels are those of `logging`; systemd's journal gets them as priorities, so `journalctl -p warning` shows warnings
 alone. A log that cannot be written costs its lines, never the classifying.

@@ -123,7 +123,7 @@ def _serial(device: usb.core.Device) -> str:
 
 
 def _configuration(device: usb.core.Device) -> Any:
-    """The active configuration; set only where none is, since setting it anew resets the board."""
+    """The active configuration; set only if there is none, since setting it again resets the board."""
     try:
         return device.get_active_configuration()
     except usb.core.USBError:

@@ -1,6 +1,7 @@
-"""The readout board as a pyusb backend: the real usb.core, usb.util and UsbSensor run above it.
+"""A simulated USB bus: a pyusb backend with one readout board. In: a Board, and faults to simulate. Out: descriptors,
+replies, transfers, and the errnos of libusb.
 
-In: a Board of the rig and what shall happen to it. Out: descriptors, replies, transfers, and the errnos of libusb.
+Simulated is libusb with everything below it; usb.core, usb.util and the drivers above are the real ones.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ SPEED_FULL = 2
 class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
     """A pyusb backend with one board on it.
 
-    errors: an errno that the next calls of a kind raise, by name
-    ("claim", "open", "read"). mangle: what the cable does to the bytes of a transfer. halted: the bulk endpoint stalls
-    until it is cleared.
+    errors: errno that all calls of a kind raise, by name ("claim", "open", "read" and so on). mangle: changes the bytes
+    of a transfer, as a bad cable. halted: the bulk endpoint stalls until it is cleared. kernel_driver: cdc_acm holds
+    the board.
     """
 
     def __init__(self, board: Board, clock: Clock, *, acm: bool = False) -> None:
@@ -43,19 +44,19 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         self._pending = b""
 
     def at(self, t_ns: int, action: Callable[[], None]) -> None:
-        """Do `action` when the timeline passes `t_ns`."""
+        """Schedule `action` for the time `t_ns`."""
         heapq.heappush(self._agenda, (t_ns, len(self._agenda), action))
 
     def unplug(self) -> None:
-        """Pull the cable; the board loses its power."""
+        """Unplug the cable; the board loses its power."""
         self.board.present = self.board.running = False
 
     def plug(self) -> None:
-        """Put the cable back."""
+        """Plug the cable in again."""
         self.board.present = True
 
     def _touch(self, what: str = "") -> None:
-        """Let what is due happen, then fail as the bus would."""
+        """Do the scheduled actions that are due, then raise the error that the bus would give."""
         while self._agenda and self._agenda[0][0] <= self._clock.now_ns():
             heapq.heappop(self._agenda)[2]()
         if what in self.errors:
@@ -65,7 +66,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
             raise usb.core.USBError("No such device (it may have been disconnected)", -4, errno.ENODEV)
 
     def _wait(self, t_ns: int) -> None:
-        """Sleep to `t_ns` or to the next thing on the agenda."""
+        """Sleep until `t_ns` or until the next scheduled action."""
         self._clock.sleep_until(min(t_ns, self._agenda[0][0]) if self._agenda else t_ns)
 
     def enumerate_devices(self) -> Iterator[str]:
@@ -118,7 +119,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         return "handle"
 
     def close_device(self, handle: str) -> None:
-        """pyusb: nothing is held."""
+        """pyusb: nothing to release."""
 
     def get_configuration(self, handle: str) -> int:
         """pyusb: the configuration that the kernel has set."""
@@ -136,7 +137,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         self._touch()
 
     def is_kernel_driver_active(self, handle: str, intf: int) -> bool:
-        """pyusb: True for a CDC-ACM board that cdc_acm has taken."""
+        """pyusb: True for a CDC-ACM board that cdc_acm holds."""
         return self.kernel_driver
 
     def detach_kernel_driver(self, handle: str, intf: int) -> None:
@@ -144,7 +145,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         self.kernel_driver = False
 
     def clear_halt(self, handle: str, ep: int) -> None:
-        """pyusb: let a stalled endpoint go on."""
+        """pyusb: clear a stalled endpoint."""
         self._touch("clear")
         self.halted = False
 
@@ -175,7 +176,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         return len(data)
 
     def bulk_read(self, handle: str, ep: int, intf: int, buff: array[int], ms: int) -> int:
-        """pyusb: one transfer, at the moment when it would come."""
+        """pyusb: one transfer, at the time at which it arrives."""
         deadline_ns = self._clock.now_ns() + ms * 1_000_000
         while True:
             self._touch("read")
