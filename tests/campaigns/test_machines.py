@@ -56,8 +56,8 @@ def _show(folder: Path, name: str) -> None:
     model = onnx.load(folder / name / bundle.MODEL)
     del model.graph.output[:]
     (folder / f"{name} inside").mkdir()
-    names = [q.output[0] for q in parity.rounded(model)]
-    (folder / f"{name} inside" / "shown.onnx").write_bytes(parity.shown(model, names).SerializeToString())
+    names = [q.output[0] for q in parity.rounding_nodes(model)]
+    (folder / f"{name} inside" / "shown.onnx").write_bytes(parity.with_outputs(model, names).SerializeToString())
     np.save(folder / f"{name} inside" / "sweeps.npy", np.load(folder / name / "sweeps.npy")[:SHOWN_SWEEPS])
 
 

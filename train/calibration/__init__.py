@@ -1,1 +1,1 @@
-"""What is fitted after training: temperatures, early exit, novelty."""
+"""What is fitted after training, on what the trunk gives: temperatures, early exit, novelty."""

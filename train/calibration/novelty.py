@@ -1,8 +1,8 @@
-"""The room of what is known. In: features of sweeps, labels, groups. Out: an Embedding, how far a known sweep may lie.
+"""Detection of unknown materials. In: features of sweeps, labels, groups. Out: an Embedding, the limit of its distances.
 
-Shrinkage LDA seen from the other side: a linear image of the features in which the sweeps of every material scatter
-around its mean with covariance 1. The nearest mean names the material, just as LDA does, and a sweep far from all of
-them is of a material that was never trained. The box needs no more than this image and the means.
+The embedding is shrinkage LDA in another form: a linear map of the features after which the sweeps of every material
+scatter around its mean with covariance 1. The nearest mean names the material, as LDA does, and a sweep far from all of
+them is of an unknown material. The box needs only this map and the means.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from appliance.core.errors import FormatError
 
 Array = NDArray[Any]
 KEPT = 0.97
-"""Share of known sweeps that the limit keeps: the others are lost to the robot, whatever the network knew. At .99 half of
-the strangers would pass for known (docs/decisions/0006)."""
+"""Share of known sweeps that the limit keeps: the others are lost to the robot, whatever the network gave. At .99 half of
+the unknown materials would pass for known (docs/decisions/0006)."""
 PARTS = 10
-"""Into how many parts groups are dealt at most, where each part is judged by what the others gave."""
+"""Into how many parts groups are divided at most; each part is judged by what was fitted to the others."""
 FLAT = 1e-9
-"""Least variance of a direction, of that of the widest one: a silent channel stays finite."""
+"""Least variance of a direction, relative to that of the widest one: a silent channel stays finite."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ class Embedding:
         return squares
 
     def classes(self) -> Classes:
-        """The means as a bundle holds them, all of them trained."""
+        """The means as a bundle holds them, each counted as trained."""
         bias, k = -(self.means.astype(np.float64) ** 2).sum(1) / 2, len(self.means)
         return Classes(self.means, bias.astype(np.float32), np.zeros(k, np.int64), np.ones(k, np.float32))
 
-    def strangeness(self, features: Array) -> Array:
+    def novelty(self, features: Array) -> Array:
         """Squared distance [...] of features [..., F] to the nearest mean: what the limit is compared with."""
         nearest: Array = self.distances(self(features)).min(axis=-1)
         return nearest
@@ -67,13 +67,13 @@ class Embedding:
         return logits
 
 
-def embed(features: Array, labels: Array, whole: int = 0) -> Embedding:
-    """The Embedding of training features [N, F] with labels [N] from 0 to K - 1, in r = min(K - 1 + whole, F) directions.
+def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
+    """The Embedding of training features [N, F] with labels [N] from 0 to K - 1, in r = min(K - 1 + fixed, F) directions.
 
-    The covariance is Ledoit and Wolf's, as in heads.closed_form_head. The first K - 1 directions hold all that LDA
-    knows of materials; more are added until the last `whole` features, those that nobody trained (see spectrum.py),
-    are in it with all they say: no trained material differs there, but one that was not trained may.
-    Raises FormatError where there is one material, a label is missing, or each material has but one sweep.
+    The covariance is Ledoit and Wolf's, as in linear_head.closed_form_head. The first K - 1 directions hold everything
+    that LDA uses; more are added until the last `fixed` features, which were not trained (see spectrum.py), are in it
+    completely: trained materials do not differ there, but an unknown one may.
+    Raises FormatError where there is one material, a label is missing, or each material has only one sweep.
     """
     labels = np.asarray(labels)
     if len(missing := np.setdiff1d(np.arange(labels.max(initial=0) + 1), labels)):
@@ -81,21 +81,21 @@ def embed(features: Array, labels: Array, whole: int = 0) -> Embedding:
     if (classes := int(labels.max(initial=0)) + 1) < 2:
         raise FormatError("all sweeps are of one material; a classifier needs two")
     if len(labels) <= classes:
-        raise FormatError(f"{len(labels)} sweeps of {classes} materials tell nothing of how they vary; record more")
+        raise FormatError(f"{len(labels)} sweeps of {classes} materials say nothing of how they vary; record more")
     x = np.asarray(features, np.float64)
     middle, size = x.mean(axis=0), x.shape[1]
     means = np.stack([x[labels == k].mean(axis=0) for k in range(classes)]) - middle
     white, coloured = _whitening(x, labels)
     axes = np.linalg.svd((means - means.mean(axis=0)) @ white)[2][: classes - 1].T
-    axes = np.linalg.qr(np.hstack([axes, coloured[:, size - whole :]]))[0]
+    axes = np.linalg.qr(np.hstack([axes, coloured[:, size - fixed :]]))[0]
     projection = (white @ axes).astype(np.float32)
     return Embedding(projection, (-middle @ projection).astype(np.float32), (means @ projection).astype(np.float32))
 
 
-def embed_some(features: Array, labels: Array, whole: int = 0) -> tuple[Embedding, Array]:
-    """The Embedding of sweeps among which some label may be missing, and the labels [K] of its means."""
-    there, numbered = np.unique(labels, return_inverse=True)
-    return embed(features, numbered, whole), there
+def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embedding, Array]:
+    """The Embedding of sweeps among which a label may be missing, and the labels [K] of its means."""
+    present, numbered = np.unique(labels, return_inverse=True)
+    return embed(features, numbered, fixed), present
 
 
 def _whitening(x: Array, labels: Array) -> tuple[Array, Array]:
@@ -107,48 +107,48 @@ def _whitening(x: Array, labels: Array) -> tuple[Array, Array]:
 
 
 def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Array, Array]]:
-    """Pairs (bool [N] to fit on, numbers of those that then judge), so that each sweep of `judged` (bool [N]) judges
-    once, what was fitted without its group; groups: int [N], dealt into `most` parts at most.
+    """Pairs (bool [N] to fit on, numbers of the sweeps that then judge).
 
-    Raises FormatError where there is but one group.
+    Each sweep of `judged` (bool [N]) judges once, what was fitted without its group. groups: int [N], divided into `most`
+    parts at most. Raises FormatError where there is only one group.
     """
     values = np.unique(groups[judged])
     if len(np.unique(groups)) < 2:
-        raise FormatError("all sweeps are of one group; what judges must not be trained on: record a second position")
+        raise FormatError("all sweeps are of one group; what judges must not be trained on; record a second position")
     part_of = np.full(len(groups), -1)
-    there = np.isin(groups, values)
-    part_of[there] = np.searchsorted(values, groups[there]) % min(most, len(values))
+    judging = np.isin(groups, values)
+    part_of[judging] = np.searchsorted(values, groups[judging]) % min(most, len(values))
     for part in range(min(most, len(values))):
         yield part_of != part, np.flatnonzero((part_of == part) & judged)
 
 
-def crossed(features: Array, labels: Array, groups: Array, judged: Array, whole: int = 0) -> Array:
-    """Strangeness [n] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups (int [N]).
+def cross_fitted_distances(features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0) -> Array:
+    """Novelty [n] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups (int [N]).
 
-    Left out are sweeps of a material that is in no other part. Raises FormatError as `parts` and `embed`.
+    Sweeps of a material that occurs in no other part are left out. Raises FormatError as `parts` and `embed`.
     """
-    told = [np.empty(0)]
+    distances = [np.empty(0)]
     for fit, numbers in parts(groups, judged):
-        model, there = embed_some(features[fit], labels[fit], whole)
-        told.append(model.strangeness(features[numbers[np.isin(labels[numbers], there)]]))
-    return np.concatenate(told)
+        embedding, present = embed_present(features[fit], labels[fit], fixed)
+        distances.append(embedding.novelty(features[numbers[np.isin(labels[numbers], present)]]))
+    return np.concatenate(distances)
 
 
-def limit(strangeness: Array, kept: float = KEPT) -> float:
-    """The limit that keeps `kept` of sweeps like those with `strangeness` [n], which were not trained on.
+def limit(novelty: Array, kept: float = KEPT) -> float:
+    """The limit that keeps `kept` of sweeps like those with this `novelty` [n], which were not trained on.
 
     The ceil((n + 1) * kept)-th smallest, as split conformal prediction takes it, so that a new sweep is kept with at
     least that probability (Vovk et al. 2005); the largest where n is too small for it.
     Raises FormatError where there is none.
     """
-    if not (n := len(strangeness)):
+    if not (n := len(novelty)):
         raise FormatError("no known sweep is left to find the limit with; record each material in several positions")
-    place = min(int(np.ceil((n + 1) * kept)), n) - 1
-    return float(max(np.sort(strangeness)[place], np.finfo(np.float32).tiny))
+    rank = min(int(np.ceil((n + 1) * kept)), n) - 1
+    return float(max(np.sort(novelty)[rank], np.finfo(np.float32).tiny))
 
 
 def auroc(known: Array, unknown: Array) -> float:
-    """The probability that a strangeness of `unknown` [m] is above one of `known` [n], ties half (Mann and Whitney).
+    """The probability that a novelty of `unknown` [m] is above one of `known` [n], ties half (Mann and Whitney).
 
     Raises FormatError where there is none of either.
     """

@@ -1,7 +1,7 @@
-"""The room where a trained trunk gets all that stands on it. In: its features of training sweeps. Out: a Posthoc.
+"""Everything that is fitted after training. In: a Fit, or its trunk's features of the training sweeps. Out: a Posthoc.
 
-That is an embedding, heads for each tenth, temperatures, the rule for early decisions and the limit of what is known;
-and the graph of all of it. What was fitted is judged by sweeps that it did not see, group by group.
+That is an embedding, heads for each tenth, temperatures, the rule for early decisions, the limit of what is known, and
+the graph of all of it. What was fitted is judged by sweeps that it did not see, group by group.
 """
 
 from __future__ import annotations
@@ -22,9 +22,8 @@ from appliance.inference.classifier import softmax
 from train.calibration import early_exit, novelty
 from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.novelty import Embedding
-from train.models.compact.augment import Augmentation
-from train.models.compact.fit import COPIES, Fit, copies, varied
-from train.models.linear_head import temperature
+from train.models.compact.fit import COPIES, Fit, copies
+from train.models.linear_head import fit_temperature
 from train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
@@ -32,8 +31,11 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Posthoc:
-    """What stands on a trunk. weight [F, K], bias [K]: the head that names, cooled by `temperature`. warmth: temperature
-    of logits from class means; steps: of the tenths, cooled; limit: see known."""
+    """What is fitted to a trunk. weight [F, K], bias [K]: the head that names the material, divided by `temperature`.
+
+    warmth: temperature of logits from class means. steps: heads of the tenths, with their temperatures. limit: see
+    novelty.
+    """
 
     embedding: Embedding
     weight: Array
@@ -45,9 +47,9 @@ class Posthoc:
     limit: float
 
     def logits(self, features: Array) -> Array:
-        """Features [..., F] of whole sweeps -> logits [..., K] whose softmax may be believed."""
-        named: Array = np.asarray(features, np.float64) @ self.weight + self.bias
-        return named
+        """Features [..., F] of whole sweeps -> logits [..., K] whose softmax is calibrated."""
+        logits: Array = np.asarray(features, np.float64) @ self.weight + self.bias
+        return logits
 
     def probabilities(self, tenths: Array) -> Array:
         """Features [n, D + 1, F] -> probabilities [n, D + 1, K] after each step and the whole sweep."""
@@ -55,28 +57,27 @@ class Posthoc:
         return softmax(np.concatenate([steps, self.logits(tenths[:, -1])[:, None]], axis=1))
 
     def known(self) -> Known:
-        """For the manifest."""
+        """The entry `known` of a manifest."""
         return Known(self.limit, self.warmth)
 
     def means(self) -> bytes:
         """The file means.npz of a bundle."""
-        packed, held = io.BytesIO(), self.embedding.classes()
-        np.savez_compressed(packed, means=held.means, bias=held.bias, sweeps=held.sweeps)
+        packed, classes = io.BytesIO(), self.embedding.classes()
+        np.savez_compressed(packed, means=classes.means, bias=classes.bias, sweeps=classes.sweeps)
         return packed.getvalue()
 
     def graph(self, trunk: onnx.ModelProto, known: bool = True) -> onnx.ModelProto:
-        """The model of a bundle; `early` is in it where the trunk gives tenths and there is a rule."""
-        return assembled(
-            trunk, self.embedding, (self.weight, self.bias), self.steps if self.rule.early else None, known
-        )
+        """The model of a bundle; it has `early` where the trunk gives tenths and there is a rule."""
+        steps = self.steps if self.rule.early else None
+        return assemble_model(trunk, self.embedding, (self.weight, self.bias), steps, known)
 
 
 @dataclass(frozen=True)
 class AugmentedCopies:
-    """The training sweeps again, as the scene might have given them: features [M, F], labels [M], groups [M].
+    """The training sweeps again, augmented: features [M, F], labels [M], groups [M].
 
-    They teach the head that names how materials vary. The embedding does not see them: with them a strange material
-    would lie among what is known.
+    They show the head that names the material how materials vary. The embedding does not see them: with them an unknown
+    material would lie among the known ones.
     """
 
     features: Array
@@ -84,64 +85,88 @@ class AugmentedCopies:
     groups: Array
 
 
-def fit_posthoc(
-    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, also: AugmentedCopies | None = None
-) -> Posthoc:
-    """Fit all of it on features [N, D + 1, F] of sweeps with labels [N] from 0 to K - 1, of groups [N].
+def calibrate(fit: Fit) -> Posthoc:
+    """Fit everything to the int8 trunk of `fit`. Raises FormatError as `posthoc_inputs` and `fit_posthoc`."""
+    return fit_posthoc(*posthoc_inputs(fit))
 
-    judged: bool [N], sweeps that the trunk did not see; only these find temperatures, rule and limit, each with heads
-    that did not see its group. fixed: so many features, the last ones, were not trained; see known.embed.
-    Raises FormatError as known.embed, and where there is but one group or nothing to judge by.
+
+def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies]:
+    """The arguments of `fit_posthoc`: what the int8 trunk gives for the sweeps that were trained on and held out, in this
+    order, and for the copies that its head was fitted to.
+
+    Raises FormatError where none was held out: nothing could judge.
+    """
+    train, held, by = fit.train, fit.held, fit.about["held_out_by"]
+    if by == "nothing":
+        raise FormatError(f"{train.source}: too few groups to hold some out; record more positions")
+    tenths = run(fit.trunk(tenths=True), np.concatenate([train.samples, held.samples]))
+    labels, groups = np.append(train.labels, held.labels), np.append(train.group(by), held.group(by))
+    trunk = fit.trunk()
+    augmented = copies(fit.network(), train, fit.augment, fit.about["seed"])
+    features = np.concatenate([run(trunk, copy.samples) for copy in augmented])
+    copied = AugmentedCopies(features, np.tile(train.labels, COPIES), np.tile(train.group(by), COPIES))
+    return tenths, labels, groups, np.arange(len(labels)) >= len(train), fit.bands, copied
+
+
+def fit_posthoc(
+    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, copied: AugmentedCopies | None = None
+) -> Posthoc:
+    """Fit all of it to features [N, D + 1, F] of sweeps with labels [N] from 0 to K - 1, of groups [N].
+
+    judged: bool [N], sweeps that the trunk did not see. Only these find temperatures, rule and limit, each with heads
+    that did not see its group. fixed: so many features, the last ones, were not trained; see novelty.embed.
+    Raises FormatError as novelty.embed, and where there is only one group or nothing to judge by.
     """
     whole, classes = tenths[:, -1], int(labels.max()) + 1
-    copied = also or AugmentedCopies(whole[:0], labels[:0], groups[:0])
+    more = copied or AugmentedCopies(whole[:0], labels[:0], groups[:0])
 
-    def named(fit: Array) -> tuple[Array, Array]:
-        """The head found without the groups that are not in `fit`, bool [N]."""
-        more = np.isin(copied.groups, groups[fit])
-        x, y = np.concatenate([whole[fit], copied.features[more]]), np.concatenate([labels[fit], copied.labels[more]])
+    def naming_head(fit: Array) -> tuple[Array, Array]:
+        """The head fitted to the groups in `fit`, bool [N]."""
+        also = np.isin(more.groups, groups[fit])
+        x, y = np.concatenate([whole[fit], more.features[also]]), np.concatenate([labels[fit], more.labels[also]])
         return early_exit.lda(x, y, classes)
 
-    logits, numbers = early_exit.crossed(tenths, labels, groups, judged, fixed)
-    warmth = temperature(logits[:, -1], labels[numbers])
-    at = {number: row for row, number in enumerate(numbers)}
+    logits, numbers = early_exit.cross_fitted_logits(tenths, labels, groups, judged, fixed)
+    warmth = fit_temperature(logits[:, -1], labels[numbers])
+    row_of = {number: row for row, number in enumerate(numbers)}
     for fit, judges in novelty.parts(groups, judged):
-        weight, bias = named(fit)
-        there = [number for number in judges if number in at]
-        logits[[at[number] for number in there], -1] = whole[there] @ weight + bias
-    cooler = early_exit.temperatures(logits, labels[numbers])
-    rule = early_exit.rule(softmax(logits / cooler[:, None]), labels[numbers])
-    embedding, (weight, bias) = novelty.embed(whole, labels, fixed), named(np.ones(len(labels), bool))
-    steps = early_exit.heads(embedding(tenths), labels, classes).cooled(cooler[:-1])
-    limit = novelty.limit(novelty.crossed(whole, labels, groups, judged, fixed))
-    return Posthoc(embedding, weight / cooler[-1], bias / cooler[-1], float(cooler[-1]), warmth, steps, rule, limit)
+        weight, bias = naming_head(fit)
+        present = [number for number in judges if number in row_of]
+        logits[[row_of[number] for number in present], -1] = whole[present] @ weight + bias
+    temperatures = early_exit.fit_temperatures(logits, labels[numbers])
+    rule = early_exit.find_rule(softmax(logits / temperatures[:, None]), labels[numbers])
+    embedding, (weight, bias) = novelty.embed(whole, labels, fixed), naming_head(np.ones(len(labels), bool))
+    steps = early_exit.heads(embedding(tenths), labels, classes).cooled(temperatures[:-1])
+    limit = novelty.limit(novelty.cross_fitted_distances(whole, labels, groups, judged, fixed))
+    last = temperatures[-1]
+    return Posthoc(embedding, weight / last, bias / last, float(last), warmth, steps, rule, limit)
 
 
-def assembled(
+def assemble_model(
     trunk: onnx.ModelProto,
     embedding: Embedding,
     head: tuple[Array, Array],
     steps: Heads | None = None,
     known: bool = True,
 ) -> onnx.ModelProto:
-    """The model that a bundle holds, of a trunk (float or int8) and what stands on it.
+    """The model that a bundle holds: a trunk (float or int8) and what is fitted to it.
 
     trunk: `sweep` -> `features` float32 [1, F], or `tenths` [1, D + 1, F], which `steps` need. head: weight [F, K], bias
     [K]. Outputs: `logits` [1, K], `early` [1, D, K] where there are `steps`, `embedding` [1, r] where `known`.
     """
-    whole = onnx.ModelProto()
-    whole.CopyFrom(trunk)
-    given = trunk.graph.output[0]
-    dims = [d.dim_value for d in given.type.tensor_type.shape.dim]
-    add = partial(_add, whole.graph)
-    last = (
-        given.name if len(dims) == 2 else add("Gather", given.name, np.array(dims[1] - 1), output="head.last", axis=1)
-    )
+    model = onnx.ModelProto()
+    model.CopyFrom(trunk)
+    features = trunk.graph.output[0]
+    dims = [d.dim_value for d in features.type.tensor_type.shape.dim]
+    add = partial(_add, model.graph)
+    last = features.name
+    if len(dims) == 3:
+        last = add("Gather", features.name, np.array(dims[1] - 1), output="head.last", axis=1)
     weight, bias = (np.asarray(part, np.float32) for part in head)
     add("Gemm", last, weight - weight.mean(1, keepdims=True), bias - bias.mean(), output="logits")
     outputs: dict[str, list[int]] = {"logits": [1, len(bias)]}
     if steps is not None and len(dims) == 3:
-        z = add("MatMul", given.name, embedding.projection, output="head.turned")
+        z = add("MatMul", features.name, embedding.projection, output="head.turned")
         z = add("Add", z, embedding.offset, output="head.each")
         # [1, D, r] -> [D, 1, r]: one head for each row
         rows = add("Slice", z, np.array([0]), np.array([dims[1] - 1]), np.array([1]), output="head.first")
@@ -152,41 +177,19 @@ def assembled(
     if known:
         add("Gemm", last, embedding.projection, embedding.offset, output="embedding")
         outputs["embedding"] = [1, embedding.projection.shape[1]]
-    del whole.graph.output[:]
+    del model.graph.output[:]
     for name, shape in outputs.items():
-        whole.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
-    onnx.checker.check_model(whole, full_check=True)
-    return whole
+        model.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
+    onnx.checker.check_model(model, full_check=True)
+    return model
 
 
-def _add(graph: onnx.GraphProto, op: str, *inputs: str | Array, output: str, **how: Any) -> str:
-    """One node more; arrays become constants."""
+def _add(graph: onnx.GraphProto, op: str, *inputs: str | Array, output: str, **attributes: Any) -> str:
+    """Add one node; arrays become constants. The name of its output."""
     names = []
-    for i, held in enumerate(inputs):
-        names.append(held if isinstance(held, str) else f"{output}.{i}")
-        if not isinstance(held, str):
-            graph.initializer.append(numpy_helper.from_array(np.array(held, order="C"), names[-1]))
-    graph.node.append(helper.make_node(op, names, [output], name=output, **how))
+    for i, value in enumerate(inputs):
+        names.append(value if isinstance(value, str) else f"{output}.{i}")
+        if not isinstance(value, str):
+            graph.initializer.append(numpy_helper.from_array(np.array(value, order="C"), names[-1]))
+    graph.node.append(helper.make_node(op, names, [output], name=output, **attributes))
     return output
-
-
-def posthoc_inputs(made: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies]:
-    """What its int8 trunk makes of the sweeps that were trained on and held out, in this order.
-
-    Raises FormatError where none was held out: nothing could judge.
-    """
-    train, held, by = made.train, made.held, made.about["held_out_by"]
-    if by == "nothing":
-        raise FormatError(f"{train.source}: too few groups to hold some out; record more positions")
-    tenths = run(made.trunk(tenths=True), np.concatenate([train.samples, held.samples]))
-    labels, groups = np.append(train.labels, held.labels), np.append(train.group(by), held.group(by))
-    change = partial(varied, rows=train.format.rows, scene=Augmentation(**made.about["recipe"]["scene"]))
-    trunk, seed = made.trunk(), made.about["seed"]
-    changed = np.concatenate([run(trunk, copy.samples) for copy in copies(made.network(), train, change, seed)])
-    also = AugmentedCopies(changed, np.tile(train.labels, COPIES), np.tile(train.group(by), COPIES))
-    return tenths, labels, groups, np.arange(len(labels)) >= len(train), made.bands, also
-
-
-def calibrate(made: Fit) -> Posthoc:
-    """All that stands on the trunk of `made`. Raises FormatError as `seen` and finish.finish."""
-    return fit_posthoc(*posthoc_inputs(made))

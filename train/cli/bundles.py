@@ -107,11 +107,11 @@ def run_fit(args: argparse.Namespace) -> None:
             args.rest.parent.mkdir(parents=True, exist_ok=True)
             rest.save(args.rest)
             print(f"rest: {len(rest)} sweeps in {args.rest}")
-    shape = ARCHITECTURES.get(args.size, DEFAULT)
+    architecture = ARCHITECTURES.get(args.size, DEFAULT)
     changes = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
-    scene = replace(fit.usual(sweeps.format, shape), **changes)
-    recipe = fit.FitRecipe(steps=args.steps, scene=scene, keep_means=args.keep_means)
-    made = fit.fit(sweeps, args.seed, recipe, options.Log(), shape)
+    augmentation = replace(fit.default_augmentation(sweeps.format, architecture), **changes)
+    recipe = fit.FitRecipe(steps=args.steps, augmentation=augmentation, keep_means=args.keep_means)
+    made = fit.fit(sweeps, args.seed, recipe, options.Log(), architecture)
     made.save(args.out)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; held-out {made.about['held_out_by']}: "
           f"{_text(made.about['validation'])}; {args.out}")  # fmt: skip

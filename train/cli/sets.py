@@ -66,24 +66,24 @@ def run_pull(args: argparse.Namespace) -> None:
         pull.pull(box, args.out, report, options.Log())
     finally:
         print(
-            f"fetched {len(report.fetched)}, there already {len(report.there)}, refused {len(report.refused)}",
+            f"fetched {len(report.fetched)}, there already {len(report.present)}, refused {len(report.refused)}",
             flush=True,
         )
         _print(report, args.out)
-    if bad := len(report.refused) + len(report.others):
+    if bad := len(report.refused) + len(report.different):
         raise FormatError(f"{bad} recordings of {args.host} were not taken; the lines above say why")
 
 
 def _print(report: pull.PullReport, out: Path) -> None:
     """A line for each kind of recording that somebody should look at."""
     for names, what in (
-        (report.halves, "without its .json or .npy on the box; left there"),
+        (report.incomplete, "without its .json or .npy on the box; left there"),
         (
             report.relabelled,
             f"described otherwise on the box; what is in {out} stays: remove its .npy and .json to take the box's",
         ),
         (
-            report.others,
+            report.different,
             f"another sweep on the box under the same name; the one in {out} stays: remove it, or pull into another folder",
         ),
         (report.refused, "refused"),

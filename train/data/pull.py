@@ -1,8 +1,8 @@
-"""The room of fetching. In: a box's recordings, over ssh. Out: the same files here; what is here already stays as it is.
+"""Fetches recordings from a box over ssh. In: a host and its folder. Out: the same files here; existing ones stay.
 
-The box needs sshd, a shell, find, sha256sum and tar, and nothing of Palpate's. It lists each file with its SHA-256; what
-is new comes in one stream, pair by pair (.npy and .json). A pair is read as a recording before it takes its names, so
-whatever ends the connection, no half of one is left under them, and the next call goes on with the rest.
+The box needs sshd, a shell, find, sha256sum and tar, and no part of Palpate. It lists each file with its SHA-256; new
+files come in one stream, pair by pair (.npy and .json). A pair is read as a recording before it gets its file names: when
+the connection ends, no incomplete pair is left under them, and the next call continues with the rest.
 """
 
 from __future__ import annotations
@@ -27,47 +27,56 @@ from appliance.core.types import load
 
 FOLDER = f"{StoreConfig().folder}/sweeps"
 PAIR = (".json", ".npy")
-"""In the order in which they take their names: an .npy never lacks its sidecar."""
-WAITS = ("BatchMode=yes", "ConnectTimeout=10", "ServerAliveInterval=5", "ServerAliveCountMax=3")
-"""No question is asked, and a box that is silent for 15 s has gone."""
+"""In the order in which they are written: an .npy never lacks its sidecar."""
+SSH_OPTIONS = ("BatchMode=yes", "ConnectTimeout=10", "ServerAliveInterval=5", "ServerAliveCountMax=3")
+"""ssh asks no questions, and a box that is silent for 15 s counts as disconnected."""
 AS_READER = (
     'if cd -- "$1" 2>/dev/null && test -r .; then exec sh -c "$2" sh "$1"; else exec sudo -n sh -c "$2" sh "$1"; fi'
 )
 LIST = """cd -- "$1" || exit
 find . -type f '(' -name '*.npy' -o -name '*.json' ')' -exec sha256sum -z -- {} +
 test $? -le 1"""
-"""find ends with 1 where a file went away meanwhile: it is told, and the others are listed all the same."""
+"""find ends with 1 where a file was removed meanwhile: it reports that, and still lists the others."""
 SEND = 'cd -- "$1" && exec tar -c --null -T - -f -'
 LISTED = re.compile(rb"([0-9a-f]{64})  \./(.+)", re.S)
-LARGEST = 1 << 30
-"""Bytes of a file that is taken."""
+MAX_BYTES = 1 << 30
+"""Of a file that is accepted."""
 SHOWN = 5
-"""Names that a line tells."""
+"""Names that a line of the report lists."""
 
 
 @dataclass(frozen=True)
 class RecordingHost:
-    """Where the recordings are. options: of ssh, which go before ours. Raises ApplianceError where it cannot be asked."""
+    """A box with recordings. options: of ssh, which take precedence over SSH_OPTIONS."""
 
     host: str
     folder: str = FOLDER
     options: Sequence[str] = ()
 
-    def run(self, script: str, given: IO[bytes] | int, told: IO[bytes]) -> subprocess.Popen[bytes]:
-        """Start a script in the folder, as whoever may read it. given: what it reads. told: where its troubles go."""
-        ours = [part for wait in WAITS for part in ("-o", wait)]
+    def run(self, script: str, stdin: IO[bytes] | int, stderr: IO[bytes]) -> subprocess.Popen[bytes]:
+        """Start a script in the folder, as the user or, where that may not read it, with sudo.
+
+        Raises ApplianceError where ssh is not installed.
+        """
+        ours = [part for option in SSH_OPTIONS for part in ("-o", option)]
         remote = shlex.join(["sh", "-c", AS_READER, "sh", self.folder, script])
         try:
             return subprocess.Popen(
-                ["ssh", *self.options, *ours, "--", self.host, remote], stdin=given, stdout=subprocess.PIPE, stderr=told
+                ["ssh", *self.options, *ours, "--", self.host, remote],
+                stdin=stdin,
+                stdout=subprocess.PIPE,
+                stderr=stderr,
             )
         except FileNotFoundError:
             raise ApplianceError("ssh is not installed; apt install openssh-client") from None
 
     @contextmanager
-    def reading(self, script: str, given: IO[bytes] | int = subprocess.DEVNULL) -> Iterator[IO[bytes]]:
-        """What the script sends. It has ended when this ends. Raises ApplianceError where it failed."""
-        with tempfile.TemporaryFile() as told, self.run(script, given, told) as process:
+    def output(self, script: str, stdin: IO[bytes] | int = subprocess.DEVNULL) -> Iterator[IO[bytes]]:
+        """The output of the script, which has ended when the context ends. Its messages go to stderr.
+
+        Raises ApplianceError where the box cannot be reached or the script failed.
+        """
+        with tempfile.TemporaryFile() as errors, self.run(script, stdin, errors) as process:
             try:
                 assert process.stdout
                 yield process.stdout
@@ -76,10 +85,10 @@ class RecordingHost:
                 process.kill()
                 raise
             code = process.wait()
-            told.seek(0)
-            said = " / ".join(told.read().decode(errors="replace").split("\n")).strip(" /")
-        if said:
-            print(f"{self.host}: {said}", file=sys.stderr)
+            errors.seek(0)
+            messages = " / ".join(errors.read().decode(errors="replace").split("\n")).strip(" /")
+        if messages:
+            print(f"{self.host}: {messages}", file=sys.stderr)
         if code == 255:
             raise ApplianceError(f"{self.host}: no connection; see that `ssh {self.host} true` works")
         if code:
@@ -91,41 +100,45 @@ class RecordingHost:
 
 @dataclass
 class PullReport:
-    """What became of the recordings, by their names without ending."""
+    """What happened to the recordings, by their names without suffix.
+
+    present: already here, and the same. incomplete: without .npy or .json on the box. relabelled: with another .json on
+    the box. different: with another .npy on the box. refused: with the reason.
+    """
 
     fetched: list[str] = field(default_factory=list)
-    there: list[str] = field(default_factory=list)
-    halves: list[str] = field(default_factory=list)
+    present: list[str] = field(default_factory=list)
+    incomplete: list[str] = field(default_factory=list)
     relabelled: list[str] = field(default_factory=list)
-    others: list[str] = field(default_factory=list)
+    different: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
 
 
-def pull(box: RecordingHost, out: Path, tally: PullReport, log: Callable[[str], None]) -> None:
-    """Fetch into `out` what is not there yet; what becomes of each recording is put into `tally` as it happens.
+def pull(box: RecordingHost, out: Path, report: PullReport, log: Callable[[str], None]) -> None:
+    """Fetch into `out` what is not there yet; what happens to each recording is added to `report` at once.
 
-    Raises ApplianceError where the box cannot be reached or read or the connection ends, FormatError where it sends what
-    was not asked for, OSError where `out` cannot be written.
+    Raises ApplianceError where the box cannot be reached or read or the connection ends, FormatError where it sends files
+    that were not requested, OSError where `out` cannot be written.
     """
     listed = listing(box)
-    wanted = list(_wanted(listed, out, tally))
+    wanted = list(_new_recordings(listed, out, report))
     if not wanted:
         return
     names, came = [name + suffix for name in wanted for suffix in PAIR], 0
-    with tempfile.TemporaryFile() as given:
-        given.write(b"".join(f"{name}\0".encode() for name in names))
-        given.seek(0)
-        with box.reading(SEND, given) as stream:
+    with tempfile.TemporaryFile() as request:
+        request.write(b"".join(f"{name}\0".encode() for name in names))
+        request.seek(0)
+        with box.output(SEND, request) as stream:
             for came, (name, pair) in enumerate(_pairs(stream, names), 1):
-                _take(name, pair, {suffix: listed[name + suffix] for suffix in PAIR}, out, tally)
+                _keep(name, pair, {suffix: listed[name + suffix] for suffix in PAIR}, out, report)
                 log(f"{came} of {len(wanted)}")
     if came < len(wanted):
         raise ApplianceError(f"{box.host}: only {came} of {len(wanted)} recordings came; run the same command again")
 
 
 def listing(box: RecordingHost) -> dict[str, str]:
-    """The box's files and their SHA-256. Raises FormatError where it sends something else."""
-    with box.reading(LIST) as stream:
+    """The box's files with their SHA-256. Raises FormatError where it sends something else."""
+    with box.output(LIST) as stream:
         lines = stream.read().split(b"\0")
     listed = {}
     for line in filter(None, lines):
@@ -137,29 +150,29 @@ def listing(box: RecordingHost) -> dict[str, str]:
     return listed
 
 
-def _wanted(listed: Mapping[str, str], out: Path, tally: PullReport) -> Iterator[str]:
-    """Names without ending of the recordings that are not here; all others are put to the tally."""
+def _new_recordings(listed: Mapping[str, str], out: Path, report: PullReport) -> Iterator[str]:
+    """Names without suffix of the recordings that are not here; all others are added to the report."""
     for name in sorted({file.rpartition(".")[0] for file in listed}):
         if not name.isprintable() or name.startswith("/") or ".." in name.split("/"):
-            tally.refused.append(f"{name!r} (not a name for a file here)")
+            report.refused.append(f"{name!r} (not a name for a file here)")
             continue
-        there = {suffix: listed.get(name + suffix) for suffix in PAIR}
-        here = {suffix: _sha256(out / (name + suffix)) for suffix in PAIR}
-        differ = [suffix for suffix in PAIR if here[suffix] and here[suffix] != there[suffix]]
-        if None in there.values():
-            tally.halves.append(name)
+        theirs = {suffix: listed.get(name + suffix) for suffix in PAIR}
+        ours = {suffix: _sha256(out / (name + suffix)) for suffix in PAIR}
+        differ = [suffix for suffix in PAIR if ours[suffix] and ours[suffix] != theirs[suffix]]
+        if None in theirs.values():
+            report.incomplete.append(name)
         elif ".npy" in differ:
-            tally.others.append(name)
+            report.different.append(name)
         elif differ:
-            tally.relabelled.append(name)
-        elif None in here.values():
+            report.relabelled.append(name)
+        elif None in ours.values():
             yield name
         else:
-            tally.there.append(name)
+            report.present.append(name)
 
 
 def _sha256(path: Path) -> str | None:
-    """Of a file that is here; None where there is none."""
+    """The SHA-256 of a file here; None where there is none."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -168,43 +181,43 @@ def _sha256(path: Path) -> str | None:
 
 
 def _pairs(stream: IO[bytes], names: Sequence[str]) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Each recording of which both files came, in the order of `names`, which go two by two.
+    """Each recording of which both files came, in the order of `names`, which come in pairs.
 
-    Raises FormatError where the archive holds anything but plain files that were asked for: a path out of the folder, a
-    link or a device is none, nor what has more bytes than LARGEST. A stream that breaks off ends here.
+    Raises FormatError where the archive holds anything but plain files that were requested: a path out of the folder, a
+    link, a device or a file of more than MAX_BYTES is refused. A stream that is cut off ends the iteration.
     """
-    asked = set(names)
-    held: dict[str, bytes] = {}
+    requested = set(names)
+    received: dict[str, bytes] = {}
     try:
         with tarfile.open(fileobj=stream, mode="r|") as archive:
             for member in archive:
                 name = member.name
-                if not member.isreg() or name not in asked or member.size > LARGEST:
-                    raise FormatError(f"the box sends {name!r}, which is no file asked for; look at that box")
+                if not member.isreg() or name not in requested or member.size > MAX_BYTES:
+                    raise FormatError(f"the box sends {name!r}, which was not requested; check that box")
                 file = archive.extractfile(member)
                 assert file
-                held[name] = file.read()
-                whole, _, _ = name.rpartition(".")
-                if all(whole + suffix in held for suffix in PAIR):
-                    yield whole, {suffix: held.pop(whole + suffix) for suffix in PAIR}
+                received[name] = file.read()
+                recording, _, _ = name.rpartition(".")
+                if all(recording + suffix in received for suffix in PAIR):
+                    yield recording, {suffix: received.pop(recording + suffix) for suffix in PAIR}
     except (tarfile.TarError, EOFError):
         return
 
 
-def _take(name: str, pair: Mapping[str, bytes], sha256: Mapping[str, str], out: Path, tally: PullReport) -> None:
-    """Keep one recording, if it is what the box listed and can be read as one."""
+def _keep(name: str, pair: Mapping[str, bytes], sha256: Mapping[str, str], out: Path, report: PullReport) -> None:
+    """Store one recording, if it is what the box listed and can be read as a recording."""
     try:
         for suffix, data in pair.items():
             if hashlib.sha256(data).hexdigest() != sha256[suffix]:
                 raise FormatError(f"{name}{suffix} changed while it was fetched; run the same command again")
-        with tempfile.TemporaryDirectory() as aside:
+        with tempfile.TemporaryDirectory() as folder:
             for suffix, data in pair.items():
-                Path(aside, f"sweep{suffix}").write_bytes(data)
-            load(Path(aside, "sweep.npy"))
+                Path(folder, f"sweep{suffix}").write_bytes(data)
+            load(Path(folder, "sweep.npy"))
     except FormatError as e:
-        tally.refused.append(f"{name} ({e})")
+        report.refused.append(f"{name} ({e})")
         return
     target = out / name
     target.parent.mkdir(parents=True, exist_ok=True)
     storage.put_all({target.with_name(target.name + suffix): data for suffix, data in pair.items()})
-    tally.fetched.append(name)
+    report.fetched.append(name)

@@ -1,7 +1,7 @@
-"""The room of files that hold sweep sets. In: an .npz, an HDF5 file, a folder of the box's recordings. Out: a SweepSet.
+"""Reads sweep sets. In: an .npz, an HDF5 file, a folder of the box's recordings. Out: a SweepSet.
 
-What the arrays are named stands in appliance/sim/sets.py, which checks them whatever they were read from. Nothing is
-unpickled, and nothing outside the named file or folder is read.
+appliance.core.sweep_set names the arrays and checks them, wherever they were read from. Nothing is unpickled, and nothing
+outside the named file or folder is read.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from appliance.core.types import load as load_recording
 
 HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
-"""Rate of the TactMat data, which neither the file nor the page it is published on names: that of the same laboratory's
-skin in the paper (sec. II.A). A `rate_hz` in the file goes before it."""
+"""Rate of the TactMat data, which neither the file nor its page states: that of the same laboratory's skin in the paper
+(sec. II.A). A `rate_hz` in the file takes precedence."""
 NAMED = ("position", "session")
-"""What a recording may have a name for, beside its material."""
+"""What a recording may name, beside its material."""
 REFUSED = (Status.NO_CONTACT, Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
-"""What the box says of a window that it does not judge."""
+"""The box's answers to a window that it does not classify."""
 NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
-"""A name that is a whole number; 07 is none, or it would be the same as 7."""
+"""A name that is a whole number; 07 is not one, or it would equal 7."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedSweep:
-    """One sweep as the box recorded it, where, and what else its sidecar says."""
+    """One sweep as the box recorded it. path: of its .npy; about: the contents of its sidecar."""
 
     path: Path
     sweep: Sweep
@@ -50,19 +50,19 @@ class RecordedSweep:
 
     @property
     def why_not(self) -> str:
-        """Why it is not trained on, in a word; "" where it is: not a whole window, or a skin that the box refused.
+        """Why it is not trained on, in one word: not a whole window, or a skin that the box refused; "" where it is.
 
-        A material that the box did not know, or was not sure of, is what it was recorded for.
+        A material that the box did not know, or was uncertain about, is trained on: it was recorded for that.
         """
         verdict = self.about.get("verdict")
-        said = verdict.get("status") if isinstance(verdict, dict) else ""
+        answer = verdict.get("status") if isinstance(verdict, dict) else ""
         if self.sweep.status is not Status.OK:
             return str(self.sweep.status)
-        return str(said) if said in REFUSED else "early" if self.sweep.share < 1 else ""
+        return str(answer) if answer in REFUSED else "early" if self.sweep.share < 1 else ""
 
 
 def read(path: Path, kind: type[Set]) -> Set:
-    """The set at `path`, by what is there. Raises FormatError naming what is missing or of the wrong form, and where."""
+    """The set at `path`, in whatever format. Raises FormatError naming what is missing or of the wrong form, and where."""
     if not path.exists():
         raise FormatError(
             f"{path.name}: not a sweep set: there is no such file; name an .npz, an HDF5 file or a folder of recordings"
@@ -77,23 +77,24 @@ def hdf5(path: Path, kind: type[Set]) -> Set:
     try:
         with h5py.File(path, "r") as file:
             names = [k for k in file if k in ("samples", "labels", "materials", "rate_hz") or k.startswith("group_")]
-            held = {name: _array(file, name) for name in names}
+            arrays = {name: _array(file, name) for name in names}
             if "rate_hz" in file.attrs:
-                held.setdefault("rate_hz", np.asarray(file.attrs["rate_hz"]))
+                arrays.setdefault("rate_hz", np.asarray(file.attrs["rate_hz"]))
     except (OSError, KeyError, RuntimeError, ValueError, TypeError) as e:
         raise FormatError(f"{path.name}: not a sweep set (HDF5 with samples, materials …) that can be read: {e}") from e
     except FormatError as e:
         raise FormatError(f"{path.name}: {e}") from e
     source = path.name
-    if "samples" in held and held["samples"].ndim == 5 and "labels" not in held:
-        if "rate_hz" not in held:
-            held["rate_hz"], source = np.array(TACTMAT_HZ), f"{path.name} (names no rate, taken for {TACTMAT_HZ:g} Hz)"
-        held = _tactmat(held, source)
-    return build(held, source, kind)
+    if "samples" in arrays and arrays["samples"].ndim == 5 and "labels" not in arrays:
+        if "rate_hz" not in arrays:
+            arrays["rate_hz"] = np.array(TACTMAT_HZ)
+            source = f"{path.name} (names no rate, taken for {TACTMAT_HZ:g} Hz)"
+        arrays = _tactmat(arrays, source)
+    return build(arrays, source, kind)
 
 
 def _array(file: h5py.File, name: str) -> Array:
-    """One array as it stands in the file itself: what a link or a virtual array shows may not be there, or be zeros."""
+    """One array that the file itself holds: what a link or a virtual array refers to may be missing, or read as zeros."""
     link = file.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
         raise FormatError(f"{name} is a link to {getattr(link, 'path', None)!r}; put the data itself into the file")
@@ -102,35 +103,35 @@ def _array(file: h5py.File, name: str) -> Array:
         raise FormatError(f"{name} is no array but {data!r}; give one")
     if data.is_virtual or data.external:
         raise FormatError(f"{name} lies in other files; put the data itself into the file")
-    if not _written(data):
+    if not _complete(data):
         raise FormatError(f"{name} {list(data.shape)} was not written to its end; record or copy it again")
     if h5py.check_string_dtype(data.dtype):
         return np.array(data.asstr("utf-8")[()], dtype=str)
     return np.asarray(data[()])
 
 
-def _written(data: h5py.Dataset) -> bool:
-    """Whether each of its chunks is there: HDF5 reads zeros where none is, as a recording that broke off leaves them."""
+def _complete(data: h5py.Dataset) -> bool:
+    """Whether all of its chunks are present: HDF5 reads zeros for missing ones, which an interrupted recording leaves."""
     if not data.chunks:
-        return not data.size or data.id.get_storage_size() > 0
-    wanted = math.prod(-(-n // size) for n, size in zip(data.shape, data.chunks, strict=True))
-    return data.id.get_num_chunks() == wanted
+        return not data.size or bool(data.id.get_storage_size() > 0)
+    chunks = math.prod(-(-n // size) for n, size in zip(data.shape, data.chunks, strict=True))
+    return bool(data.id.get_num_chunks() == chunks)
 
 
-def _tactmat(held: dict[str, Array], source: str) -> dict[str, Array]:
+def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
     """TactMat (Tulbure and Baeuml, Humanoids 2018): samples [materials, repetitions, T, R, C], names -> a set's arrays.
 
-    Its digits are 0 to 255 (paper, sec. II.B) whatever type they are kept in. Raises FormatError.
+    Its raw counts are 0 to 255 (paper, sec. II.B) whatever type they are stored in. Raises FormatError.
     """
-    x, materials = held["samples"], held.get("materials", np.empty(0, str))
+    x, materials = arrays["samples"], arrays.get("materials", np.empty(0, str))
     if len(materials) != len(x):
         raise FormatError(f"{source}: samples {list(x.shape)} are of {len(x)} materials, {len(materials)} are named")
     if x.dtype.kind in "iuf":
         with np.errstate(invalid="ignore"):
-            digits = x.astype(np.uint8)
-        x = digits if np.array_equal(digits, x) else x
+            counts = x.astype(np.uint8)
+        x = counts if np.array_equal(counts, x) else x
     label, repetition = np.indices(x.shape[:2]).reshape(2, -1)
-    return held | {"samples": x.reshape(-1, *x.shape[2:]), "labels": label, "group_repetition": repetition}
+    return arrays | {"samples": x.reshape(-1, *x.shape[2:]), "labels": label, "group_repetition": repetition}
 
 
 def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
@@ -148,26 +149,26 @@ def recorded(folder: Path) -> list[RecordedSweep]:
     return [RecordedSweep.load(path) for path in sorted(folder.rglob("*.npy"))]
 
 
-def ok(held: Sequence[RecordedSweep]) -> list[RecordedSweep]:
+def ok(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
     """Those that are trained on."""
-    return [one for one in held if not one.why_not]
+    return [one for one in recorded if not one.why_not]
 
 
 def recordings(folder: Path, kind: type[Set]) -> Set:
     """The set of all sweeps that the box recorded in `folder` and below; each is a recording.
 
-    Its label is its material; groups are position and session, by their numbers where each has one for its name, else
-    numbered in the order of their names; and the object where NEW OBJECT was ever signalled. Sweeps that are not
-    trained on are counted in `source`. Raises FormatError naming the file that is broken, lacks a name or is of
+    Its label is its material. Groups are position and session, with the numbers that they have as names where all have
+    one, else numbered in the order of their names; and the object where NEW OBJECT was ever signalled. Sweeps that are
+    not trained on are counted in `source`. Raises FormatError naming the file that is broken, lacks a name or is of
     another format.
     """
     return joined(recorded(folder), folder, kind)
 
 
-def joined(held: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
+def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
     """What `recordings` gives, of sweeps that were read already."""
-    kept = ok(held)
-    left = Counter(one.why_not for one in held if one.why_not)
+    kept = ok(recorded)
+    left = Counter(one.why_not for one in recorded if one.why_not)
     source = f"{folder} (left out: {counted(left)})" if left else str(folder)
     if not kept:
         raise FormatError(f"{source}: not a sweep set: no recorded sweep is ok; record some with `palpate record`")
@@ -182,24 +183,24 @@ def joined(held: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
                     f"{kept[texts.index('')].path}: has no {name} though others have; name it in its .json"
                 )
             groups[f"group_{name}"] = numbered(texts)
-    if any(one.sweep.object for one in kept):  # counted anew in each run
-        groups["group_object"] = _places(
+    if any(one.sweep.object for one in kept):  # each run counts from 1 again
+        groups["group_object"] = _ranks(
             [(str(one.path.parent), str(one.about.get("run", "")), one.sweep.object) for one in kept]
         )
     materials = [one.sweep.material for one in kept]
     samples = np.stack([one.sweep.frames.taxels for one in kept])
     rate = np.array(kept[0].format.rate_hz)
-    about = {"labels": _places(materials), "materials": np.unique(materials), "rate_hz": rate}
+    about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
     return build({"samples": samples} | about | groups, source, kind)
 
 
-def counted(those: Counter[str]) -> str:
-    """How many of what, in a line."""
-    return ", ".join(f"{n} {what}" for what, n in sorted(those.items()))
+def counted(reasons: Counter[str]) -> str:
+    """How many sweeps for each reason, in a line."""
+    return ", ".join(f"{n} {reason}" for reason, n in sorted(reasons.items()))
 
 
 def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
-    """Raises FormatError where it is not what the first one is, or nobody said what was touched."""
+    """Raises FormatError where its format differs from `wanted`, or no material is named."""
     path, n = one.path, len(one.sweep.frames)
     if one.format != wanted or n != wanted.window:
         raise FormatError(f"{path}: {n} frames of {one.format}; others have {wanted}: give each its folder")
@@ -208,11 +209,11 @@ def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
 
 
 def numbered(names: Sequence[str]) -> Array:
-    """A number for each name: the one that it is, where all are whole numbers, else its place among the different ones."""
-    return np.array([int(name) for name in names]) if all(map(NUMBER.fullmatch, names)) else _places(names)
+    """A number for each name: its value, where all are whole numbers, else its rank among the different names."""
+    return np.array([int(name) for name in names]) if all(map(NUMBER.fullmatch, names)) else _ranks(names)
 
 
-def _places(values: Sequence[Any]) -> Array:
-    """Each value as its place among the different ones, in their order."""
-    place = {value: i for i, value in enumerate(sorted(set(values)))}
-    return np.array([place[value] for value in values])
+def _ranks(values: Sequence[Any]) -> Array:
+    """The rank of each value among the different ones."""
+    rank = {value: i for i, value in enumerate(sorted(set(values)))}
+    return np.array([rank[value] for value in values])

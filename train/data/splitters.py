@@ -1,7 +1,7 @@
-"""The room of protocols: who is trained on and who is tested on. In: a text such as "leave:position". Out: a splitter.
+"""Evaluation protocols: which sweeps train and which test. In: a text such as "leave:position". Out: a splitter.
 
-Each is a scikit-learn splitter over the sweeps' numbers: split(X, y, groups) -> pairs (training, test). `groups` are
-recordings there, and no splitter ever has pieces of one recording on both sides.
+Each is a scikit-learn splitter over the sweeps' numbers: split(X, y, groups) -> pairs (training, test), with recordings
+as `groups`. No splitter ever has parts of one recording on both sides.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SPLIT = re.compile(r"split:(\w+)=(-?\d+(?:,-?\d+)*)->(-?\d+(?:,-?\d+)*)")
 
 
 class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn ships no types
-    """Whole recordings drawn into `folds` parts, materials spread evenly: the paper's overestimate."""
+    """Whole recordings divided into `folds` parts at random, materials in equal shares: the paper's overestimate."""
 
     def __init__(self, folds: int, seed: int) -> None:
         self.folds, self.seed = folds, seed
@@ -51,7 +51,7 @@ class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn shi
 
 
 class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
-    """Tested on one value of the group `name` at a time, trained on all others: leave-one-position-out and its kind."""
+    """Tested on one value of the group `name` at a time, trained on all others, as in leave-one-position-out."""
 
     def __init__(self, name: str, group: Array) -> None:
         self.name, self.group = name, group
@@ -84,10 +84,10 @@ class TrainTest(BaseCrossValidator):  # type: ignore[misc]
 
     def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
         """The pair (training, test) of sweep numbers. Raises FormatError where a value is on both sides or unknown."""
-        there = np.unique(self.group)
+        present = np.unique(self.group)
         for value in (*self.train, *self.test):
-            if value not in there:
-                raise FormatError(f"group {self.name!r} has no {value}; it has {', '.join(map(str, there[:20]))}")
+            if value not in present:
+                raise FormatError(f"group {self.name!r} has no {value}; it has {', '.join(map(str, present[:20]))}")
         if both := set(self.train) & set(self.test):
             raise FormatError(f"{self.name}={min(both)} is on both sides of the split; name it once")
         yield _checked(f"split:{self.name}", np.isin(self.group, self.train), np.isin(self.group, self.test), y, groups)
@@ -95,7 +95,7 @@ class TrainTest(BaseCrossValidator):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class Protocol:
-    """A protocol by its text. Raises FormatError where the text is none of FORMS."""
+    """A protocol by its text. Raises FormatError where the text has none of the FORMS."""
 
     text: str
 
@@ -111,7 +111,9 @@ class Protocol:
             return RandomFolds(int(found[1]), seed)
         if found := LEAVE.fullmatch(self.text):
             return LeaveOneGroupOut(found[1], sweeps.group(found[1]))
-        name, train, test = SPLIT.fullmatch(self.text).groups()  # type: ignore[union-attr]
+        found = SPLIT.fullmatch(self.text)
+        assert found
+        name, train, test = found.groups()
         return TrainTest(name, sweeps.group(name), *([int(v) for v in part.split(",")] for part in (train, test)))
 
     def folds(self, sweeps: Dataset, seed: int) -> list[Fold]:
@@ -121,7 +123,7 @@ class Protocol:
 
     def clusters(self, sweeps: Dataset) -> Array | None:
         """Which sweeps [N] succeed or fail together, for the interval: the left-out groups, else recordings of several
-        windows; None where each sweep stands alone."""
+        windows; None where sweeps are independent."""
         if found := LEAVE.fullmatch(self.text):
             return sweeps.group(found[1])
         recording = sweeps.group("recording")
@@ -129,7 +131,7 @@ class Protocol:
 
 
 def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Array) -> Fold:
-    """The masks as numbers, after a look at what would make the fold dishonest or empty."""
+    """The masks as numbers. Raises FormatError where the sides share a recording or there is too little to train on."""
     if shared := set(recordings[train].tolist()) & set(recordings[test].tolist()):
         raise FormatError(
             f"{what}: {len(shared)} recordings, {min(shared)} among them, would be trained on and tested on; "

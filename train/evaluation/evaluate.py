@@ -18,7 +18,7 @@ from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol
 from train.evaluation import parallel
 from train.evaluation.fold import Fold, FoldTask, key, run
-from train.metrics.score import Score, fused, interval, provenance
+from train.metrics.score import Score, fuse, interval, provenance
 from train.models import methods as known_methods
 from train.models.methods import FULL_EFFORT, Effort
 from train.onnx_tools import parity
@@ -82,15 +82,15 @@ class Result:
         right = logits.argmax(1) == labels
         counts: dict[str, Any] = {"window": Score.of(right).json(), "interval": interval(right, clusters)}
         if "recording" in self.sweeps.groups:
-            whole, first = fused(logits, recording)
+            whole, first = fuse(logits, recording)
             right = whole.argmax(1) == labels[first]
             counts["recording"] = Score.of(right).json()
             counts["recording_interval"] = interval(right, None if clusters is None else clusters[first])
         return counts
 
     def _form(self, name: str) -> dict[str, Any]:
-        """The same models in another precision: counts, how far the answers are apart (parity.Apart), and the accuracy that
-        int8 loses against float, whichever of the two this form is (parity.Lost)."""
+        """The same models in another precision: counts, how far the answers are apart (parity.AnswerDifference), and the accuracy that
+        int8 loses against float, whichever of the two this form is (parity.AccuracyLoss)."""
         logits = np.concatenate([fold.forms[name] for fold in self.folds])
         precise, int8 = (logits, self.logits) if name == "float" else (self.logits, logits)
         labels, clusters = self.sweeps.labels[self.test], Protocol(self.protocol).clusters(self.sweeps)

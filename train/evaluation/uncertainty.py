@@ -220,14 +220,14 @@ def _of_trunk(case: Case, done: Posthoc) -> Array:
     """Squared distance in the trained features alone; the same for all sweeps where there are none."""
     if not (size := case.seen.shape[2] - case.fixed):
         return np.zeros(len(case.new))
-    return embed(case.seen[:, -1, :size], case.seen_labels, size).strangeness(case.new[:, -1, :size])
+    return embed(case.seen[:, -1, :size], case.seen_labels, size).novelty(case.new[:, -1, :size])
 
 
 SCORES: dict[str, Callable[[Case, Posthoc], Array]] = {
-    "distance": lambda case, done: done.embedding.strangeness(case.new[:, -1]) / done.limit,
+    "distance": lambda case, done: done.embedding.novelty(case.new[:, -1]) / done.limit,
     "distance, trained features only": _of_trunk,
     "distance, where trained materials differ": lambda case, done: embed(
-        case.seen[:, -1], case.seen_labels).strangeness(case.new[:, -1]),
+        case.seen[:, -1], case.seen_labels).novelty(case.new[:, -1]),
     "highest probability": lambda case, done: -softmax(done.logits(case.new[:, -1])).max(1),
 }  # fmt: skip
 """Each is larger for a sweep that is less like the training sweeps. Limits of several folds differ: the first score is in

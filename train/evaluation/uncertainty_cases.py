@@ -103,7 +103,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     if task.left_out != NONE_LEFT_OUT:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
-    made: Fit = method.train(part, part.samples, task.seed).made  # type: ignore[attr-defined]
+    made: Fit = method.train(part, part.samples, task.seed).fit  # type: ignore[attr-defined]
     seen, seen_labels, seen_groups, judged, fixed, copies = posthoc_inputs(made)
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(

@@ -169,7 +169,7 @@ def _torch(path: Path) -> Call:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript, which needs none of our code to be read
-        network = torch.jit.load(path)  # type: ignore[no-untyped-call]
+        network = torch.jit.load(path)
 
     def answer(counts: Array) -> Any:
         with torch.inference_mode():

@@ -97,7 +97,7 @@ def _save_torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
     """The network as TorchScript, which needs none of our code to be read."""
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", DeprecationWarning)
-        traced: Any = torch.jit.trace(model.network.eval(), torch.from_numpy(train.samples[:1]))  # type: ignore[no-untyped-call]
+        traced: Any = torch.jit.trace(model.network.eval(), torch.from_numpy(train.samples[:1]))
         traced.save(folder / measure.TORCH)
 
 

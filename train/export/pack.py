@@ -29,7 +29,7 @@ from appliance.inference.classifier import Classifier, softmax
 from train.calibration.posthoc import calibrate
 from train.data.sets import Dataset
 from train.export.contact_positions import place_of
-from train.metrics.score import figure
+from train.metrics.score import accuracy_figure
 from train.models.compact.fit import Fit
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
@@ -227,11 +227,11 @@ def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> Ar
 def figures(classifier: Classifier, sweeps: Dataset, protocol: str) -> dict[str, Any]:
     """Accuracy by sweep, and by recording where one holds several; a refused or unknown sweep counts as wrong."""
     right = score(classifier, sweeps) == sweeps.labels
-    result = {protocol: figure(int(right.sum()), len(sweeps))}
+    result = {protocol: accuracy_figure(int(right.sum()), len(sweeps))}
     first = np.unique(sweeps.group("recording"), return_index=True)[1]
     if len(first) < len(sweeps):
         right = (score(classifier, sweeps, fused=True) == sweeps.labels)[first]
-        result[f"{protocol}, by recording"] = figure(int(right.sum()), len(first))
+        result[f"{protocol}, by recording"] = accuracy_figure(int(right.sum()), len(first))
     return result
 
 

@@ -22,11 +22,10 @@ from appliance.sim import skin
 from train.data.sets import Dataset
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
-from train.models import networks
 from train.models.compact.fit import Fit
 from train.models.compact.network import Compact
 from train.models.methods import model_inputs
-from train.models.neural_methods import PAPER_INT8
+from train.models.paper_cnn import INT8_NODES, random_paper_cnn
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import with_head
 from train.onnx_tools.parity import Parity
@@ -36,7 +35,7 @@ Array = NDArray[Any]
 MOST_TORCH_DIFFERENCE = 0.01
 """Of a logit, between PyTorch and the float graph: they add the same numbers in another order."""
 MOST_LOST = 0.005
-"""Loss of accuracy on held-out sweeps, float less int8: as expected from float's probabilities (Apart.expected_loss),
+"""Loss of accuracy on held-out sweeps, float less int8: as expected from float's probabilities (AnswerDifference.expected_loss),
 whatever the number of sweeps; and as counted, where that is significant. Counting alone is not enough: two uncertain
 sweeps of a hundred that change their label are two points lost or won."""
 CHANCE = 0.05
@@ -162,7 +161,7 @@ def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
         torch.manual_seed(seed)
         small = Compact(form, classes, 0.1, norm=False).eval().graph()
     counts = rng.integers(0, 256, (4, form.window, form.rows, form.cols), np.uint8)
-    paper = quantize(networks.paper_cnn(form, classes, rng), counts, PAPER_INT8)
+    paper = quantize(random_paper_cnn(form, classes, rng), counts, INT8_NODES)
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "fp32.onnx", folder / "paper_int8.onnx"
     for path, model in zip(paths, (small, paper), strict=True):

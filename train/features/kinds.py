@@ -1,5 +1,7 @@
-"""All feature sets by name: those the box computes, and those of prior work, for the desktop alone. In: raw counts of
-one sweep's window, frame rate. Out: float32 features. A bundle may name only a feature set of appliance.signal.features.
+"""All feature sets by name. In: raw counts of one sweep's window, frame rate. Out: float32 features.
+
+They are those that the box computes and those of prior work, for the desktop alone. A bundle may name only a feature set
+of appliance.signal.features.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ from train.features import prior_work
 
 Array = NDArray[np.float64]
 KINDS: Mapping[str, Callable[[NDArray[Any], float], Array]] = MappingProxyType(
-    features.KINDS
-    | {
+    {
+        **features.KINDS,
         "static": prior_work.static,
         "spectrogram": prior_work.spectrogram,
         "correlation": prior_work.correlation,
@@ -31,5 +33,5 @@ def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float
 
 
 def graph_input(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
-    """What a graph with the input `kind` is given of raw counts [T, R, C]: them where it is "raw", else `compute`."""
+    """The input `kind` of a graph for raw counts [T, R, C]: the counts themselves where it is "raw", else `compute`."""
     return features.given(kind, taxels, rate_hz, KINDS)

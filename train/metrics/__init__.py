@@ -1,1 +1,1 @@
-"""Right answers of how many, and how sure that is."""
+"""Accuracy with its interval."""

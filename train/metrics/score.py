@@ -1,4 +1,4 @@
-"""The room of counting: right answers of how many, and how sure that is. In: right or wrong, logits. Out: figures."""
+"""Scores: right answers of how many, with a 95 % interval. In: right or wrong, logits. Out: figures for results."""
 
 from __future__ import annotations
 
@@ -41,42 +41,46 @@ def interval(right: Array, clusters: Array | None = None) -> tuple[float, float]
     """The 95 % interval of the share of `right` [n] (booleans, or shares over seeds).
 
     Without clusters it is Wilson's. Where sweeps succeed or fail together, as those of one position do (clusters [n]),
-    it is the bootstrap's over clusters (percentiles of 2,000 draws), or Wilson's where that is wider: a bootstrap of
-    few clusters, or where all is right, is too sure.
+    it is that of the cluster bootstrap (percentiles of 2,000 draws), or Wilson's where that is wider: a bootstrap of few
+    clusters, or where all answers are right, is too narrow.
     """
-    low, high = widened(wilson(float(right.sum()), len(right)), right, clusters)
+    low, high = widen(wilson(float(right.sum()), len(right)), right, clusters)
     return round(float(max(low, 0.0)), 4), round(float(min(high, 1.0)), 4)
 
 
-def widened(sure: tuple[float, float], values: Array, clusters: Array | None) -> tuple[float, float]:
-    """An interval of the mean of `values` [n], made as wide as the bootstrap's over `clusters` [n] where that is wider:
-    2.5 and 97.5 % of DRAWS draws."""
+def widen(bounds: tuple[float, float], values: Array, clusters: Array | None) -> tuple[float, float]:
+    """The interval `bounds` of the mean of `values` [n], extended to that of the bootstrap over `clusters` [n].
+
+    The bootstrap's is from 2.5 to 97.5 % of DRAWS draws; without clusters `bounds` stay as they are.
+    """
     if clusters is None:
-        return sure
+        return bounds
     member = np.unique(clusters, return_inverse=True)[1]
     sums, size = np.bincount(member, values), np.bincount(member)
     drawn = np.random.default_rng(0).integers(len(size), size=(DRAWS, len(size)))
     means = sums[drawn].sum(1) / size[drawn].sum(1)
-    return min(sure[0], float(np.quantile(means, 0.025))), max(sure[1], float(np.quantile(means, 0.975)))
+    return min(bounds[0], float(np.quantile(means, 0.025))), max(bounds[1], float(np.quantile(means, 0.975)))
 
 
-def fused(logits: Array, together: Array) -> tuple[Array, Array]:
-    """One log score [G, K] for each value of `together` [n], the product of its probabilities, and the number [G] of
-    the first sweep of each."""
+def fuse(logits: Array, together: Array) -> tuple[Array, Array]:
+    """Fuse the sweeps with the same value of `together` [n]: log scores [G, K], each the logarithm of the product of the
+    probabilities of `logits` [n, K], and the number [G] of the first sweep of each."""
     _, first, member = np.unique(together, return_index=True, return_inverse=True)
     scores = np.zeros((len(first), logits.shape[1]))
     np.add.at(scores, member, np.log(np.maximum(softmax(logits), LEAST_PROBABILITY)))
     return scores, first
 
 
-def figure(right: int, n: int) -> dict[str, Any]:
-    """An accuracy with n and its 95 % Wilson interval."""
+def accuracy_figure(right: int, n: int) -> dict[str, Any]:
+    """The accuracy of `right` of `n` with its 95 % Wilson interval, as a manifest holds it."""
     low, high = wilson(right, n)
     return {"accuracy": round(right / n, 4), "n": n, "low": round(low, 4), "high": round(high, 4)}
 
 
 @cache
 def provenance() -> dict[str, str]:
-    """What a result file says of its origin, beside its sets and seeds; the commit as it was when first asked for, since
-    a long run may see others."""
+    """The origin that a result file records beside its sets and seeds.
+
+    The commit is that of the first call: others may follow during a long run.
+    """
     return {"commit": commit(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}

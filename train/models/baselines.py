@@ -1,8 +1,8 @@
-"""The room of the paper's classical classifiers. In: features of training sweeps. Out: Models that the box runs.
+"""The paper's classical classifiers. In: features of training sweeps. Out: Models that the box runs.
 
-Every method on features is the same few steps, which `learn` takes: fit a scikit-learn estimator, write it as an ONNX
-graph, find one temperature on groups that were held out. A model answers by running its graph as the box does, so that
-what is scored here is what is exported.
+`learn` trains every method on features: it fits a scikit-learn estimator, writes it as an ONNX graph and finds one
+temperature on groups that were held out. A model answers by running its graph as the box does, so that what is scored
+here is what is exported.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from typing import Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 import onnx
@@ -33,40 +33,54 @@ from appliance.core.errors import FormatError
 from appliance.inference.classifier import LEAST_PROBABILITY
 from appliance.inference.session import session
 from train.data.sets import Dataset
-from train.models.linear_head import temperature
+from train.models.linear_head import fit_temperature
 from train.models.methods import Method
 from train.onnx_tools.graph_builder import IR, OPSET, GraphBuilder
 
 Array = NDArray[Any]
 NEIGHBOURS = 4
 """The paper's k; also the fewest sweeps that a feature method is trained on."""
-DOUBT = 0.1
+SMOOTHING = 0.1
 """Added to the neighbours' votes before their logarithm: a class without a vote is unlikely, not impossible."""
 FOLDS = 5
-"""At most so many parts of the training set are held out, one after another, to find the temperature."""
-SHARPER = 10
-"""Votes are more modest than they need be, and heads.temperature only cools: it gets logits so many times as large."""
+"""Parts of the training set, at most, that are held out one after another to find the temperature."""
+SHARPENING = 10
+"""Factor on logits before fit_temperature, which only softens: votes are less certain than they might be."""
 ABSENT = math.log(LEAST_PROBABILITY)
-"""Log probability of a material without a sweep in training; the box's floor when it fuses."""
+"""Log probability of a material without a sweep in training: the box's lower limit when it fuses sweeps."""
 LIMIT = 1e9
-"""Features are cut off here, so that no broken reading overflows float32; no sound one comes near."""
+"""Features are clipped here, so that no broken reading overflows float32; no valid one comes near."""
 OPSETS = {"": OPSET, "ai.onnx.ml": 3, "com.microsoft": 1}
 """Operators that the box's onnxruntime has."""
 
 
-class Gauss(ClassifierMixin, BaseEstimator):
-    """One normal distribution a class (Bishop 2006, sec. 4.2); all classes are equally likely beforehand.
+class Estimator(Protocol):
+    """An estimator in the form of scikit-learn, as far as it is used here."""
+
+    classes_: Array
+
+    def fit(self, x: Array, y: Array) -> Self:
+        """x: float64 [n, F], y: labels [n]."""
+        ...
+
+    def predict(self, x: Array) -> Array:
+        """Labels [n] of features [n, F]."""
+        ...
+
+
+class Gauss(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
+    """One normal distribution for each class (Bishop 2006, sec. 4.2), with equal priors.
 
     A class's covariance is that of its sweeps and of one sweep more, which varies as the whole set does, each feature
-    by itself: that ridge of 1 / (n + 1) keeps few sweeps and collinear features from a singular matrix.
-    independent: no covariance between features. first: look at the first so many features only; 0 for all.
+    by itself: this ridge of 1 / (n + 1) keeps the matrix regular where sweeps are few or features collinear.
+    independent: no covariance between features. first: use only the first so many features; 0 for all.
     """
 
     def __init__(self, independent: bool = False, first: int = 0) -> None:
         self.independent, self.first = independent, first
 
-    def fit(self, x: Array, y: Array) -> Gauss:
-        """x: float64 [n, F], y: labels [n]. Keeps means [K, F], and what makes each class's sweeps white [K, F, F']."""
+    def fit(self, x: Array, y: Array) -> Self:
+        """x: float64 [n, F], y: labels [n]. Keeps means [K, F] and each class's whitening matrix [K, F, F']."""
         self.classes_ = np.unique(y)
         used = slice(0, self.first or x.shape[1])
         spread = x[:, used].var(axis=0)
@@ -85,32 +99,30 @@ class Gauss(ClassifierMixin, BaseEstimator):
         return self
 
     def decision_function(self, x: Array) -> Array:
-        """Log likelihoods [n, K] of features [n, F], less what all classes share."""
+        """Log likelihoods [n, K] of features [n, F], up to a term that all classes share."""
         white = (x[:, None, None] - self.means_[:, None]) @ self.whites_
         scores: Array = self.constants_ - 0.5 * (white**2).sum(axis=(2, 3))
         return scores
 
     def predict(self, x: Array) -> Array:
         """Labels [n] of features [n, F]."""
-        return self.classes_[self.decision_function(x).argmax(axis=1)]
+        labels: Array = self.classes_[self.decision_function(x).argmax(axis=1)]
+        return labels
 
     def nodes(self, g: GraphBuilder, features: str) -> str:
-        """`decision_function` in ONNX, which skl2onnx cannot know; the name of its output [1, K]."""
+        """`decision_function` in ONNX, which skl2onnx does not know; the name of its output [1, K]."""
         white = g("MatMul", g("Sub", features, g.constant(self.means_[:, None])), g.constant(self.whites_))
         squares = g("ReduceSum", g("Mul", white, white), g.constant([1, 2], "int64"), keepdims=0)
         half = g("Mul", squares, g.constant(-0.5))
         return g("Add", half, g.constant(self.constants_[None]))
 
 
-Estimator = Gauss | KNeighborsClassifier | Pipeline
-
-
 def svm(**options: Any) -> Pipeline:
     """A one-against-one SVM with C = 1, gamma = 1 / N (if RBF) on standardised features.
 
-    The paper does not say that features were standardised. But gamma = 1 / N is made for features of unit variance: of
-    H-features as they are, small fractions, the RBF kernel is nearly flat.
-    break_ties: where several classes have equally many votes the larger confidence wins, as in the graph.
+    The paper does not say that features were standardised. But gamma = 1 / N suits features of unit variance: on raw
+    H-features, which are small fractions, the RBF kernel is nearly flat. break_ties: where several classes have equally
+    many votes the larger confidence wins, as in the graph.
     """
     return make_pipeline(StandardScaler(), SVC(gamma="auto", break_ties=True, **options))
 
@@ -130,42 +142,42 @@ class FeatureModel:
         """What the box runs."""
         return self.model
 
-    def logits(self, given: Array) -> Array:
+    def logits(self, inputs: Array) -> Array:
         """Features float32 [n, F] -> log probabilities float32 [n, K], from the graph, one by one as on the box."""
         run = session(self.model.SerializeToString())
         classes = self.model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
-        rows = [run.run(None, {"features": row[None]})[0][0] for row in given.astype(np.float32, copy=False)]
+        rows = [run.run(None, {"features": row[None]})[0][0] for row in inputs.astype(np.float32, copy=False)]
         return np.array(rows, np.float32).reshape(-1, classes)
 
 
-def learn(make: Callable[[], Estimator], sweeps: Dataset, given: Array, seed: int) -> FeatureModel:
-    """Train what `make` makes on features `given` float32 [N, F] of `sweeps`; nothing in it is random.
+def learn(make: Callable[[], Estimator], sweeps: Dataset, inputs: Array, seed: int) -> FeatureModel:
+    """Train what `make` makes on `inputs`, features float32 [N, F] of `sweeps`. Nothing is random: `seed` is unused.
 
-    The temperature is that of the sweeps held out in turn: by position, or by recording where there are not several or
-    each position has its own materials; 1 where nothing can be held out.
+    The temperature is that of the sweeps held out in turn: by position, or by recording where there is only one position
+    or each position has its own materials; 1 where nothing can be held out.
     Raises FormatError where there are too few sweeps or only one material.
     """
     if len(sweeps.require_materials()) < NEIGHBOURS:
         raise FormatError(f"{sweeps.source}: {len(sweeps)} sweeps are too few to learn from; give {NEIGHBOURS} or more")
-    seen, labels, classes = given.astype(np.float64), sweeps.labels, len(sweeps.materials)
-    logits, truth = [np.empty((0, classes))], [labels[:0]]
+    features, labels, classes = inputs.astype(np.float64), sweeps.labels, len(sweeps.materials)
+    held_out, held_out_labels = [np.empty((0, classes))], [labels[:0]]
     for train, test in _folds(sweeps):
-        estimator = make().fit(seen[train], labels[train])
-        logits.append(FeatureModel(written(estimator, classes)).logits(given[test]))
-        truth.append(labels[test])
-    held, said = np.concatenate(logits), np.concatenate(truth)
-    cooler = temperature(SHARPER * held, said) / SHARPER if len(held) else 1.0
-    return FeatureModel(written(make().fit(seen, labels), classes, cooler))
+        estimator = make().fit(features[train], labels[train])
+        held_out.append(FeatureModel(to_onnx(estimator, classes)).logits(inputs[test]))
+        held_out_labels.append(labels[test])
+    logits, truth = np.concatenate(held_out), np.concatenate(held_out_labels)
+    temperature = fit_temperature(SHARPENING * logits, truth) / SHARPENING if len(logits) else 1.0
+    return FeatureModel(to_onnx(make().fit(features, labels), classes, temperature))
 
 
 def _folds(sweeps: Dataset) -> Iterator[tuple[Array, Array]]:
-    """(training, held-out) numbers of sweeps; held out are only sweeps whose material is in training."""
+    """(training, held-out) numbers of sweeps; only sweeps whose material is in training are held out."""
     names = ("position", "recording") if "position" in sweeps.groups else ("recording",)
     for group in map(sweeps.group, names):
         folds = []
         n = min(FOLDS, len(np.unique(group)), np.bincount(sweeps.labels).max())
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a material with fewer sweeps than folds is in some of them
+            warnings.simplefilter("ignore", UserWarning)  # of a material with fewer sweeps than folds
             splits = StratifiedGroupKFold(n).split(group, sweeps.labels, group) if n > 1 else ()
             for train, test in splits:
                 test = test[np.isin(sweeps.labels[test], sweeps.labels[train])]
@@ -176,63 +188,65 @@ def _folds(sweeps: Dataset) -> Iterator[tuple[Array, Array]]:
             return
 
 
-def written(estimator: Estimator, classes: int, cooler: float = 1.0) -> onnx.ModelProto:
+def to_onnx(estimator: Estimator, classes: int, temperature: float = 1.0) -> onnx.ModelProto:
     """A fitted estimator in ONNX: `features` float32 [1, F] -> `logits`, log probabilities float32 [1, classes].
 
-    cooler: the temperature, which divides the estimator's scores: log likelihoods of Gauss, log votes of kNN, votes and
-    bounded confidences of the SVM. A class that the estimator never saw has ABSENT.
+    temperature: divides the estimator's scores: log likelihoods of Gauss, log votes of kNN, votes and bounded confidences
+    of the SVM. A class that the estimator never saw gets ABSENT.
     """
-    g, size = GraphBuilder(), getattr(estimator, "n_features_in_", 0) or estimator.means_.shape[1]
-    sound = g("Clip", "features", g.constant(-LIMIT), g.constant(LIMIT), output="sound")
-    scores = estimator.nodes(g, sound) if isinstance(estimator, Gauss) else _converted(g, estimator, sound, size)
-    log_p = g("LogSoftmax", g("Mul", scores, g.constant(1 / cooler)))
-    place = np.full(classes, len(estimator.classes_))
-    place[estimator.classes_] = np.arange(len(estimator.classes_))
-    every = g("Concat", log_p, g.constant([[ABSENT]]), axis=1)
-    g("Gather", every, g.constant(place, "int64"), axis=1, output="logits")
-    given = helper.make_tensor_value_info("features", TensorProto.FLOAT, [1, size])
-    gives = helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, classes])
-    graph = helper.make_graph(g.nodes, "palpate", [given], [gives], g.constants)
+    g = GraphBuilder()
+    size = estimator.means_.shape[1] if isinstance(estimator, Gauss) else int(getattr(estimator, "n_features_in_", 0))
+    clipped = g("Clip", "features", g.constant(-LIMIT), g.constant(LIMIT), output="sound")
+    scores = estimator.nodes(g, clipped) if isinstance(estimator, Gauss) else _converted(g, estimator, clipped, size)
+    log_p = g("LogSoftmax", g("Mul", scores, g.constant(1 / temperature)))
+    column = np.full(classes, len(estimator.classes_))
+    column[estimator.classes_] = np.arange(len(estimator.classes_))
+    with_absent = g("Concat", log_p, g.constant([[ABSENT]]), axis=1)
+    g("Gather", with_absent, g.constant(column, "int64"), axis=1, output="logits")
+    features = helper.make_tensor_value_info("features", TensorProto.FLOAT, [1, size])
+    logits = helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, classes])
+    graph = helper.make_graph(g.nodes, "palpate", [features], [logits], g.constants)
     opsets = [helper.make_opsetid(domain, version) for domain, version in OPSETS.items()]
-    made = helper.make_model(graph, opset_imports=opsets, ir_version=IR, producer_name="palpate")
-    onnx.checker.check_model(made)
-    return made
+    model = helper.make_model(graph, opset_imports=opsets, ir_version=IR, producer_name="palpate")
+    onnx.checker.check_model(model)
+    return model
 
 
-def _converted(g: GraphBuilder, estimator: KNeighborsClassifier | Pipeline, features: str, size: int) -> str:
-    """skl2onnx's nodes for the estimator, added to `g`; the name of its scores [1, K]."""
-    *before, last = (each for _, each in estimator.steps) if isinstance(estimator, Pipeline) else [estimator]
+def _converted(g: GraphBuilder, estimator: Estimator, features: str, size: int) -> str:
+    """skl2onnx's nodes for a KNeighborsClassifier or Pipeline, added to `g`; the name of its scores [1, K]."""
+    steps: list[Any] = [step for _, step in estimator.steps] if isinstance(estimator, Pipeline) else [estimator]
+    *before, last = steps
+    options: dict[str, Any]
     if votes := isinstance(last, KNeighborsClassifier):
-        options = {"optim": "cdist"}  # skl2onnx's own distances are a loop over all sweeps, twelve times as slow
+        options = {"optim": "cdist"}  # skl2onnx's default distances are a loop over all sweeps, twelve times as slow
     else:
-        last = copy(last).set_params(
-            decision_function_shape="ovo"
-        )  # its own votes are thousands of nodes for 36 classes
+        # skl2onnx's votes are thousands of nodes for 36 classes
+        last = copy(last).set_params(decision_function_shape="ovo")
         options = {"raw_scores": True}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # it looks at attributes of SVC that will be gone
-        inputs, options = [(features, FloatTensorType([1, size]))], {id(last): options | {"zipmap": False}}
-        made = convert_sklearn(make_pipeline(*before, last), "m", inputs, options=options, target_opset=OPSETS)
-    g.nodes.extend(made.graph.node)
-    g.constants.extend(made.graph.initializer)
-    scores = made.graph.output[1].name
+        warnings.simplefilter("ignore", FutureWarning)  # skl2onnx reads attributes of SVC that will be removed
+        inputs, of_last = [(features, FloatTensorType([1, size]))], {id(last): options | {"zipmap": False}}
+        model = convert_sklearn(make_pipeline(*before, last), "m", inputs, options=of_last, target_opset=OPSETS)
+    g.nodes.extend(model.graph.node)
+    g.constants.extend(model.graph.initializer)
+    scores: str = model.graph.output[1].name
     if votes:
-        return g("Log", g("Add", g("Mul", scores, g.constant(float(NEIGHBOURS))), g.constant(DOUBT)))
-    return scores if len(last.classes_) == 2 else _tally(g, scores, len(last.classes_))
+        return g("Log", g("Add", g("Mul", scores, g.constant(float(NEIGHBOURS))), g.constant(SMOOTHING)))
+    return scores if len(last.classes_) == 2 else _votes(g, scores, len(last.classes_))
 
 
-def _tally(g: GraphBuilder, duels: str, classes: int) -> str:
+def _votes(g: GraphBuilder, decisions: str, classes: int) -> str:
     """SVC's `decision_function`: decisions one against one [1, pairs] -> votes and bounded confidences [1, classes].
 
-    A duel (i, j), i < j, is a vote for j where its decision is below 0, else for i; a sum s of a class's decisions adds
-    s / 3 (|s| + 1), which decides between equally many votes only.
+    The decision of a pair (i, j), i < j, is a vote for j where it is below 0, else for i; a sum s of a class's decisions
+    adds s / 3 (|s| + 1), which only decides between equally many votes.
     """
     pairs = list(combinations(range(classes), 2))
     side = np.array([[(k == i) - (k == j) for k in range(classes)] for i, j in pairs])
-    lost = g("Cast", g("Less", duels, g.constant([[0.0]])), to=TensorProto.FLOAT)
+    lost = g("Cast", g("Less", decisions, g.constant([[0.0]])), to=TensorProto.FLOAT)
     sides = g.constant(side)
     won = g("Sub", g.constant((side > 0).sum(axis=0)[None]), g("MatMul", lost, sides))
-    total = g("MatMul", duels, sides)
+    total = g("MatMul", decisions, sides)
     bound = g("Mul", g("Add", g("Abs", total), g.constant(1.0)), g.constant(3.0))
     return g("Add", won, g("Div", total, bound))
 
@@ -244,9 +258,9 @@ ESTIMATORS: dict[str, Callable[[], Estimator]] = {
     "H-knn": knn,
     "H-svm": svm,
 }
-"""The paper's classifiers on its own features. L-features have units (log, Hz, Hz): neighbours see them standardised."""
+"""The paper's classifiers on the paper's features. L-features have units (log, Hz, Hz): kNN gets them standardised."""
 ABOUT = (
-    "L-features, a normal distribution a class (sec. III.C; Bishop 2006)",
+    "L-features, a normal distribution for each class (sec. III.C; Bishop 2006)",
     "L-features standardised, 4 nearest neighbours (sec. III.C)",
     "L-features standardised, RBF SVM, one against one, gamma = 1/N (sec. III.C)",
     "H-features, 4 nearest neighbours (sec. III.C)",

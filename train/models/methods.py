@@ -1,6 +1,6 @@
-"""The room of methods: every way to name a material, behind one interface. In: a name. Out: a Method that trains Models.
+"""All methods that name a material, behind one interface. In: a name. Out: a Method, which trains Models.
 
-A model answers for many sweeps at once on the desktop, and gives the ONNX graph with which the box answers the same.
+A model classifies many sweeps at once on the desktop, and gives the ONNX graph with which the box gives the same answers.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ MODULES = (
     "train.models.prior_work",
     "train.models.sthmp",
     "train.models.minirocket",
-    "train.models.neural_methods",
+    "train.models.paper_cnn",
+    "train.models.recurrent",
     "train.models.compact.methods",
 )
-"""Each holds METHODS, or methods(effort) where it trains networks."""
+"""Each defines METHODS, and methods(effort) where it trains networks."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long networks are trained, for all of them in one place.
+    """How long networks are trained, for all of them.
 
-    share: of each network's usual iterations. paper_steps: of the paper's CNN; None stands for the paper's 4,000 on a
-    GPU and fewer on a processor. bfloat16: compute the paper's CNN so, where the processor can.
+    share: of each network's default iterations. paper_steps: of the paper's CNN; None for the paper's 4,000 on a GPU and
+    fewer on a processor. bfloat16: compute the paper's CNN in it, where the processor can.
     """
 
     share: float = 1.0
@@ -51,14 +52,14 @@ FULL_EFFORT = Effort()
 class Model(Protocol):
     """A trained method. K: number of the training set's materials, whether or not each occurred in training.
 
-    It may have more to tell, each by a name that fold.py knows: `ran`, `cost`, and `forms`, the same model in other
-    precisions as Models by name.
+    It may have further attributes, which train.evaluation.fold reads: `ran` (what was computed), `cost` (of the training)
+    and `forms`, the same model in other precisions as Models by name.
     """
 
-    def logits(self, given: Array) -> Array:
-        """What the method's `input` asks for, of n sweeps -> float32 [n, K]; their softmax are honest probabilities.
+    def logits(self, inputs: Array) -> Array:
+        """Inputs of n sweeps -> float32 [n, K]; their softmax are calibrated probabilities.
 
-        given: digits [n, T, R, C] where `input` is "raw", else features float32 [n, F].
+        inputs: raw counts [n, T, R, C] where the method's `input` is "raw", else features float32 [n, F].
         """
         ...
 
@@ -71,9 +72,9 @@ class Model(Protocol):
 class Method:
     """One way to name a material.
 
-    about: one line with its source. input: "raw" or a key of train.features.kinds.KINDS.
-    train: (training sweeps, what `input` asks for of them, seed) -> Model; the same arguments give the same model.
-    extra: the optional dependency that it needs, named as in train/pyproject.toml. effort: what an Effort changes in it.
+    about: one line with its source. input: "raw" or a key of train.features.kinds.KINDS. train: (training sweeps, their
+    model_inputs, seed) -> Model; the same arguments give the same model. extra: the optional dependency that it needs,
+    named as in train/pyproject.toml. effort: what an Effort changes in it.
     """
 
     name: str
@@ -85,15 +86,15 @@ class Method:
 
     @property
     def runs_on_the_box(self) -> bool:
-        """Whether the box computes what the graph is given."""
+        """Whether the box computes the input of the graph."""
         return self.input == "raw" or self.input in features.KINDS
 
 
 def model_inputs(kind: str, sweeps: Dataset) -> Array:
-    """What a method with the input `kind` is given of `sweeps`: their digits, or float32 [N, F] as the box computes."""
+    """What a method with the input `kind` takes of `sweeps`: raw counts [N, T, R, C], or features float32 [N, F]."""
     if kind == "raw":
         return sweeps.samples
-    return np.stack([kinds.compute(kind, digits, sweeps.rate_hz) for digits in sweeps.samples])
+    return np.stack([kinds.compute(kind, counts, sweeps.rate_hz) for counts in sweeps.samples])
 
 
 def every(effort: Effort = FULL_EFFORT) -> dict[str, Method]:
@@ -102,7 +103,7 @@ def every(effort: Effort = FULL_EFFORT) -> dict[str, Method]:
 
 
 def module_of(name: str) -> str:
-    """The full name of the module that holds the method `name`, which is known."""
+    """The full name of the module that defines the method `name`, which must exist."""
     return next(module for module in MODULES if name in {m.name for m in _of(import_module(module), FULL_EFFORT)})
 
 
@@ -116,4 +117,5 @@ def find(names: Sequence[str], effort: Effort = FULL_EFFORT) -> list[Method]:
 
 
 def _of(module: ModuleType, effort: Effort) -> Iterable[Method]:
-    return module.methods(effort) if hasattr(module, "methods") else module.METHODS
+    found: Iterable[Method] = module.methods(effort) if hasattr(module, "methods") else module.METHODS
+    return found

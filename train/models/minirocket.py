@@ -1,6 +1,6 @@
-"""The room of MiniRocket, the peer that a user would pick instead. In: sweeps. Out: aeon's transform and a ridge head.
+"""MiniRocket, the usual alternative for time series. In: sweeps. Out: the METHOD minirocket, aeon's transform and ridge.
 
-aeon fits the transform; what it found is written as a graph, and the graph is what trains the head and runs on the box.
+aeon fits the transform; its parameters are written as a graph, to which the head is fitted and which runs on the box.
 """
 
 from __future__ import annotations
@@ -24,36 +24,36 @@ from train.onnx_tools.graph_builder import GraphBuilder
 
 Array = NDArray[Any]
 LENGTH, KERNELS = 9, np.array(list(combinations(range(9), 3)))
-"""Of a kernel, and the 84 of them: which three of the nine taps are 2, the others -1 (the paper's section 3.1)."""
+"""Length of a kernel, and the 84 kernels: which three of the nine taps are 2, the others -1 (Dempster et al., sec. 3.1)."""
 FEATURES = 10_000
-"""aeon's default, and the paper's; rounded down to a multiple of 84."""
+"""The default of aeon and of Dempster et al.; rounded down to a multiple of 84."""
 ALPHAS = np.logspace(-3, 3, 10)
-"""Ridge penalties that leave-one-out chooses from: what aeon's MiniRocketClassifier and the authors' code use."""
+"""Ridge penalties that leave-one-out chooses from, as in aeon's MiniRocketClassifier and the authors' code."""
 
 
-def train(sweeps: Dataset, given: Array, seed: int) -> LinearHeadModel:
-    """MiniRocket and ridge on `given`, the digits [N, T, R, C] of `sweeps`.
+def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
+    """MiniRocket and ridge on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
     Raises FormatError where aeon is missing, a window is shorter than a kernel, or `sweeps` are too few.
     """
     return train_linear_head(
-        transform(sweeps.require_materials().format, fitted(given, seed)), _ridge, sweeps, given, seed
+        transform(sweeps.require_materials().format, fitted(inputs, seed)), _ridge, sweeps, inputs, seed
     )
 
 
-def fitted(given: Array, seed: int) -> tuple[Array, ...]:
-    """aeon's parameters of the transform, fitted to digits [N, T, R, C]; `transform` says what they are.
+def fitted(inputs: Array, seed: int) -> tuple[Array, ...]:
+    """aeon's parameters of the transform, fitted to raw counts [N, T, R, C]; see `transform` for what they are.
 
-    numpy's global random state, which aeon seeds, is put back. Raises FormatError as `train`.
+    numpy's global random state, which aeon seeds, is restored. Raises FormatError as `train`.
     """
-    if given.shape[1] < LENGTH:
-        raise FormatError(f"a window of {given.shape[1]} frames is too short for minirocket; record at least {LENGTH}")
+    if inputs.shape[1] < LENGTH:
+        raise FormatError(f"a window of {inputs.shape[1]} frames is too short for minirocket; record at least {LENGTH}")
     try:
         from aeon.transformations.collection.convolution_based import MiniRocket
     except ImportError as e:
         raise FormatError(f"minirocket needs aeon ({e}); try pip install 'palpate-train[minirocket]'") from e
-    # in C order: for another one numba compiles all over again
-    series = np.ascontiguousarray(given.reshape(*given.shape[:2], -1).transpose(0, 2, 1), np.float32)
+    # in C order: for any other numba compiles again
+    series = np.ascontiguousarray(inputs.reshape(*inputs.shape[:2], -1).transpose(0, 2, 1), np.float32)
     before = np.random.get_state()
     try:
         found: tuple[Array, ...] = MiniRocket(FEATURES, n_jobs=1, random_state=seed).fit(series).parameters
@@ -65,8 +65,8 @@ def fitted(given: Array, seed: int) -> tuple[Array, ...]:
 def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelProto:
     """The fitted transform as a graph: `sweep` -> `features` float32 [1, F], each the share of frames above a bias.
 
-    parameters: of each dilation times kernel the number of taxels, those taxels one after another, the dilations [D],
-    the number of biases of each kernel there [D], the biases [F] by dilation and kernel, as the features are. Where
+    parameters: for each dilation and kernel the number of taxels; those taxels one after another; the dilations [D]; the
+    number of biases of each kernel per dilation [D]; the biases [F] by dilation and kernel, as the features are. Where
     dilation number plus kernel number is even, the window is padded with zeros; else the kernel stays within it.
     """
     counts, taxels, dilations, per_kernel, biases = parameters
@@ -90,15 +90,11 @@ def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelPro
     return g.model(form, "features", len(biases))
 
 
-def _ridge(seen: Array, labels: Array) -> tuple[Array, Array]:
-    """Coefficients and intercepts of the ridge, for features as they are: the scaling is folded in."""
+def _ridge(features: Array, labels: Array) -> tuple[Array, Array]:
+    """Coefficients and intercepts of the ridge for unscaled features: the scaling is folded in."""
     scaler, ridge = StandardScaler(with_mean=False), RidgeClassifierCV(ALPHAS)
-    ridge.fit(scaler.fit_transform(seen), labels)
+    ridge.fit(scaler.fit_transform(features), labels)
     return ridge.coef_ / scaler.scale_, ridge.intercept_
 
 
-METHODS = (
-    Method(
-        "minirocket", "MiniRocket of aeon + ridge (Dempster et al. 2021), the peer to beat", "raw", train, "minirocket"
-    ),
-)
+METHODS = (Method("minirocket", "MiniRocket of aeon + ridge (Dempster et al. 2021)", "raw", train, "minirocket"),)

@@ -1,12 +1,12 @@
-"""The room of ST-HMP, learnt dictionaries. In: sweeps. Out: a graph of sparse codes, pooled, with a linear SVM on it.
+"""ST-HMP, learned dictionaries. In: sweeps. Out: the METHOD st-hmp, a graph of pooled sparse codes with a linear SVM.
 
-Madry, Bo, Kragic, Fox, ICRA 2014, built on hierarchical matching pursuit: Bo, Ren, Fox, NIPS 2011 and ISER 2012. Theirs,
-as far as is known here, where the text of 2014 was not at hand: a dictionary learnt with K-SVD on patches less their
-means, orthogonal matching pursuit with a fixed number of atoms, codes split by sign, the largest of each over a pyramid
-of cells in space and in time, each cell divided by its length (contrast normalisation), a linear SVM. Our reading for a
-skin that slides instead of a hand that closes: texture is in time, so a patch has several frames as well as taxels; its
-taxels are its channels, and each loses its own mean, as colours do there; the grid is hardly larger than one patch, so
-there is one layer.
+Madry, Bo, Kragic, Fox, ICRA 2014, built on hierarchical matching pursuit: Bo, Ren, Fox, NIPS 2011 and ISER 2012. The text
+of 2014 was not available; from the others: a dictionary learned with K-SVD on patches less their means, orthogonal
+matching pursuit with a fixed number of atoms, codes split by sign, the largest of each over a pyramid of cells in space
+and in time, each cell divided by its length (contrast normalisation), a linear SVM. Our adaptation to a skin that slides
+instead of a hand that closes: texture is in time, so a patch has several frames as well as taxels; its taxels are its
+channels, and each loses its own mean, as colours do in their work; the grid is hardly larger than one patch, so there is
+one layer.
 """
 
 from __future__ import annotations
@@ -28,58 +28,59 @@ from train.onnx_tools.graph_builder import GraphBuilder, run
 
 Array = NDArray[Any]
 FRAMES, SIDE, STEP = 16, 2, 8
-"""Of a patch: frames, taxels each way, and frames from one to the next. Fixed before any data was looked at, as long as
-the compact network's first kernel. A short window's patches are half as long as it, and none is wider than the grid."""
-LEAST = 8
+"""Of a patch: frames, taxels along each axis, and frames from one to the next. Fixed before any data was examined, half as
+long as the compact network's first kernel. A short window's patches are half as long as it, and none is wider than the grid."""
+MIN_WINDOW = 8
 """Frames of the shortest window."""
 ATOMS, ACTIVE = 100, 4
-"""Of the dictionary, and of each patch's code."""
+"""Atoms of the dictionary, and of each patch's code."""
 SAMPLED, ROUNDS = 4000, 8
-"""Patches that the dictionary is learnt from, and rounds of K-SVD."""
-NEW = 0.01
-"""Squared length, of 1, that an atom must have beside those chosen before; less is taken for it and divides safely."""
+"""Patches that the dictionary is learned from, and rounds of K-SVD."""
+MIN_RESIDUAL = 0.01
+"""Smallest squared length, of 1, of an atom's part orthogonal to those chosen before; smaller values are raised to it, so
+that division is safe."""
 LEVELS = (1, 2, 4)
 """Of the pyramid in time: parts of the window. In space there are two: the whole grid, and its quarters."""
 CONTRAST = 0.1
 """Added to a cell's squared length, as in HMP: a silent cell stays silent."""
 
 
-def train(sweeps: Dataset, given: Array, seed: int) -> LinearHeadModel:
-    """ST-HMP and a linear SVM on `given`, the digits [N, T, R, C] of `sweeps`.
+def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
+    """ST-HMP and a linear SVM on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
     Raises FormatError where a window is too short, or `sweeps` are too few.
     """
     form = sweeps.require_materials().format
-    if form.window < LEAST:
-        raise FormatError(f"a window of {form.window} frames is too short for st-hmp; record at least {LEAST}")
+    if form.window < MIN_WINDOW:
+        raise FormatError(f"a window of {form.window} frames is too short for st-hmp; record at least {MIN_WINDOW}")
     rng = np.random.default_rng(seed)
-    patches = sampled(given, rng)
+    patches = sample_patches(inputs, rng)
     scale = 1 / max(float(np.sqrt(np.mean(patches**2))), 1e-6)
-    atoms = dictionary(patches * scale, rng)
-    return train_linear_head(pooled(form, atoms, scale), _svm, sweeps, given, seed)
+    atoms = learn_dictionary(patches * scale, rng)
+    return train_linear_head(pooled(form, atoms, scale), _svm, sweeps, inputs, seed)
 
 
-def sampled(given: Array, rng: np.random.Generator) -> Array:
-    """Patches drawn from digits [N, T, R, C]: float64 [SAMPLED, frames, r, c], each taxel less its mean there."""
-    frames, (rows, cols) = min(FRAMES, given.shape[1] // 2), (min(SIDE, n) for n in given.shape[2:])
-    room = np.array(given.shape) - (1, frames, rows, cols) + 1
-    corners = rng.integers(0, room, (SAMPLED, 4))
-    cut = np.stack([given[i, t : t + frames, r : r + rows, c : c + cols] for i, t, r, c in corners]).astype(np.float64)
+def sample_patches(inputs: Array, rng: np.random.Generator) -> Array:
+    """Patches drawn from raw counts [N, T, R, C]: float64 [SAMPLED, frames, r, c], each taxel less its mean there."""
+    frames, (rows, cols) = min(FRAMES, inputs.shape[1] // 2), (min(SIDE, n) for n in inputs.shape[2:])
+    margins = np.array(inputs.shape) - (1, frames, rows, cols) + 1
+    corners = rng.integers(0, margins, (SAMPLED, 4))
+    cut = np.stack([inputs[i, t : t + frames, r : r + rows, c : c + cols] for i, t, r, c in corners]).astype(np.float64)
     centred: Array = cut - cut.mean(axis=1, keepdims=True)
     return centred
 
 
-def dictionary(patches: Array, rng: np.random.Generator) -> Array:
+def learn_dictionary(patches: Array, rng: np.random.Generator) -> Array:
     """K-SVD (Aharon, Elad, Bruckstein 2006) on patches [n, frames, r, c]: atoms float32 [ATOMS, frames, r, c].
 
-    Each atom in turn is the main direction of what the others leave of the patches that use it, by one step of power
-    iteration (Rubinstein, Zibulevsky, Elad 2008). An atom that nothing uses becomes the patch that is explained worst.
-    Atoms have the length 1, or 0 where the patches have nothing more to give.
+    Each atom in turn becomes the main direction of the residual, without it, of the patches that use it, by one step of
+    power iteration (Rubinstein, Zibulevsky, Elad 2008). An atom that no patch uses becomes the patch with the largest
+    residual. Atoms have the length 1, or 0 where the patches leave no residual.
     """
     x = patches.reshape(len(patches), -1)
     atoms = _unit(x[rng.choice(len(x), ATOMS, replace=False)])
     for _ in range(ROUNDS):
-        code = coded(patches, atoms.reshape(-1, *patches.shape[1:])).astype(np.float64)
+        code = encode(patches, atoms.reshape(-1, *patches.shape[1:])).astype(np.float64)
         left = x - code @ atoms
         worst = iter(np.argsort(-np.square(left).sum(1), kind="stable"))
         for k, atom in enumerate(atoms):
@@ -94,8 +95,8 @@ def dictionary(patches: Array, rng: np.random.Generator) -> Array:
     return atoms.reshape(-1, *patches.shape[1:]).astype(np.float32)
 
 
-def coded(patches: Array, atoms: Array) -> Array:
-    """Codes float32 [n, ATOMS] of patches [n, frames, r, c], by the nodes that the box runs, as one long sweep."""
+def encode(patches: Array, atoms: Array) -> Array:
+    """Codes float32 [n, ATOMS] of patches [n, frames, r, c], by the nodes that the box runs, in one long sweep."""
     n, frames, rows, cols = patches.shape
     g, form = GraphBuilder(), SweepFormat(rows, cols, 1.0, n * frames, "float32")
     g("Reshape", _codes(g, form, atoms, frames, 1.0), g.constant([1, -1], "int64"), output="features")
@@ -106,7 +107,7 @@ def coded(patches: Array, atoms: Array) -> Array:
 def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
     """`sweep` -> `features` float32 [1, F]: the largest codes of each cell of the pyramids, above zero and below.
 
-    atoms: [ATOMS, frames, r, c]. scale: makes of digits what the atoms were learnt from.
+    atoms: [ATOMS, frames, r, c]. scale: from raw counts to the scale of the patches that the atoms were learned from.
     """
     g, steps = GraphBuilder(), (form.window - atoms.shape[1]) // STEP + 1
     rows, cols = (n - size + 1 for n, size in zip((form.rows, form.cols), atoms.shape[2:], strict=True))
@@ -126,7 +127,7 @@ def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
 
 
 def _parts(n: int, parts: int) -> list[tuple[int, int]]:
-    """`n` places in so many parts (first, last + 1), which share a place where they do not divide evenly."""
+    """`n` positions in so many parts (first, last + 1), which overlap by one where they do not divide evenly."""
     return [(i * n // parts, -(-(i + 1) * n // parts)) for i in range(parts)]
 
 
@@ -138,8 +139,9 @@ def _cut(g: GraphBuilder, x: str, axis: int, part: tuple[int, int]) -> str:
 def _codes(g: GraphBuilder, form: SweepFormat, atoms: Array, step: int, scale: float) -> str:
     """Orthogonal matching pursuit of all patches of `sweep` at once: codes [patches, ATOMS], by time, row, column.
 
-    Atoms sum to zero on each taxel, so their products with a patch are those with it less its means: one convolution.
-    From there on the pursuit needs only the products of atoms with each other (batch OMP; Rubinstein et al. 2008).
+    Atoms sum to zero on each taxel, so their products with a patch equal those with the patch less its means: one
+    convolution. After it the pursuit needs only the products of atoms with each other (batch OMP; Rubinstein et al.
+    2008).
     """
     flat = atoms.reshape(len(atoms), -1)
     shape = [1, 1, form.window, form.rows, form.cols]
@@ -152,10 +154,10 @@ def _codes(g: GraphBuilder, form: SweepFormat, atoms: Array, step: int, scale: f
 def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
     """Codes [n, K] from products of n patches with K atoms, `left` [n, K], and those of the atoms, `gram` [K, K].
 
-    The atoms that a patch chooses are made orthogonal one after another (Cholesky); the products of those directions
-    with all atoms stand for the directions. At the end the triangle is solved from its last row up.
+    The atoms that a patch chooses are made orthogonal one after another (Cholesky); a direction is represented by its
+    products with all atoms. At the end the triangular system is solved from its last row up.
     """
-    products, least, zeros = g.constant(gram), g.constant(NEW), g("Mul", left, g.constant(0.0))
+    products, least, zeros = g.constant(gram), g.constant(MIN_RESIDUAL), g("Mul", left, g.constant(0.0))
     chosen: list[str] = []
     directions: list[str] = []
     lengths: list[str] = []
@@ -192,10 +194,10 @@ def _unit(vectors: Array) -> Array:
     return scaled
 
 
-def _svm(seen: Array, labels: Array) -> tuple[Array, Array]:
+def _svm(features: Array, labels: Array) -> tuple[Array, Array]:
     """Coefficients and intercepts of a linear SVM, one material against the others."""
-    machine = LinearSVC(random_state=0).fit(seen, labels)
+    machine = LinearSVC(random_state=0).fit(features, labels)
     return machine.coef_, machine.intercept_
 
 
-METHODS = (Method("st-hmp", "codes of learnt dictionaries, pooled, linear SVM (Madry et al. 2014)", "raw", train),)
+METHODS = (Method("st-hmp", "codes of learned dictionaries, pooled, linear SVM (Madry et al. 2014)", "raw", train),)

@@ -1,42 +1,56 @@
-"""The room of the training loop, one for all networks. In: a Network, a Dataset, a TrainingRecipe. Out: it trained, the cost.
+"""Training of networks. In: a Network, a Dataset, a TrainingRecipe. Out: the trained network, its cost curve, a Method.
 
-Sweeps are drawn and augmented with a generator of their own; no random state outside is read or changed as long as the
-caller forks PyTorch's.
+Sweeps are drawn and augmented with a generator of their own. `learn` draws dropout from PyTorch's global generator, which
+the caller seeds and forks; no other random state is read or changed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 from torch.nn import functional
+from torch.optim import lr_scheduler
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
 from train.data.sets import Dataset
+from train.models.linear_head import fit_temperature, hold_out
+from train.models.methods import Effort, Method, Model
 from train.models.networks import Network
+from train.onnx_tools.graph_builder import GraphModel
+from train.onnx_tools.quantize import quantize
 
 Array = NDArray[Any]
 Log = Callable[[str], None]
 Cost = list[tuple[int, float]]
 """(iteration, cross entropy of its batch), eq. 11: what the paper's Fig. 9 shows."""
 Net = TypeVar("Net", bound=Network)
-Vary = Callable[[Tensor, Generator], Tensor]
+Recipe = TypeVar("Recipe", bound="TrainingRecipe")
+Augment = Callable[[Tensor, Generator], Tensor]
+Build = Callable[[SweepFormat, int, Array], Network]
+"""(format, number of materials, training samples [N, T, R, C]) -> an untrained network."""
+MIN_STEPS = 2
+"""However small the effort is."""
 
 
 @dataclass(frozen=True)
 class TrainingRecipe:
     """How a network is trained: AdamW (Adam where `weight_decay` is 0) on batches drawn from shuffled rounds.
 
-    cycle: the rate rises to `peak_rate` and falls again; else it stays there. ema: share that the moving average of the
-    weights keeps of itself each step. dropout: of the features before the head.
-    noise and gain: standard deviations, of a scaled taxel and of its factor.
-    adversarial: how far each digit, scaled, also moves to where the cost grows (fast gradient sign; Goodfellow 2015).
+    cycle: the learning rate rises to `peak_rate` and falls again; else it is constant. ema: share that the moving average
+    of the weights keeps of itself each step. dropout: of the features before the head. noise and gain: standard
+    deviations, of a scaled taxel and of its factor. adversarial: how far each scaled count is also moved in the direction
+    in which the cost grows (fast gradient sign; Goodfellow 2015); 0 for none.
     """
 
     steps: int = 800
@@ -52,20 +66,43 @@ class TrainingRecipe:
     adversarial: float = 0.0
 
 
-def silent(line: str) -> None:
-    """The log of nobody."""
+@dataclass(frozen=True)
+class NetworkModel:
+    """A trained network as a Model. ran: what was computed, and how. cost: of the training.
+
+    forms: the same model in other precisions, by name.
+    """
+
+    network: Network
+    ran: str
+    cost: Cost = field(default_factory=list)
+    forms: Mapping[str, Model] = field(default_factory=dict)
+
+    @torch.no_grad()
+    def logits(self, inputs: Array) -> Array:
+        """Raw counts [n, T, R, C] -> float32 [n, K]."""
+        with one_thread():
+            return np.concatenate([self.network(x).numpy() for x in float_batches(inputs, batches(len(inputs), 32))])
+
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
+        return self.network.graph()
 
 
-def as_it_is(x: Tensor, rng: Generator) -> Tensor:
-    """A scene in which nothing varies."""
+def no_log(line: str) -> None:
+    """A log that drops every line."""
+
+
+def unchanged(x: Tensor, rng: Generator) -> Tensor:
+    """The augmentation that changes nothing."""
     return x
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let PyTorch compute in one thread: the same bits whatever number of cores there are, and hardly slower.
+    """Let PyTorch compute in one thread: the same bits whatever the number of cores, and hardly slower.
 
-    On a busy machine two threads wait for one another; there a fit was seen to take twenty times as long.
+    On a busy machine two threads wait for one another; a fit was once seen to take twenty times as long there.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -75,8 +112,20 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def unsettled(x: Tensor, recipe: TrainingRecipe, rng: Generator) -> Tensor:
-    """Sweeps [B, R * C, T] with other gains and another noise."""
+@contextmanager
+def deterministic_device(seed: int) -> Iterator[str]:
+    """The name of the device: a GPU where there is one, else one thread of the processor.
+
+    It gives the same bits each time, and no random state outside is changed.
+    """
+    exact = torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False)  # float32 means float32
+    with one_thread(), exact, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+        torch.manual_seed(seed)
+        yield "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def perturbed(x: Tensor, recipe: TrainingRecipe, rng: Generator) -> Tensor:
+    """Sweeps [B, R * C, T] with other gains and added noise."""
     if recipe.gain:
         x = x * (1 + recipe.gain * torch.randn(x.shape[:2], generator=rng)[..., None])
     return x + recipe.noise * torch.randn(x.shape, generator=rng) if recipe.noise else x
@@ -87,59 +136,136 @@ def learn(
     sweeps: Dataset,
     recipe: TrainingRecipe,
     seed: int,
-    log: Log = silent,
+    log: Log = no_log,
     device: str = "cpu",
     bfloat16: bool = False,
-    vary: Vary = as_it_is,
+    augment: Augment = unchanged,
 ) -> tuple[Net, Cost]:
-    """Gradient training; gives the moving average of the weights, ready for inference on the processor, and the cost.
+    """Train by gradient descent; gives the moving average of the weights, ready for inference on the processor, and the
+    cost of each step.
 
-    vary: what the scene does to sweeps [B, R * C, T], drawn anew in each step, before gain and noise. bfloat16: multiply in it. Draws what it needs from PyTorch's own generator too: seed and fork that outside.
+    augment: changes sweeps [B, R * C, T], drawn anew in each step, before gain and noise. bfloat16: multiply in it.
+    Dropout is drawn from PyTorch's global generator: the caller seeds and forks it.
     """
     rng, n = torch.Generator().manual_seed(seed), len(sweeps)
     rounds = -(-recipe.steps * recipe.batch // n)
     order = torch.cat([torch.randperm(n, generator=rng) for _ in range(rounds)])[: recipe.steps * recipe.batch]
     model = model.to(device)
     optimizer = torch.optim.AdamW(model.parameters(), recipe.peak_rate, weight_decay=recipe.weight_decay)
-    rates = torch.optim.lr_scheduler
     schedule = (
-        rates.OneCycleLR(optimizer, recipe.peak_rate, total_steps=recipe.steps)
+        lr_scheduler.OneCycleLR(optimizer, recipe.peak_rate, total_steps=recipe.steps)
         if recipe.cycle
-        else rates.ConstantLR(optimizer, 1.0)
+        else lr_scheduler.ConstantLR(optimizer, 1.0)
     )
     average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
     labels = torch.from_numpy(sweeps.labels.astype(np.int64))
     picks, cost = order.split(recipe.batch), []
     model.train().dropout = recipe.dropout
-    for step, (pick, digits) in enumerate(zip(picks, tensors(sweeps.samples, picks), strict=True), 1):
-        x = unsettled(vary(model.prepare(digits), rng), recipe, rng).to(device)
+    for step, (pick, counts) in enumerate(zip(picks, float_batches(sweeps.samples, picks), strict=True), 1):
+        x = perturbed(augment(model.prepare(counts), rng), recipe, rng).to(device)
         optimizer.zero_grad()
         with torch.autocast(device, torch.bfloat16, enabled=bfloat16):
-            cost.append((step, descend(model, x, labels[pick].to(device), recipe)))
+            cost.append((step, backward(model, x, labels[pick].to(device), recipe)))
         optimizer.step()
         schedule.step()
         average.update_parameters(model)
         log(f"step {step}/{recipe.steps} loss {cost[-1][1]:.3f}")
-    return average.module.cpu().fused(), cost
+    averaged = average.module
+    assert isinstance(averaged, type(model))
+    return averaged.cpu().fused(), cost
 
 
-def descend(model: Network, x: Tensor, labels: Tensor, recipe: TrainingRecipe) -> float:
-    """Leave the cost's gradients in the weights; the cost itself, of the sweeps as they are."""
+def backward(model: Network, x: Tensor, labels: Tensor, recipe: TrainingRecipe) -> float:
+    """Leave the gradients of the cost in the weights; the cost itself, of the sweeps as they are."""
     x.requires_grad_(recipe.adversarial > 0)
-    loss = functional.cross_entropy(model.judge(x).float(), labels, label_smoothing=recipe.smoothing)
+    loss = functional.cross_entropy(model.training_logits(x).float(), labels, label_smoothing=recipe.smoothing)
     loss.backward()
     if recipe.adversarial:
+        assert x.grad is not None
         worse = x.detach() + recipe.adversarial * x.grad.sign()
-        functional.cross_entropy(model.judge(worse).float(), labels, label_smoothing=recipe.smoothing).backward()
+        functional.cross_entropy(
+            model.training_logits(worse).float(), labels, label_smoothing=recipe.smoothing
+        ).backward()
     return loss.item()
 
 
-def in_order(n: int, batch: int = 128) -> tuple[Tensor, ...]:
-    """The numbers of n sweeps, a batch at a time."""
-    return torch.arange(n).split(batch)
+def batches(n: int, batch: int = 128) -> tuple[Tensor, ...]:
+    """The numbers of n sweeps in order, a batch at a time."""
+    numbers: tuple[Tensor, ...] = torch.arange(n).split(batch)
+    return numbers
 
 
-def tensors(samples: Array, picks: tuple[Tensor, ...]) -> Iterator[Tensor]:
-    """The picked sweeps of `samples` as float32, a batch at a time; PyTorch knows too little of uint16."""
+def float_batches(samples: Array, picks: tuple[Tensor, ...]) -> Iterator[Tensor]:
+    """The picked sweeps of `samples` as float32, a batch at a time; PyTorch supports too little of uint16."""
     for pick in picks:
         yield torch.from_numpy(samples[pick.numpy()].astype(np.float32))
+
+
+def train_network(
+    sweeps: Dataset,
+    inputs: Array,
+    seed: int,
+    *,
+    build: Build,
+    recipe: TrainingRecipe,
+    calibrated: bool,
+    bfloat16: bool,
+    log: Log,
+    int8: Sequence[str] = (),
+) -> NetworkModel:
+    """Train what `build` gives on the materials that occur in `inputs`, the raw counts [N, T, R, C] of `sweeps`.
+
+    A material that does not occur gets a logit that no sweep can raise. calibrated: hold some groups out for the
+    temperature; else all are trained on, with temperature 1. int8: kinds of nodes that the form "int8" has in int8;
+    without any there is no such form. Raises FormatError where only one material occurs.
+    """
+    known = replace(sweeps, samples=inputs).select(())
+    train, held_out = hold_out_or_all(known, seed)[:2] if calibrated else (known, known)
+    with deterministic_device(seed) as device:
+        half = bfloat16 and (device == "cuda" or bool(torch.cpu.get_capabilities().get("avx512_bf16")))
+        network = build(train.format, len(train.materials), train.samples)
+        network, cost = learn(network, train, recipe, seed, log, device, half)
+        trained = NetworkModel(network, describe_run(recipe, device, half, bfloat16), cost)
+    temperature = fit_temperature(trained.logits(held_out.samples), held_out.labels) if calibrated else 1.0
+    network.expand_head(np.unique(sweeps.labels), len(sweeps.materials), temperature)
+    return replace(trained, forms={"int8": GraphModel(quantize(network.graph(), train.samples, int8))} if int8 else {})
+
+
+def network_method(
+    name: str,
+    about: str,
+    build: Build,
+    recipe: TrainingRecipe,
+    log: Log,
+    *,
+    calibrated: bool = True,
+    bfloat16: bool = False,
+    int8: Sequence[str] = (),
+) -> Method:
+    """The Method of this name that trains what `build` gives; see train_network."""
+    train = partial(
+        train_network, build=build, recipe=recipe, calibrated=calibrated, bfloat16=bfloat16, log=log, int8=int8
+    )
+    return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations{', bfloat16' * bfloat16}")
+
+
+def hold_out_or_all(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
+    """As linear_head.hold_out; too small a set is used whole on both sides, by "nothing".
+
+    Then only Platt's correction bounds the temperature.
+    """
+    try:
+        return hold_out(sweeps, seed)
+    except FormatError:
+        return sweeps, sweeps, "nothing"
+
+
+def describe_run(recipe: TrainingRecipe, device: str, half: bool, wanted: bool) -> str:
+    """What was computed, and how. half: in bfloat16; wanted: whether that was asked for."""
+    precision = "bfloat16" if half else "float32 (no bfloat16 here)" if wanted else "float32"
+    return f"{recipe.steps} iterations of {recipe.batch} in {precision} on {device}"
+
+
+def scale_steps(recipe: Recipe, effort: Effort) -> Recipe:
+    """`recipe` with as many iterations as `effort` asks for."""
+    return replace(recipe, steps=max(round(recipe.steps * effort.share), MIN_STEPS))

@@ -1,6 +1,6 @@
-"""The room of costs that a graph tells by itself. In: an ONNX graph, the form of a sweep. Out: weights, multiply-adds.
+"""Costs that are counted in a graph. In: an ONNX graph, the form of a sweep. Out: weights, multiply-accumulates.
 
-Time and memory are measured, in dots.py; what stands here is counted and the same on every machine.
+They are the same on every machine; train.export.measure measures time and memory.
 """
 
 from __future__ import annotations
@@ -33,32 +33,33 @@ def precision(model: onnx.ModelProto) -> str:
 def weights(model: onnx.ModelProto) -> int:
     """How many trained numbers the graph holds, float or int8: its constants and the tables of its classifiers.
 
-    Single numbers and the scales and zero points of int8 are not counted.
+    Scalars and the scales and zero points of int8 are not counted.
     """
     graph = model.graph
     scales = {name for node in graph.node if node.op_type in SCALED for name in node.input[1:]}
     held = [c for c in graph.initializer if prod(c.dims) > 1 and c.data_type in NUMBERS and c.name not in scales]
     tables = [len(a.floats) for node in graph.node for a in node.attribute if len(a.floats) > 1]
-    return sum(prod(c.dims) for c in held) + sum(tables)
+    return int(sum(prod(c.dims) for c in held) + sum(tables))
 
 
 def macs(model: onnx.ModelProto) -> int:
     """Multiply-accumulates of one sweep: convolutions, matrix products, GRU, kernels of an SVM, distances to neighbours.
 
-    Shapes are inferred. Raises FormatError naming a node whose shape is not known.
+    Shapes are inferred. Raises FormatError naming a node with an unknown shape.
     """
     graph = onnx.shape_inference.infer_shapes(model).graph
     known = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in (*graph.value_info, *graph.output)}
     known |= {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in graph.input}
     known |= {c.name: list(c.dims) for c in graph.initializer}
-    moved = {v.name for v in graph.input}  # what no sweep moves is computed once, when the box loads the graph
+    # what does not depend on the sweep is computed once, when the box loads the graph
+    dependent = {v.name for v in graph.input}
     for node in graph.node:
-        moved |= set(node.output) if moved & set(node.input) else set()
-    return sum(_macs(node, known) for node in graph.node if moved & set(node.output))
+        dependent |= set(node.output) if dependent & set(node.input) else set()
+    return sum(_macs(node, known) for node in graph.node if dependent & set(node.output))
 
 
 def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
-    given = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
+    attributes = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
 
     def shape(name: str) -> list[int]:
         if not all(found := known.get(name, [0])):
@@ -70,32 +71,32 @@ def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
     if node.op_type in ("MatMul", "MatMulInteger"):
         return prod(shape(node.input[0])) * shape(node.input[1])[-1]
     if node.op_type == "Gemm":
-        return prod(shape(node.input[0])) * shape(node.input[1])[0 if given.get("transB") else -1]
+        return prod(shape(node.input[0])) * shape(node.input[1])[0 if attributes.get("transB") else -1]
     if node.op_type == "GRU":
         steps, _, inputs = shape(node.input[0])
-        hidden = given["hidden_size"]
+        hidden = int(attributes["hidden_size"])
         return steps * shape(node.input[1])[0] * GATES * hidden * (inputs + hidden)
     if node.op_type == "SVMClassifier":
-        return len(given["support_vectors"]) + len(given["coefficients"])
+        return len(attributes["support_vectors"]) + len(attributes["coefficients"])
     return prod(shape(node.input[1])) if node.op_type == "CDist" else 0
 
 
 def feature_macs(kind: str, form: SweepFormat) -> int:
     """Multiply-accumulates of the Fourier transforms in the features `kind`: n log2 n for one of n real numbers.
 
-    A transform of n real numbers is n/4 log2 n complex products of four each. All else in features is not counted.
+    A transform of n real numbers takes n/4 log2 n complex products of four each. Everything else is not counted.
     """
     if kind == "raw":
         return 0
-    seen: list[int] = []
-    real = time_series.power
+    transforms: list[int] = []
+    power = time_series.power
 
     def counted(x: Any, frames: int) -> Any:
-        seen.append(round(x.size * log2(max(x.shape[-1], 1))))
-        return real(x, frames)
+        transforms.append(round(x.size * log2(max(x.shape[-1], 1))))
+        return power(x, frames)
 
-    rng = np.random.default_rng(0)  # a silent sweep may be spared its transforms
-    digits = rng.integers(0, 100, (form.window, form.rows, form.cols)).astype(form.digits)
+    rng = np.random.default_rng(0)  # no transform may be computed for a silent sweep
+    counts = rng.integers(0, 100, (form.window, form.rows, form.cols)).astype(form.digits)
     with mock.patch.object(time_series, "power", counted):
-        kinds.compute(kind, digits, form.rate_hz)
-    return sum(seen)
+        kinds.compute(kind, counts, form.rate_hz)
+    return sum(transforms)

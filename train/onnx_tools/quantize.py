@@ -1,4 +1,4 @@
-"""The room of int8. In: a float graph, sweeps of the training set. Out: the graph with its heavy nodes in int8."""
+"""Static quantization. In: a float graph, sweeps of the training set. Out: the graph with its expensive nodes in int8."""
 
 from __future__ import annotations
 
@@ -17,27 +17,32 @@ from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, Q
 Array = NDArray[Any]
 CALIBRATION_SWEEPS = 96
 PERCENTILE = 99.9
-"""Of the values that int8 must reach: with their full range one outlier sweep takes the resolution from all others."""
+"""Of the values, the one that int8 reaches: with the full range one outlier sweep costs all others their resolution."""
 
 
 def quantize(model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv", "Relu")) -> onnx.ModelProto:
-    """`model` with its nodes `ops` in int8, ranges found on some of `sweeps`: digits [N, T, R, C].
+    """`model` with its nodes `ops` in int8, ranges found on some of `sweeps`: raw counts [N, T, R, C].
 
-    Weights keep to seven bits: two products of eight overflow the 16-bit sums of an x86 without VNNI, and then the
-    answer there is another than on Arm.
+    Weights have seven bits: two products of eight bits overflow the 16-bit sums of an x86 without VNNI, and the answer
+    there would differ from that on Arm.
     """
-    some = np.linspace(0, len(sweeps) - 1, min(CALIBRATION_SWEEPS, len(sweeps))).astype(int)
-    mine = onnx.ModelProto()
-    mine.CopyFrom(model)  # onnxruntime moves the weights of what it is given to a file
-    mine.metadata_props.add(key="onnx.quant.pre_process", value="onnxruntime.quant")  # nothing to simplify beforehand
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)  # onnxruntime moves the weights of what it is given to a file
+    copy.metadata_props.add(key="onnx.quant.pre_process", value="onnxruntime.quant")  # nothing to simplify beforehand
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         path = Path(folder) / "int8.onnx"
         quantize_static(
-            mine, path, _CalibrationReader(sweeps[some]), QuantFormat.QDQ, list(ops), per_channel=True, reduce_range=True,
-            activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8,
+            copy, path, _CalibrationReader(calibration_sweeps(sweeps)), QuantFormat.QDQ, list(ops), per_channel=True,
+            reduce_range=True, activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8,
             calibrate_method=CalibrationMethod.Percentile, extra_options={"CalibPercentile": PERCENTILE},
         )  # fmt: skip
         return onnx.load(path)
+
+
+def calibration_sweeps(sweeps: Array) -> Array:
+    """At most CALIBRATION_SWEEPS of `sweeps` [N, ...], evenly spaced: ranges and comparisons are taken from these."""
+    some: Array = sweeps[np.linspace(0, len(sweeps) - 1, min(CALIBRATION_SWEEPS, len(sweeps))).astype(int)]
+    return some
 
 
 class _CalibrationReader(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime ships no types

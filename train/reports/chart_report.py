@@ -40,7 +40,8 @@ SEVEN = ("direction=0", "force<=180")
 FAMILIES = {
     "train.models.compact.methods": "Palpate",
     "train.models.baselines": "L and H",
-    "train.models.neural_methods": "deep networks",
+    "train.models.paper_cnn": "deep networks",
+    "train.models.recurrent": "deep networks",
     "train.models.minirocket": "MiniRocket",
 }
 OTHERS = "related work"

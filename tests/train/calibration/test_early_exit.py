@@ -43,7 +43,7 @@ def certain(labels, when, wrong=()):
 def test_the_rule_decides_when_the_steps_are_sure():
     """All sweeps are clear from the third tenth on: decided there with one step, and nothing is lost."""
     labels = np.arange(300) % 3
-    found = early_exit.rule(certain(labels, np.full(300, 2)), labels)
+    found = early_exit.find_rule(certain(labels, np.full(300, 2)), labels)
     assert found.early
     assert found.early.agree == 1
     assert (found.share, found.lost, found.why) == (pytest.approx(0.3), 0.0, "")
@@ -54,7 +54,7 @@ def test_a_rule_asks_for_agreement_where_one_step_deceives():
     labels = np.arange(300) % 3
     p = certain(labels, np.full(300, 2))
     p[:6, 2] = np.roll(p[:6, 2], 1, axis=1)
-    found = early_exit.rule(p, labels)
+    found = early_exit.find_rule(p, labels)
     assert found.early
     assert found.early.agree == 2
     assert found.share == pytest.approx(0.4, abs=0.01)
@@ -65,7 +65,7 @@ def test_a_rule_asks_for_agreement_where_one_step_deceives():
 def test_half_a_point_and_no_more(wrong: int, off: bool):
     """Of 300 sweeps one may turn wrong, a third of a point; two, which stay wrong until the end, may not."""
     labels = np.arange(300) % 3
-    found = early_exit.rule(certain(labels, np.full(300, 2), range(wrong)), labels)
+    found = early_exit.find_rule(certain(labels, np.full(300, 2), range(wrong)), labels)
     assert (found.early is None) is off
     assert bool(found.why) is off
 
@@ -73,9 +73,9 @@ def test_half_a_point_and_no_more(wrong: int, off: bool):
 def test_no_rule_without_data_or_gain():
     """Few sweeps, or sweeps that are clear only at the end: off, and why."""
     labels = np.arange(30) % 3
-    assert "30 sweeps" in early_exit.rule(certain(labels, np.full(30, 2)), labels).why
+    assert "30 sweeps" in early_exit.find_rule(certain(labels, np.full(30, 2)), labels).why
     labels = np.arange(300) % 3
-    assert "95%" in early_exit.rule(certain(labels, np.full(300, 9)), labels).why
+    assert "95%" in early_exit.find_rule(certain(labels, np.full(300, 9)), labels).why
 
 
 def test_no_looser_level_after_one_that_lost():
@@ -86,7 +86,7 @@ def test_no_looser_level_after_one_that_lost():
     p[np.arange(200), 4, labels] = 0.9  # right at .9
     p[:10, 2] = 0.02
     p[np.arange(10), 2, (labels[:10] + 1) % 3] = 0.96  # ten are wrong at .96
-    assert early_exit.rule(p, labels).early is None or early_exit.rule(p, labels).early.least[0] > 0.96
+    assert early_exit.find_rule(p, labels).early is None or early_exit.find_rule(p, labels).early.least[0] > 0.96
 
 
 @pytest.mark.parametrize("agree", [1, 2, 3])
@@ -118,8 +118,8 @@ def test_each_step_has_its_own_temperature():
     """The last temperature is the whole sweep's, each other one its own step's."""
     x, y, at = tenths(10, seed=3)
     done, every = posthoc.fit_posthoc(x, y, at, np.ones(len(y), bool)), np.ones(len(y), bool)
-    logits, numbers = early_exit.crossed(x, y, at, every)
-    cooler = early_exit.temperatures(logits, y[numbers])
+    logits, numbers = early_exit.cross_fitted_logits(x, y, at, every)
+    cooler = early_exit.fit_temperatures(logits, y[numbers])
     assert len(set(cooler)) > 2
     assert done.temperature == cooler[-1]
     raw = early_exit.heads(done.embedding(x), y, 3)

@@ -37,8 +37,8 @@ def test_features_that_nobody_trained_are_kept_whole():
     """With `whole` all of the last features' directions are seen: the distance is the whole Mahalanobis distance there."""
     x, y = gaussians(300, [[0, 0, 0], [6, 0, 0]])
     stranger = np.array([[0.0, 0.0, 20.0]])
-    assert novelty.embed(x, y, 0).strangeness(stranger)[0] < 10
-    assert novelty.embed(x, y, 1).strangeness(stranger)[0] > 300
+    assert novelty.embed(x, y, 0).novelty(stranger)[0] < 10
+    assert novelty.embed(x, y, 1).novelty(stranger)[0] > 300
 
 
 def test_two_sweeps_of_a_material_and_silent_channels_are_finite():
@@ -48,9 +48,9 @@ def test_two_sweeps_of_a_material_and_silent_channels_are_finite():
     more, labels = gaussians(30, [[5, 0, 1]], seed=3)
     more[:, 2] = 1.0
     one = novelty.embed(np.vstack([x, more]), np.concatenate([y, labels + 1]), 2)
-    assert np.isfinite(one.strangeness(x)).all()
+    assert np.isfinite(one.novelty(x)).all()
     silent = novelty.embed(np.zeros((8, 3)), np.repeat([0, 1], 4), 3)
-    assert np.isfinite(silent.strangeness(np.ones((1, 3)))).all()
+    assert np.isfinite(silent.novelty(np.ones((1, 3)))).all()
 
 
 @pytest.mark.parametrize(
@@ -84,17 +84,19 @@ def test_the_limit_knows_positions_that_were_not_seen():
 
     (x, y, at), (new, _, _) = world(300, 0), world(400, 5)
     one, every = novelty.embed(x, y, 2), np.ones(len(y), bool)
-    across = novelty.limit(novelty.crossed(x, y, at, every, 2), 0.95)
-    assert 0.93 < np.mean(one.strangeness(new) <= across) < 0.97
+    across = novelty.limit(novelty.cross_fitted_distances(x, y, at, every, 2), 0.95)
+    assert 0.93 < np.mean(one.novelty(new) <= across) < 0.97
     seven = at < 7  # with few places the covariance is too small, and what fits itself is far too narrow
     narrow, mine, them = novelty.embed(x[seven], y[seven], 2), (x[seven], y[seven], at[seven]), every[seven]
-    itself, others = (novelty.limit(s, 0.95) for s in (narrow.strangeness(x[seven]), novelty.crossed(*mine, them, 2)))
-    kept = [np.mean(narrow.strangeness(new) <= at_most) for at_most in (itself, others)]
+    itself, others = (
+        novelty.limit(s, 0.95) for s in (narrow.novelty(x[seven]), novelty.cross_fitted_distances(*mine, them, 2))
+    )
+    kept = [np.mean(narrow.novelty(new) <= at_most) for at_most in (itself, others)]
     assert kept[0] < 0.9 < kept[1]
     few = np.isin(at, (0, 1))
-    assert len(novelty.crossed(x, y, at, few)) == few.sum()
+    assert len(novelty.cross_fitted_distances(x, y, at, few)) == few.sum()
     with pytest.raises(FormatError, match="one group"):
-        novelty.crossed(x, y, 0 * at, every)
+        novelty.cross_fitted_distances(x, y, 0 * at, every)
 
 
 def test_each_judge_judges_once_and_never_its_own_group():

@@ -144,7 +144,7 @@ def test_an_interrupted_call_goes_on(ground: Ground):
     assert len(tally.fetched) == 2
     assert len(files(ground.here)) == 4
     again = ground.fetch()
-    assert (len(again.there), len(again.fetched)) == (2, 2)
+    assert (len(again.present), len(again.fetched)) == (2, 2)
     assert ground.same()
 
 
@@ -261,7 +261,7 @@ def test_a_hostile_archive_is_refused(ground: Ground, archive: bytes):
     """Out of the folder, absolute, links, devices, what was not asked for: nothing of it is written."""
     (ground.bin / "archive").write_bytes(archive)
     ground.ssh("tar", f"exec cat '{ground.bin}/archive'")
-    with pytest.raises(FormatError, match=r"the box sends '.*', which is no file asked for; look at that box"):
+    with pytest.raises(FormatError, match=r"the box sends '.*', which was not requested; check that box"):
         ground.fetch()
     assert not ground.here.exists()
 
@@ -272,7 +272,7 @@ def test_a_member_beyond_all_size_is_refused(ground: Ground):
     info.size = 1 << 40
     (ground.bin / "archive").write_bytes(info.tobuf())
     ground.ssh("tar", f"exec cat '{ground.bin}/archive'")
-    with pytest.raises(FormatError, match="which is no file asked for"):
+    with pytest.raises(FormatError, match="which was not requested"):
         ground.fetch()
 
 
@@ -290,7 +290,7 @@ def test_a_name_that_leads_elsewhere_is_refused(ground: Ground):
         "'/etc/evil'",
         "'run 0/line\\nbreak'",
     ]
-    assert ground.fetch().there == tally.fetched
+    assert ground.fetch().present == tally.fetched
     assert len(files(ground.here)) == 8
 
 
@@ -387,7 +387,7 @@ def test_through_a_real_sshd(tmp_path: Path, sshd: list[str]):
     tally = PullReport()
     pull.pull(box, tmp_path / "here", tally, lambda line: None)
     pull.pull(box, tmp_path / "here", tally, lambda line: None)
-    assert (len(tally.fetched), len(tally.there)) == (3, 3)
+    assert (len(tally.fetched), len(tally.present)) == (3, 3)
     assert files(tmp_path / "here") == files(tmp_path / "box")
     assert load(tmp_path / "here" / "a session" / "sweep-000002.npy")[0].material == "a"
     (tmp_path / "mine.pub").write_text("")

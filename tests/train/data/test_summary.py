@@ -18,7 +18,7 @@ from train.data import sets, summary
 
 def lines(s: sets.Dataset) -> list[str]:
     """What is told of a set."""
-    return summary.described(s, {})
+    return summary.description(s, {})
 
 
 def command(*words: str) -> None:

@@ -155,10 +155,10 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
         """Without the packages' names."""
         return {name.split(".")[-1] for name in fold.reached((methods.module_of(method), "train.evaluation.fold"))}
 
-    assert {"neural_methods", "networks", "training", "graph_builder", "linear_head", "fold"} <= reached("paper-cnn")
+    assert {"paper_cnn", "networks", "training", "graph_builder", "linear_head", "fold"} <= reached("paper-cnn")
     classical = reached("L-svm")
     assert {"baselines", "linear_head", "graph_builder", "features", "time_series", "prior_work"} <= classical
-    assert not {"neural_methods", "networks", "network", "evaluate", "score", "main"} & classical
+    assert not {"paper_cnn", "recurrent", "networks", "network", "evaluate", "score", "main"} & classical
     assert all(methods.module_of(name) in methods.MODULES for name in methods.every())
 
 

@@ -68,15 +68,22 @@ def test_error_is_the_gap_between_said_and_right():
 
 
 def test_an_overconfident_head_is_made_honest():
-    """Places that shift the materials: LDA says too much, the temperature found across places takes it back."""
-    one = case(apart=2.5)
-    rng = np.random.default_rng(0)
-    moved = lambda x, at: x + 1.5 * rng.standard_normal((200, 1, 4))[at]  # noqa: E731
-    one = replace(one, seen=moved(one.seen, one.seen_groups), new=moved(one.new, one.places))
-    # sweeps of one place close together: their scatter says little of other places
-    figures = uncertainty.calibration([(one, fit_posthoc(one.seen, one.seen_labels, one.seen_groups, one.judged))])
-    assert figures["n"] == 288
-    assert 0 < figures["accuracy"]["low"] < figures["accuracy"]["accuracy"] < figures["accuracy"]["high"] < 1
+    """Positions that shift the materials: LDA is overconfident, the temperature found across positions corrects that."""
+    one = case(apart=2.5, places=12)
+    # sweeps of one position close together: their scatter says little of other positions
+    shift = 1.5 * np.random.default_rng(0).standard_normal((200, 1, 4))
+    one = replace(one, seen=one.seen + shift[one.seen_groups], new=one.new + shift[one.places])
+    done = fit_posthoc(one.seen, one.seen_labels, one.seen_groups, one.judged)
+    figures = uncertainty.calibration([(one, done)])
+    right = figures["accuracy"]["accuracy"]
+    mean = {when: np.average([b["said"] for b in figures[when]["bins"]], weights=[b["n"] for b in figures[when]["bins"]])
+            for when in ("before", "after")}  # fmt: skip
+    assert figures["n"] == sum(b["n"] for b in figures["after"]["bins"]) == 12 * 4 * 24
+    assert done.temperature > 1.3
+    assert mean["before"] > right + 0.1
+    assert abs(mean["after"] - right) < 0.05
+    assert figures["after"]["error"] < 0.5 * figures["before"]["error"]
+    assert figures["accuracy"]["low"] < right < figures["accuracy"]["high"]
 
 
 def test_more_sweeps_for_more_certainty(figures):

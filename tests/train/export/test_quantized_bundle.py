@@ -28,13 +28,13 @@ from train.cli.main import main
 from train.data import sets
 from train.export import pack, quantized_bundle
 from train.export.pack import ExportRefused
-from train.models import methods, networks
+from train.models import methods, paper_cnn
 from train.models.compact import fit
 from train.models.compact.architectures import ARCHITECTURES, DEFAULT
 from train.models.compact.fit import Fit, FitRecipe
 from train.models.compact.network import Compact
 from train.models.linear_head import closed_form_head, hold_out
-from train.onnx_tools import graph_builder, parity
+from train.onnx_tools import cost, graph_builder, parity
 from train.onnx_tools.parity import Layer
 
 pytestmark = pytest.mark.slow
@@ -43,13 +43,13 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on the easy set, two sweeps to a recording."""
-    return fit.fit(easy(pieces=2), 1, FitRecipe(steps=40), shape=ARCHITECTURES["20k"])
+    return fit.fit(easy(pieces=2), 1, FitRecipe(steps=40), architecture=ARCHITECTURES["20k"])
 
 
 @pytest.fixture(scope="module")
 def tight() -> Fit:
     """A fit on a set that takes all int8 has."""
-    return fit.fit(close(), 1, FitRecipe(steps=60), shape=ARCHITECTURES["20k"])
+    return fit.fit(close(), 1, FitRecipe(steps=60), architecture=ARCHITECTURES["20k"])
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: P
     maker = {name: n for n in model.graph.node for name in n.output}
     values = {c.name: numpy_helper.to_array(c) for c in model.graph.initializer}
     convs = [n for n in model.graph.node if n.op_type == "Conv"]
-    assert len(convs) == len(fitted.shape.channels)
+    assert len(convs) == len(fitted.architecture.channels)
     for conv in convs:
         assert [maker[name].op_type for name in conv.input] == ["DequantizeLinear"] * 3
         weight, scale = (values[name] for name in maker[conv.input[1]].input[:2])
@@ -195,7 +195,7 @@ def judged(fitted: Fit) -> None:
 
 def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
     """A fit whose stages reach so far in int8, its head refitted."""
-    other = replace(fitted, reach=replace(fitted.reach, responses=tuple(responses)))
+    other = replace(fitted, ranges=replace(fitted.ranges, responses=tuple(responses)))
     seen, unseen = (graph_builder.run(other.trunk(), s.samples) for s in (fitted.train, fitted.held))
     weight, bias = closed_form_head(seen, fitted.train.labels, unseen, fitted.held.labels)
     return replace(other, weights=fitted.weights | {"int8.weight": weight, "int8.bias": bias})
@@ -210,19 +210,19 @@ def test_a_range_for_one_outlier_is_refused(tight: Fit):
         responses = network.responses(network.prepare(torch.from_numpy(wild)))
     with pytest.raises(ExportRefused, match=r"int8 .*\(limit .*suffers most \(-?\d+ dB, 0\.0% beyond.*record more"):
         judged(ranged(tight, [float(x.max()) for x in responses]))
-    judged(ranged(tight, tight.reach.responses))
+    judged(ranged(tight, tight.ranges.responses))
 
 
 def test_a_layer_that_saturates_is_refused(tight: Fit):
     """The first stage reaches a twentieth of what it should: no head can compensate; the share that is cut off is reported."""
-    first, *others = tight.reach.responses
+    first, *others = tight.ranges.responses
     with pytest.raises(ExportRefused, match=r"\(limit .*suffers most \(\d+ dB, [3-6]\d\.\d% beyond"):
         judged(ranged(tight, (0.05 * first, *others)))
 
 
 def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
     """The float head on features of an int8 trunk that saturates: only a head of its own copes with them."""
-    *before, last = tight.reach.responses
+    *before, last = tight.ranges.responses
     refitted = ranged(tight, (*before, 0.25 * last))
     judged(refitted)
     stale = {f"int8.{name}": refitted.weights[f"head.{name}"] for name in ("weight", "bias")}
@@ -234,7 +234,7 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
     """A Parity of `n` sweeps, of which int8 loses and wins some; all else as good as can be unless it is named."""
     right = np.arange(n) >= won, np.arange(n) < n - lost
     usual = {"agreement": 1, "expected_loss": 0, "probability_difference": 0, "probability_mean": 0}
-    difference = parity.Apart(**(usual | apart), logit_difference=0, logit_mean=0)
+    difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
     layer = Layer("conv1", "activations", "float", (0,) * 4, 0, 1, 1 / 255, 0.001, 35)
     return parity.Parity(n, int(right[1].sum()), difference, parity.loss(*right), 0, (layer,))
 
@@ -275,10 +275,10 @@ def test_a_box_that_would_refuse_is_no_box(fitted: Fit, tmp_path: Path):
 def test_the_box_must_say_what_export_saw(fitted: Fit, packed: Path):
     """Other labels from the box than from the int8 model are refused, with how many."""
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
-    assert "held-out" in pack.judge(packed, fitted.held, logits, "held-out")
+    assert "held-out" in pack.training_logits(packed, fitted.held, logits, "held-out")
     logits[:2] = -logits[:2]
     with pytest.raises(ExportRefused, match="labels 2 of 24 held-out sweeps otherwise"):
-        pack.judge(packed, fitted.held, logits, "held-out")
+        pack.training_logits(packed, fitted.held, logits, "held-out")
 
 
 def test_a_material_never_recognised_is_refused(fitted: Fit):
@@ -336,8 +336,8 @@ def test_the_default_bundle_is_what_the_box_needs():
 
 def test_references_are_what_they_are_called(tmp_path: Path):
     """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give six logits."""
-    whole = networks.paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
-    assert graph_builder.weight_count(whole) == 15_891_910
+    whole = paper_cnn.random_paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
+    assert cost.weights(whole) == 15_891_910
     assert main(["references", "--out", str(tmp_path / "new")]) == 0
     sizes = {}
     for path in (tmp_path / "new").iterdir():
@@ -368,7 +368,7 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     """Nothing in it is int8: both forms are one, the box's labels are its network's, no tensor is reported; what another
     head says is refused here as well."""
-    made = fit.fit(easy(), 1, FitRecipe(), shape=ARCHITECTURES["bands"])
+    made = fit.fit(easy(), 1, FitRecipe(), architecture=ARCHITECTURES["bands"])
     quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
     it = box(tmp_path / "b")
     assert it.self_test() < 1e-6
@@ -433,7 +433,7 @@ def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
     level = whole.samples.mean(axis=1, keepdims=True) - np.array([60, 100, 140])[labels][:, None, None, None]
     offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
     try:
-        made = fit.fit(offset, 1, FitRecipe(steps=20, keep_means=keep), shape=ARCHITECTURES["20k"])
+        made = fit.fit(offset, 1, FitRecipe(steps=20, keep_means=keep), architecture=ARCHITECTURES["20k"])
         manifest = quantized_bundle.export(made, tmp_path / "b", "offset", "1", "0123abcd")
     except ExportRefused:  # what was never learnt may not survive int8 either
         assert not keep

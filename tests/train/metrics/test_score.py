@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from appliance.inference.classifier import softmax
-from train.metrics.score import Score, figure, fused, interval
+from train.metrics.score import Score, fuse, interval
 
 
 def test_a_tally_counts():
@@ -44,7 +44,7 @@ def test_the_bootstrap_covers_the_truth():
 def test_windows_of_a_recording_are_fused_as_a_product():
     """The sum of log probabilities, recordings in the order of their numbers, with the first sweep of each."""
     logits = np.array([[1.0, 0.0], [0.0, 3.0], [2.0, 0.0]], np.float32)
-    scores, first = fused(logits, np.array([7, 3, 7]))
+    scores, first = fuse(logits, np.array([7, 3, 7]))
     assert first.tolist() == [1, 0]
     assert scores[1] == pytest.approx(np.log(softmax(logits[0])) + np.log(softmax(logits[2])))
     assert scores.argmax(1).tolist() == [1, 0]
@@ -52,11 +52,11 @@ def test_windows_of_a_recording_are_fused_as_a_product():
 
 def test_no_window_can_veto_all_others():
     """One that is sure beyond float does not outweigh with log 0."""
-    scores, _ = fused(np.array([[1e4, 0.0]] + [[0.0, 9.0]] * 5, np.float32), np.zeros(6, int))
+    scores, _ = fuse(np.array([[1e4, 0.0]] + [[0.0, 9.0]] * 5, np.float32), np.zeros(6, int))
     assert np.isfinite(scores).all()
     assert scores.argmax() == 1
 
 
 def test_a_figure_has_wilsons_interval():
     """55 of 60, the paper's T-HARD: .917 in [.819, .964]."""
-    assert figure(55, 60) == {"accuracy": 0.9167, "n": 60, "low": 0.8193, "high": 0.9639}
+    assert accuracy_figure(55, 60) == {"accuracy": 0.9167, "n": 60, "low": 0.8193, "high": 0.9639}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from appliance.inference.classifier import Classifier, softmax
 from train.data import sets
 from train.data.sets import Dataset
 from train.models import baselines, methods, prior_work
-from train.models.baselines import ABSENT, FeatureModel, Gauss, knn, svm, written
+from train.models.baselines import ABSENT, FeatureModel, Gauss, knn, svm, to_onnx
 from train.models.methods import Method
 
 METHODS = (*baselines.METHODS, *prior_work.METHODS)
@@ -144,7 +145,7 @@ def test_the_graph_is_the_estimator(name: str, present: tuple[int, ...]):
     y = np.array(present)[rng.integers(0, len(present), 90)]
     x = rng.normal(0, 1, (90, 5)) * [1, 10, 0.1, 5, 1] + 0.7 * y[:, None] * rng.normal(1, 0.2, 5) + [0, 100, 0, 0, 9]
     estimator = ESTIMATORS[name]().fit(x[:60], y[:60])
-    model = FeatureModel(written(estimator, 6, 1.7))
+    model = FeatureModel(to_onnx(estimator, 6, 1.7))
     unseen = x[60:].astype(np.float32)
     if "knn" in name:
         scores = np.log(4 * estimator.predict_proba(unseen) + 0.1)
@@ -186,7 +187,7 @@ def test_gauss_bears_little_and_collinear():
     x = np.array([[0.0, 0, 7], [1, 1, 7], [5, 5, 7]])
     gauss = Gauss().fit(x, np.arange(3))
     assert gauss.predict(x + 0.1).tolist() == [0, 1, 2]
-    assert np.isfinite(FeatureModel(written(gauss, 3)).logits(x)).all()
+    assert np.isfinite(FeatureModel(to_onnx(gauss, 3)).logits(x)).all()
 
 
 def test_a_material_that_training_lacks_is_never_named(tubes: World):
@@ -227,22 +228,25 @@ def test_without_anything_to_hold_out_the_temperature_is_one(tubes: World):
     sweeps = replace(tubes.sweeps, groups={"recording": tubes.sweeps.labels})
     assert not folds_of(sweeps)
     given = tubes.given("L")
-    want = FeatureModel(written(Gauss().fit(given.astype(float), sweeps.labels), 6)).logits(given)
+    want = FeatureModel(to_onnx(Gauss().fit(given.astype(float), sweeps.labels), 6)).logits(given)
     np.testing.assert_array_equal(baselines.learn(Gauss, sweeps, given, 0).logits(given), want)
 
 
 @pytest.mark.slow
-def test_probabilities_are_honest():
-    """Labels that are drawn by lot are believed to about one half of two; those that are clear nearly to one."""
+@pytest.mark.parametrize(("strength", "most"), [(0.0, 0.62), (0.75, 0.8), (9.0, 1.0)])
+@pytest.mark.parametrize("make", [Gauss, knn, svm])
+def test_probabilities_are_honest(make: Callable[[], baselines.Estimator], strength: float, most: float):
+    """New sweeps of two materials, which are equal, overlap or are far apart: the mean probability of the label given is
+    its accuracy, to a tenth."""
     rng = np.random.default_rng(2)
-    labels = np.arange(80) % 2
+    labels, truth = np.arange(80) % 2, np.arange(2000) % 2
     some = Dataset(np.zeros((80, 1, 1, 1), np.uint8), labels, ("a", "b"), 1.0)
-    noise = rng.normal(0, 1, (80, 3)).astype(np.float32)
-    for make in (Gauss, knn, svm):
-        vague = softmax(baselines.learn(make, some, noise, 0).logits(noise)).max(1).mean()
-        clear = softmax(baselines.learn(make, some, noise + 9 * labels[:, None], 0).logits(noise)).max(1).mean()
-        assert vague < 0.75
-        assert clear > 0.95
+    x, new = ((rng.normal(0, 1, (len(y), 3)) + strength * y[:, None]).astype(np.float32) for y in (labels, truth))
+    p = softmax(baselines.learn(make, some, x, 0).logits(new))
+    assert p.max(1).mean() == pytest.approx(np.mean(p.argmax(1) == truth), abs=0.1)
+    assert p.max(1).mean() <= most
+    if strength == 9:
+        assert p.max(1).mean() > 0.95
 
 
 @pytest.mark.parametrize(("index", "hint"), [([0, 0, 0, 0], "only one class"), ([0, -1], "2 sweeps are too few")])

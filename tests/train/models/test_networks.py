@@ -18,7 +18,7 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.data.sets import Dataset
 from train.evaluation import evaluate, fold
-from train.models import methods, networks, neural_methods, training
+from train.models import methods, paper_cnn, recurrent, training
 from train.models.compact import fit, network
 from train.models.compact.fit import FitRecipe
 from train.models.linear_head import closed_form_head
@@ -44,12 +44,12 @@ def made(shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, ra
     return Dataset(samples.astype(dtype), labels, names, rate_hz, {"recording": np.arange(shape[0]) // 2}, "made")
 
 
-def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> neural_methods.NetworkModel:
+def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> training.NetworkModel:
     """Train the method on everything."""
     return method(name, effort).train(s, s.samples, seed)
 
 
-def check_agrees(model: neural_methods.NetworkModel, samples: np.ndarray) -> None:
+def check_agrees(model: training.NetworkModel, samples: np.ndarray) -> None:
     """The graph in the box's session gives the logits of the model, which are finite."""
     want = model.logits(samples)
     assert want.dtype == np.float32
@@ -63,22 +63,22 @@ def test_the_paper_s_cnn_is_the_paper_s():
 
     TactNet-II has about the 1.84 M that are known of it.
     """
-    net = neural_methods.paper_cnn(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
+    net = paper_cnn.build_paper_cnn(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
     assert sum(p.numel() for p in net.parameters()) == 15_891_910
     assert [tuple(c.weight.shape) for c in net.convs] == [(32, 1, 15, 5), (64, 32, 15, 5)]
     assert net.dense.in_features == 15 * 16 * 64
-    r = neural_methods.PAPER_RECIPE
-    assert (r.batch, r.peak_rate, r.dropout, neural_methods.PAPER_STEPS) == (50, 1e-4, 0.25, 4000)
+    r = paper_cnn.PAPER_RECIPE
+    assert (r.batch, r.peak_rate, r.dropout, paper_cnn.PAPER_STEPS) == (50, 1e-4, 0.25, 4000)
     assert (r.weight_decay, r.smoothing, r.ema, r.noise, r.gain, r.adversarial) == (0,) * 6
     assert not r.cycle
-    other = neural_methods.tactnet2(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
+    other = paper_cnn.build_tactnet2(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
     assert sum(p.numel() for p in other.parameters()) == pytest.approx(1.84e6, rel=0.01)
 
 
 @pytest.mark.parametrize(("window", "steps"), [(1500, (150, 15)), (128, (13, 2)), (101, (11, 2)), (5, (1, 1))])
 def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
     """Zero padding handles over-flow: what is left at the end makes one step more, and is seen."""
-    net = networks.ImageNetwork(SweepFormat(1, 1, 100.0, window, "float32"), 2, 1.0, 0.0, networks.PAPER)
+    net = paper_cnn.ImageNetwork(SweepFormat(1, 1, 100.0, window, "float32"), 2, 1.0, 0.0, paper_cnn.PAPER)
     assert net.dense.in_features == 64 * steps[1]
     digits = torch.rand(1, window, 1, 1)
     with torch.no_grad():
@@ -90,10 +90,10 @@ def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
 @pytest.mark.slow
 def test_the_loop_is_adam_as_the_paper_prints_it():
     """Against PyTorch's Adam, step by step: batches in sequence from a shuffled set, shuffled again after each round."""
-    s, r = made((6, 12, 2, 1), "float32", 2), replace(neural_methods.PAPER_RECIPE, steps=5, batch=4, dropout=0.0)
+    s, r = made((6, 12, 2, 1), "float32", 2), replace(paper_cnn.PAPER_RECIPE, steps=5, batch=4, dropout=0.0)
     with torch.random.fork_rng():
         torch.manual_seed(3)
-        mine = networks.ImageNetwork(s.format, 2, 0.1, 60.0, replace(networks.PAPER, dense=8))
+        mine = paper_cnn.ImageNetwork(s.format, 2, 0.1, 60.0, replace(paper_cnn.PAPER, dense=8))
         plain = pickle.loads(pickle.dumps(mine))
     learnt, cost = training.learn(mine, s, r, 7)
     rng = torch.Generator().manual_seed(7)
@@ -114,17 +114,17 @@ def test_the_loop_is_adam_as_the_paper_prints_it():
 def test_adversarial_training_sees_the_worse_sweep():
     """The gradient is that of the sweep and of the one moved against it by the fast gradient sign, together."""
     s = made((6, 20, 2, 2), "float32", 2)
-    net = networks.ImageNetwork(s.format, 2, 0.1, 60.0, networks.ImageShape((4, 4), ((2, 1), (2, 1)), 2, False, 8))
+    net = paper_cnn.ImageNetwork(s.format, 2, 0.1, 60.0, paper_cnn.ImageLayers((4, 4), ((2, 1), (2, 1)), 2, False, 8))
     x, labels = net.prepare(torch.from_numpy(s.samples)), torch.from_numpy(s.labels)
     still = x.clone().requires_grad_()
-    cost = nn.functional.cross_entropy(net.judge(still), labels)
+    cost = nn.functional.cross_entropy(net.training_logits(still), labels)
     cost.backward()
-    worse = nn.functional.cross_entropy(net.judge(x + 0.1 * still.grad.sign()), labels)
+    worse = nn.functional.cross_entropy(net.training_logits(x + 0.1 * still.grad.sign()), labels)
     assert worse > cost
     worse.backward()
     want = [p.grad.clone() for p in net.parameters()]
     net.zero_grad()
-    told = training.descend(net, x, labels, FitRecipe(adversarial=0.1, smoothing=0.0))
+    told = training.backward(net, x, labels, FitRecipe(adversarial=0.1, smoothing=0.0))
     assert told == pytest.approx(cost.item())
     for p, gradient in zip(net.parameters(), want, strict=True):
         torch.testing.assert_close(p.grad, gradient)
@@ -150,17 +150,17 @@ def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str
 def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
     """Real sizes with random weights, or the smallest training: 1500 x 4 x 4 of uint8."""
     build = {
-        "paper-cnn": neural_methods.paper_cnn,
-        "paper-cnn-centred": neural_methods.paper_cnn_centred,
-        "tactnet2": neural_methods.tactnet2,
-        "recurrent": neural_methods.recurrent,
+        "paper-cnn": paper_cnn.build_paper_cnn,
+        "paper-cnn-centred": paper_cnn.build_centred,
+        "tactnet2": paper_cnn.build_tactnet2,
+        "recurrent": recurrent.build_recurrent,
     }.get(name)
     digits = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
     with torch.random.fork_rng():
         torch.manual_seed(0)
         form, plain = skin.FORMAT, network.Compact(skin.FORMAT, 6, 0.1, norm=False)
         net = build(form, 6, digits) if build else plain
-    check_agrees(neural_methods.NetworkModel(net.eval(), ""), digits)
+    check_agrees(training.NetworkModel(net.eval(), ""), digits)
 
 
 @pytest.mark.slow
@@ -293,14 +293,14 @@ def test_bfloat16_is_used_where_it_is_asked_for_and_there():
 
 def test_effort_is_kept():
     """Names, iterations and logs follow the effort; methods can be sent to another process."""
-    assert tuple(m.name for m in neural_methods.METHODS) == NETS
-    assert all(m.input == "raw" and "\n" not in m.about for m in neural_methods.METHODS)
+    assert tuple(m.name for m in (*paper_cnn.METHODS, *recurrent.METHODS)) == NETS
+    assert all(m.input == "raw" and "\n" not in m.about for m in (*paper_cnn.METHODS, *recurrent.METHODS))
     if not torch.cuda.is_available():
-        assert f"{neural_methods.PROCESSOR_STEPS} iterations" in neural_methods.METHODS[0].about
+        assert f"{paper_cnn.PROCESSOR_STEPS} iterations" in paper_cnn.METHODS[0].about
     assert "17 iterations" in method("paper-cnn", Effort(paper_steps=17)).about
     lines: list[str] = []
     s = easy(4)
-    neural_methods.methods(BRIEF, lines.append)[3].train(s, s.samples, 1)
+    recurrent.methods(BRIEF, lines.append)[0].train(s, s.samples, 1)
     assert lines[-1].startswith("step 4/4 loss")
     again = pickle.loads(pickle.dumps(method("recurrent")))
     np.testing.assert_array_equal(

@@ -42,7 +42,7 @@ def atoms(n: int, rows: int = 2, cols: int = 2, frames: int = 12) -> np.ndarray:
 def test_the_codes_are_those_of_orthogonal_matching_pursuit():
     """Each patch gets the four atoms, and the amounts of them, that scikit-learn finds."""
     x, d = patches(50), atoms(40)
-    codes = sthmp.coded(x, d)
+    codes = sthmp.encode(x, d)
     want = orthogonal_mp(d.reshape(40, -1).T.astype(np.float64), x.reshape(50, -1).T, n_nonzero_coefs=sthmp.ACTIVE).T
     np.testing.assert_array_equal((codes != 0).sum(axis=1), sthmp.ACTIVE)
     np.testing.assert_allclose(codes, want, rtol=0, atol=1e-4)
@@ -51,9 +51,9 @@ def test_the_codes_are_those_of_orthogonal_matching_pursuit():
 def test_a_patch_of_fewer_atoms_stays_so():
     """Nothing, one atom, or a dictionary of one: what is left over is nothing, and no number grows."""
     d = atoms(9)
-    codes = sthmp.coded(np.stack([0 * d[0], -3 * d[4]]), d)
+    codes = sthmp.encode(np.stack([0 * d[0], -3 * d[4]]), d)
     np.testing.assert_allclose(codes, np.array([np.zeros(9), -3.0 * np.eye(9)[4]]), rtol=0, atol=1e-3)
-    np.testing.assert_allclose(sthmp.coded(2 * d[:1], d[:1]), [[2]], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(sthmp.encode(2 * d[:1], d[:1]), [[2]], rtol=0, atol=1e-3)
 
 
 def by_loops(sweep: np.ndarray, d: np.ndarray, scale: float) -> np.ndarray:
@@ -65,7 +65,7 @@ def by_loops(sweep: np.ndarray, d: np.ndarray, scale: float) -> np.ndarray:
         sweep[t : t + frames, r : r + height, c : c + width] for t in steps for r in range(rows) for c in range(cols)
     ]
     x = np.array(cut, np.float64) * scale
-    codes = sthmp.coded(x - x.mean(axis=1, keepdims=True), d).reshape(len(steps), rows, cols, -1)
+    codes = sthmp.encode(x - x.mean(axis=1, keepdims=True), d).reshape(len(steps), rows, cols, -1)
 
     def halves(n: int) -> list[slice]:
         return [slice(0, n), slice(0, (n + 1) // 2), slice(n // 2, n)] if n > 1 else [slice(0, 1)]
@@ -114,13 +114,13 @@ def test_the_dictionary_finds_what_patches_are_made_of(monkeypatch: pytest.Monke
     for row in mix:
         row[rng.choice(20, 2, replace=False)] = rng.choice([-1, 1], 2) * rng.uniform(1, 2, 2)
     x = np.tensordot(mix, truth, 1)
-    found = sthmp.dictionary(x, np.random.default_rng(0))
+    found = sthmp.learn_dictionary(x, np.random.default_rng(0))
     flat = found.reshape(20, -1)
     np.testing.assert_allclose(np.linalg.norm(flat, axis=1), 1, atol=1e-5)
     alike = np.abs(flat @ truth.reshape(20, -1).T)
     assert (alike.max(axis=0) > 0.95).sum() >= 15
     assert (np.abs(flat @ flat.T) - np.eye(20)).max() < 0.999
-    left = x - np.tensordot(sthmp.coded(x, found), found, 1)
+    left = x - np.tensordot(sthmp.encode(x, found), found, 1)
     assert np.square(left).sum() < 0.1 * np.square(x).sum()
     np.testing.assert_allclose(found.mean(axis=1), 0, atol=1e-6)
 

@@ -114,8 +114,8 @@ def test_tensors_are_told_as_pytorch_has_them(fitted: Fit):
 
 def test_a_layer_that_saturates_is_the_one_that_is_named(fitted: Fit):
     """A stage whose range is a fifth: its values are cut off, its signal drowns; those before are as they were."""
-    *before, last = fitted.reach.responses
-    broken = replace(fitted, reach=replace(fitted.reach, responses=(*before, last / 5)))
+    *before, last = fitted.ranges.responses
+    broken = replace(fitted, ranges=replace(fitted.ranges, responses=(*before, last / 5)))
     whole, cut = (activations(measured(one)) for one in (fitted, broken))
     assert cut[:-1] == whole[:-1]
     assert whole[-1].saturated < 0.005 < 0.1 < cut[-1].saturated
@@ -142,7 +142,7 @@ def test_any_quantized_graph_can_be_looked_at(fitted: Fit):
     reference, _ = quantized_bundle.graphs(fitted)
     int8 = quantize(reference, fitted.train.samples)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels, reference)
-    assert len(activations(found)) == len(fitted.shape.channels)
+    assert len(activations(found)) == len(fitted.architecture.channels)
     assert all(layer.sqnr_db > 15 for layer in activations(found))
     assert found.tap_sum > 0
 
@@ -152,7 +152,7 @@ def test_a_bundle_is_told_without_float(fitted: Fit):
     reference, int8 = quantized_bundle.graphs(fitted)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels)
     assert (found.apart, found.lost, {layer.against for layer in found.layers}) == (None, None, {"itself"})
-    assert len(found.layers) >= len(fitted.shape.channels)
+    assert len(found.layers) >= len(fitted.architecture.channels)
     assert "holds no float form" in parity.table(found)
     with pytest.raises(FormatError, match="no int8 tensors"):
         parity.measure(reference, fitted.held.samples, fitted.held.labels)

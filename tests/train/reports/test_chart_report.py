@@ -66,8 +66,8 @@ def test_the_family_counts_its_costs_as_the_chart_does():
     (method,) = methods.find(["compact-10k"], methods.Effort(share=0.0))
     known = sweeps()
     model = method.train(known, known.samples, 1)
-    told, bands = model.made.shape.cost(known.format, 2), model.made.bands
-    alone = graph.trunk(known.format, model.made.scale, {}, ARCHITECTURES["bands"])
+    told, bands = model.fit.architecture.cost(known.format, 2), model.fit.bands
+    alone = graph.trunk_graph(known.format, model.fit.scale, {}, ARCHITECTURES["bands"])
     more = [count(alone) + 2 * bands if bands else 0 for count in (cost.weights, cost.macs)]
     for one in (model, model.forms["float"]):
         assert cost.weights(one.graph()) == told.weights + more[0]

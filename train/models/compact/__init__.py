@@ -1,1 +1,1 @@
-"""The default network family: architecture, training, graphs."""
+"""The compact networks, the box's default: architectures, training, graphs in float and int8."""

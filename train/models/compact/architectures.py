@@ -1,7 +1,7 @@
-"""The room of the ladder. In: a number of weights. Out: a Architecture, what a compact network of that size is made of.
+"""The architectures of the compact network. In: a size. Out: an Architecture, with its stages and its cost.
 
-One architecture in several sizes: dense strided convolutions over time with the taxels as input channels; the head sees
-the log of every stage's mean responses.
+All sizes are alike: dense strided convolutions over time with the taxels as input channels; the head sees the logarithm
+of every stage's mean responses.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
 
 FLOOR = 0.02
-"""Added to a mean response before its logarithm: a silent channel stays finite."""
-LEAST_STEPS = 24
-"""Time steps that the last stage should have: a mean over less is mostly noise."""
+"""Added to a mean response before its logarithm, so that a silent channel stays finite."""
+MIN_LAST_STEPS = 24
+"""Time steps that the last stage should have: a mean over fewer is mostly noise."""
 LATER = (5, 2)
 """Kernel and stride of the stages after the first."""
-SHORT = 4
-"""The first kernel of a window that does not allow any stride."""
+SHORT_KERNEL = 4
+"""The first kernel for a window that does not allow any stride."""
 MAINS_HZ = 50.0
-"""What is not heard. Of 60 Hz three quarters still pass 32 frames at 750 Hz."""
+"""Frequency that is filtered out. Three quarters of 60 Hz still pass a kernel of 32 frames at 750 Hz."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,11 @@ class Cost:
 
 @dataclass(frozen=True)
 class Architecture:
-    """A rung of the ladder. channels: of each stage; kernel and stride: of the first stage for long windows.
+    """The layers of one size. channels: of each stage; kernel and stride: of the first stage for long windows.
 
-    planned: how many stages there were before some were cut off, 0 for no more than there are; all may be. spectrum:
-    whether the head sees the bands of spectrum.py behind the stages' responses. fewest: stages that are not cut off.
+    planned: how many stages there were before some were cut off, 0 if none were; with none left the head sees only the
+    spectrum. spectrum: whether the head sees the bands of spectrum.py after the stages' responses. fewest: number of
+    stages that are never cut off.
     """
 
     channels: tuple[int, ...]
@@ -61,23 +62,23 @@ class Architecture:
     fewest: int = 1
 
     def cut(self, depth: int, spectrum: bool = False) -> Architecture:
-        """The first `depth` stages, each as it was, and the spectrum or not."""
+        """The first `depth` stages, each as it was, with the spectrum or without."""
         planned = max(self.planned, len(self.channels))
         return replace(self, channels=self.channels[:depth], planned=planned, spectrum=spectrum)
 
     def stages(self, window: int) -> tuple[Stage, ...]:
         """The stages for a window of so many frames.
 
-        Kernel and stride of the first are halved as long as the last stage has less than LEAST_STEPS; where that leaves
-        no stride, the kernel is SHORT. Raises FormatError where the window is too short for any.
+        Kernel and stride of the first are halved as long as the last stage has fewer steps than MIN_LAST_STEPS; where
+        that leaves no stride, the kernel is SHORT_KERNEL. Raises FormatError where the window is too short for any.
         """
-        return self._stages(window)[: len(self.channels)]
+        return self._planned_stages(window)[: len(self.channels)]
 
-    def _stages(self, window: int) -> tuple[Stage, ...]:
+    def _planned_stages(self, window: int) -> tuple[Stage, ...]:
         kernel, stride = self.kernel, self.stride
-        while (plan := self._plan(window, kernel, stride))[-1].steps < LEAST_STEPS and stride > 1:
+        while (plan := self._plan(window, kernel, stride))[-1].steps < MIN_LAST_STEPS and stride > 1:
             stride //= 2
-            kernel = kernel // 2 if stride > 1 else SHORT
+            kernel = kernel // 2 if stride > 1 else SHORT_KERNEL
         if plan[-1].steps < 1:
             raise FormatError(f"a window of {window} frames is too short for the network; record at least 16")
         return plan
@@ -90,20 +91,20 @@ class Architecture:
         return tuple(plan)
 
     def zero_sum(self, window: int) -> bool:
-        """Whether the first stage's kernels sum to zero over time for every taxel: no offset or slow drift moves them.
+        """Whether the first stage's kernels sum to zero over time for every taxel, so that no offset or slow drift matters.
 
-        So they do where the window is long enough for a stride. A slow sensor's texture lies in just these low
-        frequencies; there each taxel's mean over the window is taken away instead.
+        They do where the window is long enough for a stride. A slow sensor's texture lies in just these low frequencies:
+        there each taxel's mean over the window is subtracted instead.
         """
-        return self._stages(window)[0].stride > 1
+        return self._planned_stages(window)[0].stride > 1
 
     def cost(self, form: SweepFormat, classes: int) -> Cost:
-        """Of convolutions and head, as they stand in the graph."""
+        """Of convolutions and head, as they are in the graph."""
         head = sum(self.channels) * classes
         weights, macs, inputs = head + classes, head, form.rows * form.cols
         for stage, outputs in zip(self.stages(form.window), self.channels, strict=True):
-            each = inputs * stage.kernel * outputs
-            weights, macs, inputs = weights + each + outputs, macs + each * stage.steps, outputs
+            taps = inputs * stage.kernel * outputs
+            weights, macs, inputs = weights + taps + outputs, macs + taps * stage.steps, outputs
         return Cost(weights, macs)
 
 
@@ -116,19 +117,20 @@ ARCHITECTURES = {
     "50k": Architecture((40, 48, 64)),
     "100k": Architecture((32, 72, 104)),
 }
-"""By about how many weights they have at most, for 1500 x 4 x 4 digits and six materials; the last is as large as its
-bundle may be, the first has nothing but the spectrum and a head."""
+"""By the approximate maximum of their weights, for 1500 x 4 x 4 raw counts and six materials. The last is as large as its
+bundle may be; the first has only the spectrum and a head."""
 DEFAULT = replace(ARCHITECTURES["20k"], fewest=0)
-"""Of the box's own method: no stage at all where the spectrum alone does as well."""
+"""Of the method `compact`: all stages may be cut off where the spectrum alone does as well."""
 
 
 @dataclass(frozen=True)
-class Cap:
-    """A taxel that trembles more than others is turned down: a broken one must not drown the rest.
+class NoiseLimit:
+    """A taxel that is much noisier than others is attenuated: a broken one must not drown the rest.
 
-    The mean difference of neighbouring frames, of `pairs` pairs at most, is compared with that of the strongest taxel
-    after a quarter of all (the fifth of 16, none of three): more than `times` of it is turned down to that. A quarter,
-    not half: where a finger touches few taxels only, most are silent. Nothing is turned down where that one is silent.
+    A taxel's noise is its mean difference between neighbouring frames, over `pairs` pairs at most. The reference is the
+    taxel at rank a quarter of all, the noisiest first (the fifth of 16, the noisiest of three): more than `times` its
+    noise is scaled down to that. A quarter and not half: where a finger touches only a few taxels, most are silent.
+    Nothing is attenuated where the reference is silent.
     """
 
     times: float = 3.0
@@ -138,9 +140,9 @@ class Cap:
         """Frames from one pair to the next."""
         return max(window // self.pairs, 1)
 
-    def place(self, taxels: int) -> int:
-        """Which taxel they are compared with, the strongest being 0."""
+    def rank(self, taxels: int) -> int:
+        """The rank of the reference taxel, the noisiest being 0."""
         return taxels // 4
 
 
-CAP = Cap()
+NOISE_LIMIT = NoiseLimit()

@@ -1,14 +1,14 @@
-"""The room of training. In: a Dataset and a seed. Out: a Fit, which holds the network and the sweeps it saw.
+"""Training of the compact network. In: a Dataset and a seed. Out: a Fit, which holds the network and the sweeps it saw.
 
-The convolutions are trained by gradient on sweeps that vary as the scene does; then shrinkage LDA in closed form
-replaces the head, one for the network and one for its int8 trunk. Groups that were held out tell how many stages the
-heads should see, and give one temperature that makes probabilities honest. No random state outside is read or changed.
+The convolutions are trained by gradient descent on augmented sweeps. Then shrinkage LDA in closed form replaces the head,
+once for the network and once for its int8 trunk. Groups that were held out decide how many stages the heads see, and give
+one temperature that makes probabilities honest. No random state outside is read or changed.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import chain, product
@@ -26,52 +26,58 @@ from appliance.core.sweep_set import read
 from appliance.core.types import SweepFormat
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from train.data.sets import Dataset
-from train.metrics.score import figure
+from train.metrics.score import accuracy_figure
 from train.models import training
-from train.models.compact import graph, spectrum
+from train.models.compact import augment, graph, spectrum
 from train.models.compact.architectures import DEFAULT, Architecture
-from train.models.compact.augment import SLOW, Augmentation, vary
+from train.models.compact.augment import SLOW, Augmentation
 from train.models.compact.network import Compact
 from train.models.linear_head import closed_form_head, hold_out
 from train.models.networks import Network, texture_scale
-from train.models.training import Cost, Log, Vary, in_order, learn, one_thread, silent, tensors
+from train.models.training import Augment, Cost, Log, batches, float_batches, learn, no_log, one_thread
 from train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
-Seen = tuple[tuple[Array, Array], ...]
+HeadInputs = tuple[tuple[Array, Array], ...]
+"""(features of the training sweeps and their copies, features of the held-out sweeps) of the float and the int8 trunk."""
 COPIES = 2
-"""Of the training sweeps, changed as in training, that the closed-form head sees beside them."""
+"""Of the training sweeps, augmented as in training, that the closed-form head sees beside them."""
 
 
 @dataclass(frozen=True)
 class FitRecipe(training.TrainingRecipe):
     """How the compact network is trained.
 
-    scene: what varies, and so do the training sweeps; gain and noise are its matter. None: `usual`.
-    keep_means: see Compact; the convolutions never see them, the closed-form head does.
+    augmentation: of the training sweeps, None for `default_augmentation`; it replaces gain and noise. keep_means: see
+    Compact; the convolutions never see the means, the closed-form head does.
     """
 
     steps: int = 600
     noise: float = 0.0
     gain: float = 0.0
-    scene: Augmentation | None = None
+    augmentation: Augmentation | None = None
     keep_means: bool = False
+
+    def json(self) -> dict[str, Any]:
+        """What a fit and its bundle's manifest record."""
+        fields = asdict(self)
+        return fields | {"scene": fields.pop("augmentation")}
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A trained network. weights: the state of a fused Compact with its LDA head, the temperature folded in; and one
-    more, `int8.weight` [K, F] and `int8.bias` [K], fitted on what the int8 trunk gives.
+    """A trained network. weights: the state of a fused Compact with its LDA head, the temperature folded in, and a second
+    head, `int8.weight` [K, F] and `int8.bias` [K], fitted to what the int8 trunk gives.
 
-    shape: its rung, cut to what the heads see. reach: what its int8 form reaches. train, held: what was trained on and
-    what was held out. about: JSON of how it was made and how it did. cost: (step, cross entropy) of the training; the
-    file does not keep it.
+    architecture: cut to what the heads see. ranges: of its int8 form. train, held: the sweeps that were trained on and
+    those that were held out. about: JSON of how it was made and validated. cost: (step, cross entropy) of the training;
+    the file does not keep it.
     """
 
     weights: dict[str, Array]
     scale: float
-    shape: Architecture
-    reach: graph.Ranges
+    architecture: Architecture
+    ranges: graph.Ranges
     train: Dataset
     held: Dataset
     about: dict[str, Any]
@@ -84,70 +90,76 @@ class Fit:
 
     @property
     def bands(self) -> int:
-        """How many of the features, the last ones, are of the spectrum and were not learnt."""
-        return self.shape.spectrum * spectrum.count(self.train.format)
+        """How many of the features, the last ones, are of the spectrum and were not learned."""
+        return self.architecture.spectrum * spectrum.count(self.train.format)
+
+    @property
+    def augment(self) -> Augment:
+        """The augmentation of its training, for sweeps of its format."""
+        return augmenter(self.train.format, Augmentation(**self.about["recipe"]["scene"]))
 
     def network(self) -> Compact:
         """The network in PyTorch, ready to run."""
-        with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and written over
+        with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and overwritten
             form, classes = self.train.format, len(self.train.materials)
-            model = Compact(form, classes, self.scale, False, self.keep_means, self.shape)
+            model = Compact(form, classes, self.scale, False, self.keep_means, self.architecture)
         state = {k: torch.from_numpy(v) for k, v in self.weights.items() if not k.startswith("int8.")}
         model.load_state_dict(state)
         return model.eval()
 
     def trunk(self, int8: bool = True, tenths: bool = False) -> onnx.ModelProto:
-        """`sweep` -> `features` float32 [1, F], or `tenths` float32 [1, 10, F]; see exact.trunk."""
-        reach, form = self.reach if int8 else None, self.train.format
-        return graph.trunk(form, self.scale, self.weights, self.shape, reach, tenths, self.keep_means)
+        """`sweep` -> `features` float32 [1, F], or `tenths` float32 [1, 10, F]; see graph.trunk_graph."""
+        ranges, form = self.ranges if int8 else None, self.train.format
+        return graph.trunk_graph(form, self.scale, self.weights, self.architecture, ranges, tenths, self.keep_means)
 
     def int8_head(self) -> tuple[Array, Array]:
         """Weight [K, F] and bias [K] of the int8 trunk's head, the temperature folded in."""
         return self.weights["int8.weight"], self.weights["int8.bias"]
 
     def save(self, path: Path) -> None:
-        """Write the fit as one .npz without pickle; training and held-out sweeps are one set with a mark."""
-        both = {
+        """Write the fit as one .npz without pickle; training and held-out sweeps are one set, the first of them trained on."""
+        sets = {
             f"set_{k}": np.concatenate([getattr(self.train, k), getattr(self.held, k)]) for k in ("samples", "labels")
         }
-        arrays = {f"weight_{k}": v for k, v in self.weights.items()} | both
+        arrays = {f"weight_{k}": v for k, v in self.weights.items()} | sets
         for name in self.train.groups:
             arrays[f"group_{name}"] = np.concatenate([self.train.groups[name], self.held.groups[name]])
-        meta = {"scale": self.scale, "shape": asdict(self.shape), "reach": asdict(self.reach),
+        meta = {"scale": self.scale, "shape": asdict(self.architecture), "reach": asdict(self.ranges),
                 "materials": self.train.materials, "rate_hz": self.train.rate_hz,
                 "source": self.train.source, "trained_on": len(self.train), "about": self.about}  # fmt: skip
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as f:
-            np.savez_compressed(f, meta=np.array(json.dumps(meta)), **arrays)
+            np.savez_compressed(f, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Fit:
         """Read what `save` wrote. Raises FormatError where it is something else."""
         what = "a fit (made by palpate-train fit)"
-        held = read(path, what)
+        arrays = read(path, what)
         try:
-            meta = json.loads(str(held["meta"]))
+            meta = json.loads(str(arrays["meta"]))
             weights, groups = (
-                {k.removeprefix(p): v for k, v in held.items() if k.startswith(p)} for p in ("weight_", "group_")
+                {k.removeprefix(p): v for k, v in arrays.items() if k.startswith(p)} for p in ("weight_", "group_")
             )
-            samples, labels, materials = held["set_samples"], held["set_labels"], tuple(meta["materials"])
-            whole = Dataset(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
-            first = np.arange(len(whole)) < meta["trained_on"]
-            shape = Architecture(**meta["shape"] | {"channels": tuple(meta["shape"]["channels"])})
-            reach = graph.Ranges(meta["reach"]["digits"], tuple(meta["reach"]["responses"]))
-            made = cls(weights, meta["scale"], shape, reach, whole.take(first), whole.take(~first), meta["about"])
+            samples, labels, materials = arrays["set_samples"], arrays["set_labels"], tuple(meta["materials"])
+            sweeps = Dataset(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
+            first = np.arange(len(sweeps)) < meta["trained_on"]
+            architecture = Architecture(**meta["shape"] | {"channels": tuple(meta["shape"]["channels"])})
+            ranges = graph.Ranges(meta["reach"]["digits"], tuple(meta["reach"]["responses"]))
+            train, held = sweeps.take(first), sweeps.take(~first)
+            fit = cls(weights, meta["scale"], architecture, ranges, train, held, meta["about"])
         except (KeyError, ValueError, TypeError) as e:
             raise FormatError(f"{path.name}: not {what}, or of another version; fit again: {e}") from e
         try:
-            made.network()
+            fit.network()
         except RuntimeError as e:
-            raise FormatError(f"{path.name}: its weights are not those of its {shape}; fit again") from e
-        return made
+            raise FormatError(f"{path.name}: its weights are not those of its {architecture}; fit again") from e
+        return fit
 
 
-def fit(sweeps: Dataset, seed: int, recipe: FitRecipe, log: Log = silent, shape: Architecture = DEFAULT) -> Fit:
-    """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it, and for windows too short."""
-    return fit_on(*hold_out(sweeps, seed), seed, recipe, log, shape)
+def fit(sweeps: Dataset, seed: int, recipe: FitRecipe, log: Log = no_log, architecture: Architecture = DEFAULT) -> Fit:
+    """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it does, and for windows too short."""
+    return fit_on(*hold_out(sweeps, seed), seed, recipe, log, architecture)
 
 
 def fit_on(
@@ -156,89 +168,108 @@ def fit_on(
     by: str,
     seed: int,
     recipe: FitRecipe,
-    log: Log = silent,
-    shape: Architecture = DEFAULT,
+    log: Log = no_log,
+    architecture: Architecture = DEFAULT,
 ) -> Fit:
-    """Train on `train`; `held` gives temperature and validation. by: how they were parted, for the story."""
-    if not (shape.channels or spectrum.count(train.format)):
-        raise FormatError(f"a window of {train.format.window} frames is too short for a spectrum; take another rung")
-    recipe = replace(recipe, scene=(scene := recipe.scene or usual(train.format, shape)))
-    scale, change = texture_scale(train.samples), partial(varied, rows=train.format.rows, scene=scene)
+    """Train on `train`; `held` gives temperature and validation. by: the group that separates the two, for the record."""
+    form, bands = train.format, spectrum.count(train.format)
+    if not (architecture.channels or bands):
+        raise FormatError(f"a window of {form.window} frames is too short for a spectrum; take another size")
+    recipe = replace(recipe, augmentation=recipe.augmentation or default_augmentation(form, architecture))
+    assert recipe.augmentation
+    scale, change = texture_scale(train.samples), augmenter(form, recipe.augmentation)
     with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
-        model = Compact(train.format, len(train.materials), scale, shape=shape)
-        with torch.enable_grad():
-            model, cost = learn(model, train, recipe, seed, log, vary=change) if shape.channels else (model.fused(), [])
-        model.keep_means, model.shape = recipe.keep_means, replace(shape, spectrum=spectrum.count(train.format) > 0)
-        reach = model.reach(train.samples)
-        seen = _seen(model, reach, train, held, copies(model, train, change, seed))
-        model, weights = _judged(model, seen, np.tile(train.labels, COPIES + 1), held.labels)
+        model, cost = Compact(form, len(train.materials), scale, architecture=architecture), Cost()
+        if architecture.channels:
+            with torch.enable_grad():
+                model, cost = learn(model, train, recipe, seed, log, augment=change)
+        else:
+            model = model.fused()
+        model.keep_means, model.architecture = recipe.keep_means, replace(architecture, spectrum=bands > 0)
+        ranges = model.ranges(train.samples)
+        inputs = _head_inputs(model, ranges, train, held, copies(model, train, change, seed))
+        model, weights = _select_depth(model, inputs, np.tile(train.labels, COPIES + 1), held.labels)
         logits = features(model, held) @ weights["head.weight"].T + weights["head.bias"]
     right = int(np.sum(logits.argmax(1) == held.labels))
-    about = {"seed": seed, "recipe": asdict(recipe), "held_out_by": by, "validation": figure(right, len(held))}
-    reach = replace(reach, responses=reach.responses[: len(model.convs)])
-    return Fit(weights, scale, model.shape, reach, train, held, about, cost)
+    about = {"seed": seed, "recipe": recipe.json(), "held_out_by": by, "validation": accuracy_figure(right, len(held))}
+    ranges = replace(ranges, responses=ranges.responses[: len(model.convs)])
+    return Fit(weights, scale, model.architecture, ranges, train, held, about, cost)
 
 
-def _seen(model: Compact, reach: graph.Ranges, train: Dataset, held: Dataset, more: Iterable[Dataset]) -> Seen:
+def _head_inputs(
+    model: Compact, ranges: graph.Ranges, train: Dataset, held: Dataset, more: Iterable[Dataset]
+) -> HeadInputs:
     """What the heads see of the training sweeps with their copies, and of those held out: (float, int8)."""
-    trunk = graph.trunk(model.form, model.scale, model.weights(), model.shape, reach, keep_means=model.keep_means)
-    asked = (partial(features, model), lambda sweeps: run(trunk, sweeps.samples))
-    rows = [[ask(sweeps) for ask in asked] for sweeps in chain([train], more)]
+    trunk = graph.trunk_graph(
+        model.form, model.scale, model.weights(), model.architecture, ranges, keep_means=model.keep_means
+    )
+    trunks: tuple[Callable[[Dataset], Array], ...] = (
+        partial(features, model),
+        lambda sweeps: run(trunk, sweeps.samples),
+    )
+    rows = [[compute(sweeps) for compute in trunks] for sweeps in chain([train], more)]
     return tuple(
-        (np.concatenate(of_all), ask(held)) for of_all, ask in zip(zip(*rows, strict=True), asked, strict=True)
+        (np.concatenate(of_all), compute(held)) for of_all, compute in zip(zip(*rows, strict=True), trunks, strict=True)
     )
 
 
-def _judged(model: Compact, seen: Seen, labels: Array, held_labels: Array) -> tuple[Compact, dict[str, Array]]:
-    """The network behind the heads, and all weights of a Fit.
+def _select_depth(
+    model: Compact, inputs: HeadInputs, labels: Array, held_labels: Array
+) -> tuple[Compact, dict[str, Array]]:
+    """The network that the heads see, cut, and all weights of a Fit.
 
-    The heads see the first stages, with the spectrum or without, whichever names the held-out sweeps with the least
-    surprise; of equal ones the least. What comes after is cut off. Later stages know the training sweeps too well, and
-    a head that was found on these trusts them too much.
+    The heads see the first stages, with the spectrum or without: the choice with the least cross entropy on the held-out
+    sweeps, and among equal ones the smallest. The rest is cut off. Later stages fit the training sweeps too closely, and
+    a head that was fitted to these trusts them too much.
     """
-    size, whole = sum(model.shape.channels), seen[1][0].shape[1]
-    bands = model.shape.spectrum * spectrum.count(model.form)
-    surprise = []
-    depths = range(min(model.shape.fewest, len(model.convs)), len(model.convs) + 1)
+    convolved, total = sum(model.architecture.channels), inputs[1][0].shape[1]
+    bands = model.architecture.spectrum * spectrum.count(model.form)
+    candidates = []
+    depths = range(min(model.architecture.fewest, len(model.convs)), len(model.convs) + 1)
     for depth, with_bands in product(depths, (True, False) if bands else (False,)):
         if not depth and not with_bands:
             continue
-        columns = np.r_[: sum(model.shape.channels[:depth]), size : whole - bands * (not with_bands)]
-        heads = [closed_form_head(x[:, columns], labels, y[:, columns], held_labels) for x, y in seen]
+        columns = np.r_[: sum(model.architecture.channels[:depth]), convolved : total - bands * (not with_bands)]
+        heads = [closed_form_head(x[:, columns], labels, y[:, columns], held_labels) for x, y in inputs]
         weight, bias = heads[1]
-        p = softmax(seen[1][1][:, columns] @ weight.T + bias)[np.arange(len(held_labels)), held_labels]
-        surprise.append((-np.log(np.maximum(p, LEAST_PROBABILITY)).mean(), depth, with_bands, heads))
-    _, depth, with_bands, heads = min(surprise, key=lambda one: one[0])
+        p = softmax(inputs[1][1][:, columns] @ weight.T + bias)[np.arange(len(held_labels)), held_labels]
+        candidates.append((-np.log(np.maximum(p, LEAST_PROBABILITY)).mean(), depth, with_bands, heads))
+    _, depth, with_bands, heads = min(candidates, key=lambda candidate: candidate[0])
     model = model.cut(depth, with_bands)
-    named = {  # what all materials have in common changes no probability, and takes digits from float32
+    head_weights = {  # what all materials have in common changes no probability, and costs float32 precision
         f"{name}.{k}": v - v.mean(axis=0)
         for name, head in zip(("head", "int8"), heads, strict=True)
         for k, v in zip(("weight", "bias"), head, strict=True)
     }
-    model.head.weight.data, model.head.bias.data = (torch.from_numpy(named[f"head.{k}"]) for k in ("weight", "bias"))
-    return model, {k: v.numpy() for k, v in model.state_dict().items()} | named
+    model.head.weight.data = torch.from_numpy(head_weights["head.weight"])
+    model.head.bias.data = torch.from_numpy(head_weights["head.bias"])
+    return model, {k: v.numpy() for k, v in model.state_dict().items()} | head_weights
 
 
-def usual(form: SweepFormat, shape: Architecture) -> Augmentation:
-    """What varies where nobody says it: another scene for a sensor that is too slow for kernels that sum to zero."""
-    return Augmentation() if shape.zero_sum(form.window) else SLOW
+def default_augmentation(form: SweepFormat, architecture: Architecture) -> Augmentation:
+    """The augmentation where none is given: SLOW for a sensor that is too slow for kernels that sum to zero."""
+    return Augmentation() if architecture.zero_sum(form.window) else SLOW
 
 
-def varied(x: Tensor, rng: Generator, rows: int, scene: Augmentation) -> Tensor:
-    """augment.vary, as the loop calls it."""
-    return vary(x, rows, scene, rng)
+def augmenter(form: SweepFormat, augmentation: Augmentation) -> Augment:
+    """augment.augment for sweeps of `form`, as the training loop calls it."""
+
+    def change(x: Tensor, rng: Generator) -> Tensor:
+        return augment.augment(x, form.rows, augmentation, rng)
+
+    return change
 
 
-def copies(model: Compact, sweeps: Dataset, change: Vary, seed: int) -> Iterator[Dataset]:
-    """The sweeps again COPIES times as the scene might have given them: the head must know how materials vary, too."""
+def copies(model: Compact, sweeps: Dataset, change: Augment, seed: int) -> Iterator[Dataset]:
+    """The sweeps again, COPIES times, changed: they show the head how materials vary."""
     rng, kind = torch.Generator().manual_seed(seed), sweeps.samples.dtype
     for _ in range(COPIES):
         changed = np.empty_like(sweeps.samples)
-        picks = in_order(len(sweeps))
-        for pick, digits in zip(picks, tensors(sweeps.samples, picks), strict=True):
-            x = change(model.prepare(digits), rng) / model.scale
-            x = x.transpose(1, 2).unflatten(2, digits.shape[2:]) + digits.mean(1, keepdim=True)
+        picks = batches(len(sweeps))
+        for pick, counts in zip(picks, float_batches(sweeps.samples, picks), strict=True):
+            x = change(model.prepare(counts), rng) / model.scale
+            x = x.transpose(1, 2).unflatten(2, counts.shape[2:]) + counts.mean(1, keepdim=True)
             if kind.kind != "f":
                 x = x.round().clamp(np.iinfo(kind).min, np.iinfo(kind).max)
             changed[pick.numpy()] = x.numpy()
@@ -248,4 +279,4 @@ def copies(model: Compact, sweeps: Dataset, change: Vary, seed: int) -> Iterator
 @torch.no_grad()
 def features(model: Network, sweeps: Dataset) -> Array:
     """What the head sees of each sweep, float32 [N, F]."""
-    return np.concatenate([model.seen(x).numpy() for x in tensors(sweeps.samples, in_order(len(sweeps)))])
+    return np.concatenate([model.head_input(x).numpy() for x in float_batches(sweeps.samples, batches(len(sweeps)))])

@@ -1,4 +1,4 @@
-"""Tests of the room of augmentation."""
+"""Augmentation: what each parameter changes, and what it leaves alone."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from train.models.compact.augment import Augmentation, vary
+from train.models.compact.augment import Augmentation, augment
 
 OFF = Augmentation(**{f.name: 0.0 for f in fields(Augmentation)})
-KNOBS = ("gain", "gains", "silent", "stretch", "damped", "colour", "noise", "noisy", "drift", "hum", "clipped")
+NAMES = ("gain", "gains", "silent", "stretch", "damped", "colour", "noise", "noisy", "drift", "hum", "clipped")
 
 
 def sweeps(n: int = 16, taxels: int = 16, frames: int = 300, seed: int = 1) -> torch.Tensor:
@@ -19,9 +19,9 @@ def sweeps(n: int = 16, taxels: int = 16, frames: int = 300, seed: int = 1) -> t
     return x - x.mean(2, keepdim=True)
 
 
-def varied(x: torch.Tensor, rows: int = 4, seed: int = 2, **knobs: float) -> torch.Tensor:
-    """`x` with these knobs and no others."""
-    return vary(x, rows, replace(OFF, **knobs), torch.Generator().manual_seed(seed))
+def varied(x: torch.Tensor, rows: int = 4, seed: int = 2, **settings: float) -> torch.Tensor:
+    """`x` with these settings and no others."""
+    return augment(x, rows, replace(OFF, **settings), torch.Generator().manual_seed(seed))
 
 
 def band(x: torch.Tensor, low: float, high: float) -> torch.Tensor:
@@ -31,20 +31,20 @@ def band(x: torch.Tensor, low: float, high: float) -> torch.Tensor:
 
 
 def test_nothing_varies_at_zero_and_nothing_is_drawn():
-    """All knobs at 0: the sweeps as they are, the generator where it was."""
+    """All settings at 0: the sweeps as they are, the generator where it was."""
     x, rng = sweeps(), torch.Generator().manual_seed(3)
-    assert torch.equal(vary(x, 4, OFF, rng), x)
+    assert torch.equal(augment(x, 4, OFF, rng), x)
     assert torch.equal(rng.get_state(), torch.Generator().manual_seed(3).get_state())
 
 
 @pytest.mark.parametrize(
-    "knobs", [Augmentation(), replace(OFF, shift=1.0, moved=0.5), *(replace(OFF, **{k: 0.5}) for k in KNOBS)]
+    "settings", [Augmentation(), replace(OFF, shift=1.0, moved=0.5), *(replace(OFF, **{k: 0.5}) for k in NAMES)]
 )
-def test_every_knob_changes_sweeps_each_otherwise_and_leaves_its_input(knobs: Augmentation):
+def test_every_parameter_changes_sweeps_each_otherwise_and_leaves_its_input(settings: Augmentation):
     """Same generator, same bits; another one, others; sweeps that were equal differ; the input stays."""
     x = sweeps(1).expand(12, -1, -1).clone()
     before = x.clone()
-    once, again, other = (vary(x, 4, knobs, torch.Generator().manual_seed(seed)) for seed in (4, 4, 5))
+    once, again, other = (augment(x, 4, settings, torch.Generator().manual_seed(seed)) for seed in (4, 4, 5))
     assert once.shape == x.shape
     assert once.dtype == x.dtype
     assert once.isfinite().all()
@@ -57,11 +57,11 @@ def test_every_knob_changes_sweeps_each_otherwise_and_leaves_its_input(knobs: Au
 def test_no_random_state_outside_is_read_or_changed():
     """PyTorch's own generator neither matters nor moves."""
     state = torch.get_rng_state()
-    first = vary(sweeps(), 4, Augmentation(), torch.Generator().manual_seed(6))
+    first = augment(sweeps(), 4, Augmentation(), torch.Generator().manual_seed(6))
     assert torch.equal(torch.get_rng_state(), state)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(2)
-        assert torch.equal(vary(sweeps(), 4, Augmentation(), torch.Generator().manual_seed(6)), first)
+        assert torch.equal(augment(sweeps(), 4, Augmentation(), torch.Generator().manual_seed(6)), first)
 
 
 @pytest.mark.slow
@@ -95,8 +95,8 @@ def test_a_line_of_taxels_is_not_moved(rows: int):
 def test_gains_are_of_all_taxels_or_of_each():
     """A logarithm of the wanted spread; `gain` the same for all taxels of a sweep, `gains` not; the same at all times."""
     x = sweeps(400, frames=20)
-    for knob, taxels in (("gain", 1), ("gains", 16)):
-        ratio = varied(x, **{knob: 0.3}) / x
+    for name, taxels in (("gain", 1), ("gains", 16)):
+        ratio = varied(x, **{name: 0.3}) / x
         assert torch.allclose(ratio, ratio[..., :1], rtol=1e-3)
         assert (ratio > 0).all()
         log = ratio[..., 0].log()
@@ -201,9 +201,9 @@ def test_what_is_clipped_is_cut_off_above():
     [(1, 1, 1), (1, 1, 2), (3, 9, 20), (16, 16, 128), (1, 5, 33), (2, 6, 3000), (6, 12, 21)],
 )
 def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames: int):
-    """One taxel, one frame, odd lengths: with every knob up, silent sweeps stay finite and keep their shape."""
-    everything = replace(Augmentation(), **dict.fromkeys(KNOBS, 0.5))
+    """One taxel, one frame, odd lengths: with every name up, silent sweeps stay finite and keep their shape."""
+    everything = replace(Augmentation(), **dict.fromkeys(NAMES, 0.5))
     x = torch.zeros(5, taxels, frames)
-    now = vary(x, rows, everything, torch.Generator().manual_seed(7))
+    now = augment(x, rows, everything, torch.Generator().manual_seed(7))
     assert now.shape == x.shape
     assert now.isfinite().all()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from train.models.compact.augment import Augmentation
 from train.models.compact.fit import Fit, FitRecipe
 from train.models.compact.network import Compact
 from train.models.methods import Effort
+from train.onnx_tools import cost as graph_cost
 from train.onnx_tools import graph_builder
 
 SMALL = Architecture((6, 8, 8), 8, 2)
@@ -43,28 +43,28 @@ def drawn(form: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
 
 
 def trunks(
-    form: SweepFormat, shape: Architecture = SMALL, **asked: bool
+    form: SweepFormat, architecture: Architecture = SMALL, **asked: bool
 ) -> tuple[Compact, onnx.ModelProto, onnx.ModelProto]:
     """A network with random weights, its float and its int8 trunk."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = Compact(form, 3, 0.1, shape=shape)
+        model = Compact(form, 3, 0.1, architecture=architecture)
         model.train()(torch.from_numpy(drawn(form).astype(np.float32)))
     model = model.fused()
-    weights, reach = {k: v.numpy() for k, v in model.state_dict().items()}, model.reach(drawn(form))
-    return model, *(graph.trunk(form, 0.1, weights, shape, r, **asked) for r in (None, reach))
+    weights, found = {k: v.numpy() for k, v in model.state_dict().items()}, model.ranges(drawn(form))
+    return model, *(graph.trunk_graph(form, 0.1, weights, architecture, ranges, **asked) for ranges in (None, found))
 
 
 def seen(model: Compact, digits: np.ndarray) -> np.ndarray:
     """What PyTorch's head sees of the digits."""
     with torch.no_grad():
-        return model.seen(torch.from_numpy(digits.astype(np.float32))).numpy()
+        return model.head_input(torch.from_numpy(digits.astype(np.float32))).numpy()
 
 
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on the easy set."""
-    return fit.fit(easy(), 1, FitRecipe(steps=40), shape=SMALL)
+    return fit.fit(easy(), 1, FitRecipe(steps=40), architecture=SMALL)
 
 
 @pytest.mark.parametrize(("rows", "cols", "window", "dtype"),
@@ -92,7 +92,7 @@ def test_no_offset_moves_a_bit_of_bytes():
     values = {c.name: numpy_helper.to_array(c) for c in int8.graph.initializer}
     first = next(v for v in values.values() if v.dtype == np.int8 and v.ndim == 3)
     np.testing.assert_array_equal(first.sum(axis=2, dtype=int), 0)
-    assert np.abs(first).max() == graph.SEVEN_BITS
+    assert np.abs(first).max() == graph.MAX_TAP
     digits = drawn(form, 2)
     offset = np.random.default_rng(1).integers(0, 60, (2, 1, 4, 4)).astype(np.uint8)
     np.testing.assert_array_equal(graph_builder.run(int8, digits + offset), graph_builder.run(int8, digits))
@@ -145,7 +145,7 @@ def test_the_first_kernels_do_not_hear_the_mains():
     hum, tone = (torch.sin(2 * np.pi * hz * at + torch.rand(16, 1)) for hz in (50, 100))
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        deaf, short = (Compact(skin.FORMAT, 3, 1.0, shape=Architecture((6, 8), kernel, 4)) for kernel in (16, 8))
+        deaf, short = (Compact(skin.FORMAT, 3, 1.0, architecture=Architecture((6, 8), kernel, 4)) for kernel in (16, 8))
     with torch.no_grad():
         for model in (deaf, deaf.fused()):
             first = model.convs[0]
@@ -159,15 +159,15 @@ def test_a_trembling_taxel_is_turned_down():
     x = torch.randn(2, 16, 1500, generator=torch.Generator().manual_seed(0))
     loud = x.clone()
     loud[0, 3] *= 40
-    have = network.capped(loud)
+    have = network.limit_noise(loud)
     trembling = (have[:, :, 1::10] - have[:, :, :-1:10]).abs().mean(2)
     assert trembling[0, 3] == pytest.approx(3 * trembling[0].sort(descending=True).values[4].item(), rel=1e-5)
     others = torch.arange(16) != 3
     assert torch.equal(have[:, others], x[:, others])
     assert torch.equal(have[1], x[1])
     loud[:, 4:] = 0
-    assert torch.equal(network.capped(loud), loud)
-    assert torch.equal(network.capped(loud[:, 3:4]), loud[:, 3:4])
+    assert torch.equal(network.limit_noise(loud), loud)
+    assert torch.equal(network.limit_noise(loud[:, 3:4]), loud[:, 3:4])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
@@ -197,8 +197,8 @@ def test_a_rung_costs_what_it_says(name: str):
     """Weights of the float graph, multiply-accumulates of its convolutions and head; within what the issue allows."""
     cost = ARCHITECTURES[name].cost(skin.FORMAT, 6)
     assert cost.weights == pytest.approx(1000 * int(name[:-1]), rel=0.45)
-    plain = Compact(skin.FORMAT, 6, 0.1, norm=False, shape=ARCHITECTURES[name]).eval().graph()
-    assert graph_builder.weight_count(plain) == cost.weights
+    plain = Compact(skin.FORMAT, 6, 0.1, norm=False, architecture=ARCHITECTURES[name]).eval().graph()
+    assert graph_cost.weights(plain) == cost.weights
     inferred = onnx.shape_inference.infer_shapes(plain, strict_mode=True, data_prop=True).graph
     steps = {v.name: v.type.tensor_type.shape.dim[-1].dim_value for v in inferred.value_info}
     sizes = {c.name: c.dims for c in plain.graph.initializer}
@@ -207,7 +207,7 @@ def test_a_rung_costs_what_it_says(name: str):
     macs, kilobytes = LIMITS.get(f"compact-{name}", (12e6, 96))
     assert cost.macs <= macs
     for shape, limit in ((ARCHITECTURES[name], kilobytes), (replace(ARCHITECTURES[name], spectrum=True), 96)):
-        _, _, int8 = trunks(skin.FORMAT, shape=shape)
+        _, _, int8 = trunks(skin.FORMAT, architecture=shape)
         features = sum(shape.channels) + shape.spectrum * spectrum.count(skin.FORMAT)
         whole = graph_builder.with_head(int8, np.zeros((6, features)), np.zeros(6))
         assert len(whole.SerializeToString()) <= limit * 1024
@@ -215,7 +215,7 @@ def test_a_rung_costs_what_it_says(name: str):
 
 def test_every_operator_of_int8_is_fused(tmp_path: Path):
     """onnxruntime runs whole-number convolutions on bytes in the order they come, integer sums, and turns nothing."""
-    _, _, int8 = trunks(skin.FORMAT, shape=ARCHITECTURES["20k"])
+    _, _, int8 = trunks(skin.FORMAT, architecture=ARCHITECTURES["20k"])
     options = onnxruntime.SessionOptions()
     options.optimized_model_filepath = str(tmp_path / "optimized.onnx")
     options.log_severity_level = 3
@@ -236,10 +236,10 @@ def test_the_method_is_its_int8_graph():
     plain = model.forms["float"]
     np.testing.assert_allclose(plain.logits(s.samples), graph_builder.run(plain.graph(), s.samples), atol=1e-3)
     assert not any(n.op_type == "QuantizeLinear" for n in plain.graph().graph.node)
-    weight, bias = model.made.int8_head()
+    weight, bias = model.fit.int8_head()
     z = model.features(s.samples) @ weight.T + bias
     np.testing.assert_allclose(model.logits(s.samples), z, atol=1e-3)
-    size = sum(model.made.shape.channels) + model.made.bands
+    size = sum(model.fit.architecture.channels) + model.fit.bands
     assert model.features(s.samples[:2], tenths=True).shape == (2, 10, size)
 
 
@@ -247,7 +247,7 @@ def test_the_family_is_one_recipe_in_several_shapes():
     """Names in order of size; `compact` is one of the ladder that may lose all stages; effort reaches all."""
     made = {m.name: m for m in family.methods(Effort(share=0.01))}
     assert list(made) == [*(f"compact-{size}" for size in ARCHITECTURES), "compact"]
-    assert made["compact"].train.keywords["shape"] == replace(ARCHITECTURES["20k"], fewest=0)
+    assert made["compact"].train.keywords["architecture"] == replace(ARCHITECTURES["20k"], fewest=0)
     assert {name: shape.fewest for name, shape in ARCHITECTURES.items()} == dict.fromkeys(ARCHITECTURES, 1) | {
         "bands": 0
     }
@@ -281,53 +281,53 @@ def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, ban
     x, y = known[labels] + rng.standard_normal((90, 27)), rng.standard_normal((60, 27))
     y += np.where(useful, known[held], rng.standard_normal((60, 27)))
     for fewest in (0, 1):
-        model.shape = replace(SMALL, spectrum=True, fewest=fewest)
-        less, weights = fit._judged(model, ((x, y), (x, y)), labels, held)
+        model.architecture = replace(SMALL, spectrum=True, fewest=fewest)
+        less, weights = fit._select_depth(model, ((x, y), (x, y)), labels, held)
         least = max(depth, fewest)
-        assert (len(less.convs), less.shape) == (least, model.shape.cut(least, banded))
+        assert (len(less.convs), less.architecture) == (least, model.architecture.cut(least, banded))
         seen_by_heads = sum(SMALL.channels[:least]) + 5 * banded
         assert weights["int8.weight"].shape == weights["head.weight"].shape == (3, seen_by_heads)
     if not useful[BANDS].any():
-        model.shape = SMALL
-        less, _ = fit._judged(model, ((x[:, ~BANDS], y[:, ~BANDS]),) * 2, labels, held)
-        assert less.shape == SMALL.cut(depth)
+        model.architecture = SMALL
+        less, _ = fit._select_depth(model, ((x[:, ~BANDS], y[:, ~BANDS]),) * 2, labels, held)
+        assert less.architecture == SMALL.cut(depth)
 
 
 def test_a_cut_network_gives_what_its_first_stages_gave():
     """Each stage as it was before; the spectrum behind them, or nothing but that."""
     model, _, _ = trunks(SweepFormat(2, 2, 100.0, 64, "uint8"))
     digits = drawn(model.form)
-    model.shape = replace(SMALL, spectrum=True)
+    model.architecture = replace(SMALL, spectrum=True)
     every = seen(model, digits)
     assert every.shape == (6, 27)
     for depth, banded, columns in ((2, False, FIRST | SECOND), (1, True, FIRST | BANDS), (0, True, BANDS)):
         less = model.cut(depth, banded)
         np.testing.assert_array_equal(seen(less, digits), every[:, columns])
-        assert less.shape.stages(64) == SMALL.stages(64)[:depth]
-        assert less.shape.zero_sum(64) == SMALL.zero_sum(64)
+        assert less.architecture.stages(64) == SMALL.stages(64)[:depth]
+        assert less.architecture.zero_sum(64) == SMALL.zero_sum(64)
 
 
 @pytest.fixture(scope="module")
 def bare() -> family.CompactModel:
     """The box's own method where its stages tell nothing of what was held out."""
 
-    def blind(model: Compact, *others: object) -> fit.Seen:
-        told, size = seen_by_heads(model, *others), sum(model.shape.channels)
+    def blind(model: Compact, *others: object) -> fit.HeadInputs:
+        told, size = seen_by_heads(model, *others), sum(model.architecture.channels)
         for _, held in told:
             held[:, :size] = 9 * np.random.default_rng(0).standard_normal((len(held), size))
         return told
 
-    seen_by_heads, s = fit._seen, easy()
+    seen_by_heads, s = fit._head_inputs, easy()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "_seen", blind)
+        patch.setattr(fit, "_head_inputs", blind)
         return methods.find(["compact"], Effort(share=0.01))[0].train(s, s.samples, 1)
 
 
 @pytest.mark.slow
 def test_the_box_s_own_may_end_without_a_convolution(bare: family.CompactModel):
     """Then nothing in its graph is int8, its float form says the same, and it learns what is easy."""
-    assert bare.made.shape == DEFAULT.cut(0, spectrum=True)
-    assert bare.made.reach.responses == ()
+    assert bare.fit.architecture == DEFAULT.cut(0, spectrum=True)
+    assert bare.fit.ranges.responses == ()
     done = {n.op_type for n in bare.graph().graph.node}
     assert not {"Conv", "QuantizeLinear", "DequantizeLinear", "MatMulInteger"} & done
     other = easy(seed=9).samples
@@ -336,31 +336,31 @@ def test_the_box_s_own_may_end_without_a_convolution(bare: family.CompactModel):
     np.testing.assert_allclose(bare.forms["float"].logits(other), said, atol=2e-3)
     np.testing.assert_allclose(graph_builder.run(bare.forms["float"].graph(), other), said, atol=2e-3)
     assert np.mean(said.argmax(1) == easy(seed=9).labels) > 0.9
-    assert bare.features(other[:2], tenths=True).shape == (2, 10, bare.made.bands)
+    assert bare.features(other[:2], tenths=True).shape == (2, 10, bare.fit.bands)
 
 
 def test_a_fit_without_a_convolution_survives_its_file(bare: family.CompactModel, tmp_path: Path):
     """It says the same, to the bit, in PyTorch and in its graphs."""
-    bare.made.save(tmp_path / "fit.npz")
+    bare.fit.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
-    assert (again.shape, again.reach, again.bands) == (bare.made.shape, bare.made.reach, 5)
+    assert (again.architecture, again.ranges, again.bands) == (bare.fit.architecture, bare.fit.ranges, 5)
     digits = easy(2).samples
     with torch.no_grad():
         x = torch.from_numpy(digits.astype(np.float32))
-        assert torch.equal(again.network()(x), bare.made.network()(x))
+        assert torch.equal(again.network()(x), bare.fit.network()(x))
     for tenths in (False, True):
-        assert again.trunk(tenths=tenths) == bare.made.trunk(tenths=tenths)
+        assert again.trunk(tenths=tenths) == bare.fit.trunk(tenths=tenths)
         assert again.trunk(int8=False, tenths=tenths) == again.trunk(tenths=tenths)
 
 
 def test_copies_are_digits_of_the_scene():
     """Nothing varies: the very sweeps, twice. The default scene: others, of the same type, the same of the same seed."""
     for s in (easy(4), replace(easy(4), samples=easy(4).samples.astype(np.float32) / 7)):
-        model = Compact(s.format, 3, 0.1, shape=SMALL)
+        model = Compact(s.format, 3, 0.1, architecture=SMALL)
         still = Augmentation(shift=0, gain=0, gains=0, silent=0, damped=0, colour=0, noise=0)
         both = [
-            [c.samples for c in fit.copies(model, s, partial(fit.varied, rows=2, scene=scene), 5)]
-            for scene in (still, Augmentation(), Augmentation())
+            [c.samples for c in fit.copies(model, s, fit.augmenter(s.format, one), 5)]
+            for one in (still, Augmentation(), Augmentation())
         ]
         assert len(both[0]) == fit.COPIES
         for same, other, again in zip(*both, strict=True):
@@ -374,9 +374,9 @@ def test_copies_are_digits_of_the_scene():
 def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
     """With keep_means the head sees each taxel's mean beside the rest, in int8 too, and of each tenth."""
     s = easy(6)
-    made = fit.fit(s, 1, FitRecipe(steps=2, keep_means=True), shape=SMALL)
+    made = fit.fit(s, 1, FitRecipe(steps=2, keep_means=True), architecture=SMALL)
     level = s.samples.mean(axis=(1,)).reshape(len(s), -1) * made.scale
-    first = sum(made.shape.channels)
+    first = sum(made.architecture.channels)
     for int8 in (False, True):
         np.testing.assert_allclose(
             graph_builder.run(made.trunk(int8), s.samples)[:, first : first + 4], level, rtol=1e-5
@@ -384,4 +384,4 @@ def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
         of_tenths = graph_builder.run(made.trunk(int8, tenths=True), s.samples)
         np.testing.assert_allclose(of_tenths[:, -1, first : first + 4], level, rtol=1e-5)
         assert of_tenths.shape[2] == first + 4 + made.bands
-    assert graph_builder.run(fitted.trunk(), s.samples).shape[1] == sum(fitted.shape.channels) + fitted.bands
+    assert graph_builder.run(fitted.trunk(), s.samples).shape[1] == sum(fitted.architecture.channels) + fitted.bands

@@ -39,7 +39,7 @@ def test_stages_follow_the_window():
     for shape in (shape for shape in ARCHITECTURES.values() if shape.channels):
         for window in range(16, 3000):
             last = shape.stages(window)[-1]
-            assert last.steps >= (architectures.LEAST_STEPS if window >= 108 else 1)
+            assert last.steps >= (architectures.MIN_LAST_STEPS if window >= 108 else 1)
             assert (last.steps - 1) * last.hop + last.reach <= window
             assert shape.cut(1).stages(window) == shape.stages(window)[:1]
             assert shape.cut(0, spectrum=True).stages(window) == ()
@@ -51,10 +51,10 @@ def test_stages_follow_the_window():
 @pytest.mark.parametrize(("size", "weights"), [("1k", 1_442), ("20k", 18_558)])
 def test_compact_is_as_small_as_it_says(size: str, weights: int):
     """For the skin of the paper with six classes; what a shape costs is what its network holds."""
-    model = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=ARCHITECTURES[size])
+    model = Compact(skin.FORMAT, 6, 1.0, norm=False, architecture=ARCHITECTURES[size])
     assert sum(p.numel() for p in model.parameters()) == weights == ARCHITECTURES[size].cost(skin.FORMAT, 6).weights
     assert model(torch.zeros(2, 1500, 4, 4)).shape == (2, 6)
-    more = Compact(skin.FORMAT, 6, 1.0, norm=False, shape=replace(ARCHITECTURES[size], spectrum=True))
+    more = Compact(skin.FORMAT, 6, 1.0, norm=False, architecture=replace(ARCHITECTURES[size], spectrum=True))
     assert sum(p.numel() for p in more.parameters()) == weights + 6 * spectrum.count(skin.FORMAT)
 
 
@@ -65,8 +65,10 @@ def test_compact_ignores_offsets():
     counts = torch.from_numpy(rng.integers(0, 100, (2, 16, 1500)).astype(np.float32))
     offset = torch.from_numpy(rng.integers(0, 100, (2, 16, 1)).astype(np.float32))
     with torch.no_grad():
-        torch.testing.assert_close(model.judge(counts + offset), model.judge(counts), rtol=0, atol=1e-4)
-        assert (model.judge(counts * 2) - model.judge(counts)).abs().max() > 0.01
+        torch.testing.assert_close(
+            model.training_logits(counts + offset), model.training_logits(counts), rtol=0, atol=1e-4
+        )
+        assert (model.training_logits(counts * 2) - model.training_logits(counts)).abs().max() > 0.01
 
 
 def test_fused_norms_change_nothing():
@@ -86,9 +88,9 @@ def test_temperature_scaling_calibrates():
     rng = np.random.default_rng(0)
     calibrated = 2 * rng.standard_normal((4000, 4))
     labels = np.array([rng.choice(4, p=p) for p in np.exp(calibrated) / np.exp(calibrated).sum(1, keepdims=True)])
-    assert linear_head.temperature(5 * calibrated, labels) == pytest.approx(5, rel=0.1)
+    assert linear_head.fit_temperature(5 * calibrated, labels) == pytest.approx(5, rel=0.1)
     sure = 50 * np.eye(3)[np.arange(9) % 3]
-    assert 50 / linear_head.temperature(sure, np.arange(9) % 3) < 6
+    assert 50 / linear_head.fit_temperature(sure, np.arange(9) % 3) < 6
 
 
 def test_a_head_of_two_classes_has_two_logits():
@@ -147,7 +149,7 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
         np.testing.assert_array_equal(mine.group("recording"), theirs.group("recording"))
     for name, value in fitted.weights.items():
         np.testing.assert_array_equal(again.weights[name], value)
-    assert (again.shape, again.reach) == (fitted.shape, fitted.reach)
+    assert (again.architecture, again.ranges) == (fitted.architecture, fitted.ranges)
     easy(4).save(tmp_path / "set.npz")
     with pytest.raises(FormatError, match=r"^set.npz: not a fit"):
         Fit.load(tmp_path / "set.npz")
@@ -155,20 +157,20 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
 
 def test_the_size_without_convolutions_learns_its_head_alone(tmp_path: Path):
     """No iteration, no cost; it distinguishes what is easy, and comes back from its file."""
-    made = fit.fit(easy(), 1, QUICK, shape=ARCHITECTURES["bands"])
-    assert (made.shape, made.bands, made.cost) == (ARCHITECTURES["bands"], 5, [])
+    made = fit.fit(easy(), 1, QUICK, architecture=ARCHITECTURES["bands"])
+    assert (made.architecture, made.bands, made.cost) == (ARCHITECTURES["bands"], 5, [])
     assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]
     assert made.about["validation"]["accuracy"] > 0.9
     made.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
-    assert (again.shape, again.reach) == (made.shape, made.reach)
+    assert (again.architecture, again.ranges) == (made.architecture, made.ranges)
     np.testing.assert_array_equal(fit.features(again.network(), made.held), fit.features(made.network(), made.held))
     assert again.trunk() == made.trunk()
 
 
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     """Weights that are not of the shape that the file names, and a file from before there were shapes."""
-    replace(fitted, shape=ARCHITECTURES["1k"]).save(tmp_path / "fit.npz")
+    replace(fitted, architecture=ARCHITECTURES["1k"]).save(tmp_path / "fit.npz")
     with pytest.raises(
         FormatError,
         match=r"^fit.npz: its weights are not those of its Architecture\(channels=\(2, 6, 8\).*; fit again$",

@@ -50,14 +50,14 @@ def drawn(form: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
 
 def trunk(form: SweepFormat, scale: float = 0.1, tenths: bool = False) -> onnx.ModelProto:
     """The graph that gives nothing but the spectrum."""
-    return graph.trunk(form, scale, {}, BARE, tenths=tenths)
+    return graph.trunk_graph(form, scale, {}, BARE, tenths=tenths)
 
 
 def heard(form: SweepFormat, digits: np.ndarray, scale: float = 0.1) -> np.ndarray:
     """What PyTorch's head sees where there is nothing but the spectrum."""
     with torch.no_grad():
-        model = Compact(form, 3, scale, norm=False, shape=BARE)
-        return model.seen(torch.from_numpy(digits.astype(np.float32))).numpy()
+        model = Compact(form, 3, scale, norm=False, architecture=BARE)
+        return model.head_input(torch.from_numpy(digits.astype(np.float32))).numpy()
 
 
 def turned(x: np.ndarray) -> np.ndarray:
@@ -110,12 +110,12 @@ def test_a_noisy_taxel_is_turned_down_as_for_the_trunk(dtype: str):
     assert turned(digits.reshape(2, 600, 16).astype(float)).min() < 0.8
     assert np.abs(defined(form, digits, True, cap=False) - want).max() > 0.3
     np.testing.assert_allclose(heard(form, digits), want[:, -1], atol=2e-3)
-    plain = Compact(form, 3, 0.1, norm=False, shape=SMALL).eval()
-    weights, reach, size = plain.weights(), plain.reach(digits), want.shape[2]
-    for ranges in (None, reach):
+    plain = Compact(form, 3, 0.1, norm=False, architecture=SMALL).eval()
+    weights, found, size = plain.weights(), plain.ranges(digits), want.shape[2]
+    for ranges in (None, found):
         for tenths in (False, True):
             both, alone = (
-                graph_builder.run(graph.trunk(form, 0.1, weights, shape, ranges, tenths), digits)
+                graph_builder.run(graph.trunk_graph(form, 0.1, weights, shape, ranges, tenths), digits)
                 for shape in (SMALL.cut(3, True), SMALL)
             )
             np.testing.assert_array_equal(both[..., :-size], alone)
@@ -179,14 +179,14 @@ def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
 
 
 def test_a_window_too_short_has_no_spectrum():
-    """Less than four frames a tenth: none is counted, a fit has none, and the rung of nothing else refuses by name."""
+    """Less than four frames a tenth: none is counted, a fit has none, and the size without convolutions refuses with the reason."""
     short = replace(easy(12), samples=easy(12).samples[:, :39])
     assert spectrum.count(short.format) == 0
     made = fit.fit(short, 1, FitRecipe(steps=2))
-    assert (made.shape.spectrum, made.bands) == (False, 0)
-    assert made.shape.channels
+    assert (made.architecture.spectrum, made.bands) == (False, 0)
+    assert made.architecture.channels
     rung = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]
-    with pytest.raises(FormatError, match="a window of 39 frames is too short for a spectrum; take another rung"):
+    with pytest.raises(FormatError, match="a window of 39 frames is too short for a spectrum; take another size"):
         rung.train(short, short.samples, 1)
     enough = replace(easy(12), samples=easy(12).samples[:, :40])
     assert spectrum.count(enough.format) == 3
