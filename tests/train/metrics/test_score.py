@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from appliance.inference.classifier import softmax
-from train.metrics.score import Score, fuse, interval
+from train.metrics.score import Score, accuracy_figure, fuse, interval
 
 
 def test_a_tally_counts():
