@@ -48,7 +48,7 @@ AS_PALPATE = ("setpriv", "--reuid=palpate", "--regid=palpate", "--init-groups", 
 LEFT = "has failed its trial, and "
 
 
-class Store:
+class DeliveredStore:
     """The store on the machine, for a person who deploys to it. a: the sha256 of bundle A's manifest."""
 
     def __init__(self, machine: Machine, folder: Path) -> None:
@@ -99,13 +99,13 @@ class Store:
 
 
 @pytest.fixture(scope="module")
-def stored(machine: Machine, before: list[bool], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def stored(machine: Machine, before: list[bool], tmp_path_factory: pytest.TempPathFactory) -> DeliveredStore:
     """The store with bundle A committed."""
-    return Store(machine, tmp_path_factory.mktemp("bundles"))
+    return DeliveredStore(machine, tmp_path_factory.mktemp("bundles"))
 
 
 @pytest.fixture
-def store(stored: Store, service: Service) -> Iterator[Store]:
+def store(stored: DeliveredStore, service: Service) -> Iterator[DeliveredStore]:
     """The same store, which goes back to A after the test."""
     yield stored
     stored.machine.get("systemctl", "stop", "palpate")
@@ -125,7 +125,7 @@ def serves(service: Service, sha: str) -> None:
         time.sleep(0.2)
 
 
-def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Service, store: Store):
+def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Service, store: DeliveredStore):
     """On trial at its first start, which `palpate status` shows; committed after its sweeps, with a line in the journal."""
     new = store.deploy()
     machine.put(SITE, "[store]\ntrial_sweeps = 1\n")
@@ -147,7 +147,7 @@ def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Ser
 
 @pytest.mark.parametrize(("does", "more"), [("die", ""), ("hang", "WatchdogSec=1\n")])
 def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
-    machine: Machine, service: Service, store: Store, does: str, more: str
+    machine: Machine, service: Service, store: DeliveredStore, does: str, more: str
 ):
     """Each start becomes READY and then fails or hangs: after three starts A serves again, without help."""
     new = store.deploy()
@@ -167,7 +167,7 @@ def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
 
 
 def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
-    machine: Machine, service: Service, store: Store
+    machine: Machine, service: Service, store: DeliveredStore
 ):
     """Altered on the card after it was installed: A serves in the same start, without a restart."""
     new = store.deploy()
@@ -181,7 +181,7 @@ def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
     assert "model.onnx was altered" in lines[0]
 
 
-def test_a_bundle_that_does_not_fit_the_settings_is_left(machine: Machine, service: Service, store: Store):
+def test_a_bundle_that_does_not_fit_the_settings_is_left(machine: Machine, service: Service, store: DeliveredStore):
     """The new bundle does not fit the settings and A does: A serves in the same start."""
     new = store.deploy(early=None)
     machine.put(SITE, "[classifier]\nearly = true\n")
@@ -192,7 +192,7 @@ def test_a_bundle_that_does_not_fit_the_settings_is_left(machine: Machine, servi
 
 
 def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
-    machine: Machine, service: Service, store: Store
+    machine: Machine, service: Service, store: DeliveredStore
 ):
     """Exit 78, no restarts, and the journal says what to do; after `palpate rollback` and a start, A serves."""
     new = store.deploy()
@@ -210,7 +210,9 @@ def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
 
 
 @pytest.mark.parametrize("end", ["stopped in order", "killed without a skin", "without a GPIO chip"])
-def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(machine: Machine, service: Service, store: Store, end: str):
+def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
+    machine: Machine, service: Service, store: DeliveredStore, end: str
+):
     """Four restarts, four kills while the skin is away, or four ends with exit 69: still on trial, at its first start."""
     new = store.deploy()
     if end == "without a GPIO chip":
@@ -245,7 +247,7 @@ def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) ->
         time.sleep(0.1)
 
 
-def test_a_candidate_classifies_beside_and_becomes_the_one(machine: Machine, service: Service, store: Store):
+def test_a_candidate_classifies_beside_and_becomes_the_one(machine: Machine, service: Service, store: DeliveredStore):
     """Deployed as a candidate, it classifies in the shadow from the next start on; `palpate status` and `palpate bundles` show
     its figures; once promoted it is on trial, and no longer in the shadow."""
     new = store.deploy("--shadow")

@@ -240,7 +240,7 @@ def browser() -> Iterator[Any]:
         one.close()
 
 
-class Seen:
+class BrowsedPage:
     """The page as a person sees it. errors: messages of the browser. requests: addresses that it asked for."""
 
     def __init__(self, context: Any, address: str) -> None:
@@ -264,7 +264,7 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     """The real command: the page waits for contact, advises, follows the next touch; when it ends, "no connection"."""
     run, address = box
     context = browser.new_context(viewport={"width": 820, "height": 1180})
-    seen = Seen(context, address)
+    seen = BrowsedPage(context, address)
     seen.state("off")
     until(lambda: seen.text("#message").startswith("2."))
     assert re.fullmatch(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1", seen.text("#message"))
@@ -289,7 +289,7 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
 def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
     """Loads as shades and numbers, points at their coordinates, the message in large letters and for screen readers."""
     context = browser.new_context(viewport={"width": 1180, "height": 820})
-    seen = Seen(context, page.address)
+    seen = BrowsedPage(context, page.address)
     seen.state("off")
     assert seen.text("#message") == VIEW.message
     assert seen.page.text_content("#spoken").startswith(VIEW.message)
@@ -319,7 +319,7 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
     context.close()
 
 
-def circles(seen: Seen, which: str) -> list[dict[str, float]]:
+def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     """Centre and radius of each."""
     return seen.page.eval_on_selector_all(
         which, "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r: e.r.baseVal.value}))"
@@ -329,7 +329,7 @@ def circles(seen: Seen, which: str) -> list[dict[str, float]]:
 def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
     """The server still answers, but its loop hangs: after a while the page shows that instead of an old picture."""
     context = browser.new_context()
-    seen = Seen(context, page.address)
+    seen = BrowsedPage(context, page.address)
     seen.state("off")
     seen.state("no-connection")
     assert "no news" in seen.text("#hint")
@@ -341,7 +341,7 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
 def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypatch: pytest.MonkeyPatch):
     """It accepts the request and never answers: the page does not wait for it."""
     context, ended = browser.new_context(), threading.Event()
-    seen = Seen(context, page.address)
+    seen = BrowsedPage(context, page.address)
     seen.state("off")
     monkeypatch.setattr(web.PageHandler, "do_GET", lambda self: ended.wait(3 * WAIT_S))
     try:
@@ -359,7 +359,7 @@ def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, 
     """Everything on one screen without scrolling, in the light and the dark scheme; the text has enough contrast."""
     page.show(replace(VIEW, message="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"))
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-    seen = Seen(context, page.address)
+    seen = BrowsedPage(context, page.address)
     seen.state("off")
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
     assert seen.page.evaluate("document.documentElement.scrollHeight") <= height
@@ -375,7 +375,7 @@ def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, 
     context.close()
 
 
-def luminance(seen: Seen, what: str, colour: str) -> float:
+def luminance(seen: BrowsedPage, what: str, colour: str) -> float:
     """Relative luminance of a colour (WCAG 2.1), 0 to 1."""
     text = seen.page.locator(what).evaluate(f"e => getComputedStyle(e).{colour}")
     parts = [int(part) / 255 for part in re.findall(r"\d+", text)[:3]]
@@ -383,7 +383,7 @@ def luminance(seen: Seen, what: str, colour: str) -> float:
     return sum(w * part for w, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
-def contrast(seen: Seen, what: str) -> float:
+def contrast(seen: BrowsedPage, what: str) -> float:
     """Contrast of a text with the page's background (WCAG 2.1)."""
     dark, light = sorted((luminance(seen, what, "color"), luminance(seen, "body", "backgroundColor")))
     return (light + 0.05) / (dark + 0.05)

@@ -192,7 +192,7 @@ def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Pat
         assert (found.compared, found.agreed, found.later) == counts
 
 
-class Broken:
+class FailingClassifier:
     """A candidate whose model fails on some sweeps, as onnxruntime does: with an exception of its own."""
 
     def __init__(self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]) -> None:
@@ -213,7 +213,7 @@ def strange() -> None:
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: list[str]):
     """Three failures in a row are logged once, and the candidate is not asked any more; a success starts the count anew."""
     pair = side()
-    pair.shadow._classifier = Broken(pair.shadow._classifier, lambda s: s.id != 3, strange)
+    pair.shadow._classifier = FailingClassifier(pair.shadow._classifier, lambda s: s.id != 3, strange)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 10)))
     found = pair.shadow.agreement
     assert (found.compared, found.failed) == (1, 5)
@@ -229,7 +229,7 @@ def test_a_candidate_that_is_too_slow_has_failed(side, logged: list[str]):
     """Frames may wait a tenth of a second at most."""
     pair = side()
     slow = lambda: pair.clock.sleep_until(pair.clock.now_ns() + SECOND // 5)  # noqa: E731
-    pair.shadow._classifier = Broken(pair.shadow._classifier, lambda s: True, slow)
+    pair.shadow._classifier = FailingClassifier(pair.shadow._classifier, lambda s: True, slow)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
     assert (pair.shadow.agreement.compared, pair.shadow.agreement.failed) == (0, 3)
     assert "it computed 200 ms for a sweep, 100 are allowed" in logged[0]

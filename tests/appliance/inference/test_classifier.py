@@ -554,12 +554,12 @@ def test_only_needed_outputs_are_computed(tmp_path: Path, more: dict, asked: lis
     it = Classifier(toy_bundle.load(tmp_path / "toy", **more), VirtualClock())
     seen = []
 
-    class Spy:
+    class OutputSpy:
         def run(self, outputs, given, inner=it._session):
             seen.append(outputs)
             return inner.run(outputs, given)
 
-    monkeypatch.setattr(it, "_session", Spy())
+    monkeypatch.setattr(it, "_session", OutputSpy())
     assert it(toy_bundle.sweep(1, 0)).label == "a"
     assert seen == [asked]
 

@@ -79,7 +79,7 @@ def until(u: Backend, done: Callable[[], Any], step_s: float = 0.002) -> None:
 # ---------------------------------------------------------------- Sensor
 
 
-class Reader:
+class SensorReader:
     """Reads a sensor continuously. No read may last longer than all its timeouts together."""
 
     def __init__(self, u: Backend, **settings: Any) -> None:
@@ -122,7 +122,7 @@ class Reader:
             assert now(self._u) < end_ns, f"{self.sensor.state}, not {wanted}: {self.sensor.trouble}"
             self.once()
 
-    def __enter__(self) -> Reader:
+    def __enter__(self) -> SensorReader:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -139,7 +139,7 @@ def test_streams_without_a_gap(need: Need):
     """Every frame once and in order, its time later than the one before and never in the future; then the skin is
     released."""
     u = need("skin")
-    with Reader(u) as reader:
+    with SensorReader(u) as reader:
         reader.seconds(SETTLE_S)
         frames = reader.frames(800)
         assert (frames.t_ns <= now(u)).all()
@@ -153,7 +153,7 @@ def test_streams_without_a_gap(need: Need):
         # an emulator may be too late with a first answer, so what matters is that it streamed unbroken once it did
         assert reader.states[-1] == "streaming"
         assert reader.sensor.counters.enumerations == 1
-    with Reader(u) as reader:  # closing has let go of all that the first one held
+    with SensorReader(u) as reader:  # closing has let go of all that the first one held
         check_content(u, reader.frames(100))
 
 
@@ -161,7 +161,7 @@ def test_absent_then_plugged(need: Need):
     """No skin: state absent, the ids are named, no frames; it is used when it is plugged in."""
     u = need("plug")
     u.unplug()
-    with Reader(u) as reader:
+    with SensorReader(u) as reader:
         reader.state("absent")
         assert len(reader.seconds(0.5)) == 0
         assert f"{u.sensor.vendor_id:04x}:{u.sensor.product_id:04x}" in str(reader.sensor.trouble)
@@ -172,7 +172,7 @@ def test_absent_then_plugged(need: Need):
 def test_unplugged_in_mid_read(need: Need):
     """The cable is pulled while frames come: lost, then absent; plugged in again, a new epoch with correct frames."""
     u = need("plug")
-    with Reader(u) as reader:
+    with SensorReader(u) as reader:
         first = reader.frames(100)
         u.after(0.2, u.unplug)
         first = Frames.joined([first, reader.seconds(0.1)])
@@ -195,7 +195,7 @@ def test_serial_number_chooses(need: Need):
     """Only the skin with the configured serial number is used; for another the message says what was found."""
     u = need("plug")
     u.plug(Skin(serial="0042"))
-    with Reader(u, serial="0043") as reader:
+    with SensorReader(u, serial="0043") as reader:
         reader.state("absent")
         assert len(reader.seconds(0.3)) == 0
         assert "serial number 0043" in str(reader.sensor.trouble)
@@ -218,7 +218,7 @@ def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: st
     """A skin with another protocol or format is refused, naming both sides; a matching one is used after it."""
     u = need("plug")
     u.plug(Skin(**change))
-    with Reader(u) as reader:
+    with SensorReader(u) as reader:
         reader.state("mismatch")
         assert len(reader.seconds(0.3)) == 0
         assert hint in str(reader.sensor.trouble)
@@ -236,7 +236,7 @@ def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code
     refuse = getattr(u, control)
     refuse(True)
     try:
-        with Reader(u) as reader:
+        with SensorReader(u) as reader:
             reader.state(state)
             assert len(reader.seconds(0.3)) == 0
             assert f"errno {code}" in str(reader.sensor.trouble)
@@ -250,7 +250,7 @@ def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code
 def test_a_silent_skin_is_started_again(need: Need):
     """A connected skin that sends nothing: silent after `silence_ms`, then it is started again automatically."""
     u = need("silence")
-    with Reader(u, silence_ms=300) as reader:
+    with SensorReader(u, silence_ms=300) as reader:
         reader.frames(100)
         u.silence()
         reader.state("silent")
@@ -262,7 +262,7 @@ def test_a_silent_skin_is_started_again(need: Need):
 def test_garbage_on_the_cable(need: Need):
     """Corrupted transfers are counted in bytes and in missing frames; intact frames are correct."""
     u = need("garble")
-    with Reader(u) as reader:
+    with SensorReader(u) as reader:
         reader.frames(100)
         u.garble(True)
         frames = reader.frames(500)

@@ -93,7 +93,7 @@ def test_a_line_that_the_box_drives_is_seen():
     lines.close()
 
 
-class Guest:
+class QemuEnd:
     """QEMU's end of the cable."""
 
     def __init__(self) -> None:
@@ -131,7 +131,7 @@ class Guest:
 
 def test_a_reply_that_crosses_a_cancellation_comes_again():
     """A reply that QEMU discards is not lost: the next transfer has the same frames, the one after it the next ones."""
-    guest = Guest()
+    guest = QemuEnd()
     clock = SystemClock()
     hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()
     board = rig.Board(skin.FORMAT, hand, clock)

@@ -398,12 +398,12 @@ def test_all_applicable_corruptions_by_default():
     seen = []
 
     @dataclass
-    class Spy:
+    class InputSpy:
         def logits(self, x: np.ndarray) -> np.ndarray:
             seen.append(x.copy())
             return np.zeros((len(x), 2), np.float32)
 
-    method = Method("spy", "", "L", lambda *_: Spy())
+    method = Method("spy", "", "L", lambda *_: InputSpy())
     trial = EvaluationSweeps(small())
     done = robustness.evaluate_method(method, small(), trial, None, 6)
     assert list(done["curves"]) == [s.name for s in corruptions.applicable(trial)]
@@ -429,13 +429,13 @@ def test_what_cannot_be_done_is_said():
 def test_an_answer_that_is_no_number_is_wrong():
     """It is counted as wrong and as broken, also where the label would have been right."""
 
-    class Broken(NearestMean):
+    class NanModel(NearestMean):
         def logits(self, given: np.ndarray) -> np.ndarray:
             logits = super().logits(given)
             logits[:3] = [np.nan, 1]
             return logits
 
-    model = Broken(learn(small(), small().samples, 0).means)
+    model = NanModel(learn(small(), small().samples, 0).means)
     done = robustness.evaluate_model(FAKE, model, EvaluationSweeps(small()), corruptions.find(["dead"]), 0)
     assert done["curves"]["dead"]["right"][0] == 9
     assert done["curves"]["dead"]["broken"] == [3] * 5

@@ -75,15 +75,15 @@ def test_what_does_not_run_by_itself_is_named(tmp_path: Path):
 def test_torch_runs_what_was_trained(tmp_path: Path):
     """The network as TorchScript gives its own logits."""
 
-    class Network(torch.nn.Module):
+    class TwoCounts(torch.nn.Module):
         def forward(self, counts: torch.Tensor) -> torch.Tensor:
             return counts.flatten(1).float()[:, :2]
 
     @dataclass
-    class Model:
+    class TwoCountsModel:
         network: torch.nn.Module
 
-    model_forms._save_torch(Model(Network()), sweeps(), 1, tmp_path)
+    model_forms._save_torch(TwoCountsModel(TwoCounts()), sweeps(), 1, tmp_path)
     counts = sweeps().samples[3]
     assert measure.load(tmp_path)(counts).tolist() == counts.ravel()[:2].tolist()
 

@@ -29,7 +29,7 @@ METHODS = (*baselines.METHODS, *prior_work.METHODS)
 by_name = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 
 
-class World:
+class HeldOutSet:
     """A set, its features by kind, and which of its sweeps are held out."""
 
     def __init__(self, sweeps: Dataset, held: np.ndarray) -> None:
@@ -59,10 +59,10 @@ class World:
 
 
 @pytest.fixture(scope="module")
-def tubes() -> World:
+def tubes() -> HeldOutSet:
     """Two sweeps of each tube at each of nine positions, three of which are held out."""
     sweeps = sets.load("sim:T-REAL:1001:2")
-    return World(sweeps, np.isin(sweeps.groups["position"], np.unique(sweeps.groups["position"])[::3]))
+    return HeldOutSet(sweeps, np.isin(sweeps.groups["position"], np.unique(sweeps.groups["position"])[::3]))
 
 
 def ripples(frames: int, rows: int, cols: int, rate_hz: float, dtype: str) -> Dataset:
@@ -79,7 +79,7 @@ def ripples(frames: int, rows: int, cols: int, rate_hz: float, dtype: str) -> Da
 
 
 @by_name
-def test_every_method_learns(method: Method, tubes: World):
+def test_every_method_learns(method: Method, tubes: HeldOutSet):
     """Positions that were never seen: far above the chance of one in six."""
     assert tubes.accuracy(method) > 0.4
 
@@ -91,11 +91,11 @@ def test_every_method_takes_another_skin(method: Method, removed: bool):
     """3x3 taxels at 100 Hz in int16, and 16x1 at 120 Hz in float32 without means: three materials told apart."""
     sweeps = ripples(128, 16, 1, 120.0, "float32").without_means() if removed else ripples(200, 3, 3, 100.0, "int16")
     held = np.arange(len(sweeps)) >= 15
-    assert World(sweeps, held).accuracy(method) > 0.8
+    assert HeldOutSet(sweeps, held).accuracy(method) > 0.8
 
 
 @by_name
-def test_broken_readings_get_finite_logits(method: Method, tubes: World):
+def test_broken_readings_get_finite_logits(method: Method, tubes: HeldOutSet):
     """Silent and saturated sweeps, and features as large as float32 holds."""
     still = [np.full_like(tubes.sweeps.samples[0], level) for level in (0, 255)]
     rows = [methods.kinds.compute(method.input, x, tubes.sweeps.rate_hz) for x in still]
@@ -104,7 +104,7 @@ def test_broken_readings_get_finite_logits(method: Method, tubes: World):
 
 
 @by_name
-def test_training_twice_gives_the_same_bytes(method: Method, tubes: World):
+def test_training_twice_gives_the_same_bytes(method: Method, tubes: HeldOutSet):
     """The same arguments, the same model; another seed changes nothing, since nothing is random."""
     train = tubes.sweeps.take(~tubes.held)
     given = tubes.given(method.input)[~tubes.held]
@@ -113,7 +113,7 @@ def test_training_twice_gives_the_same_bytes(method: Method, tubes: World):
 
 
 @pytest.mark.parametrize("method", [m for m in METHODS if m.runs_on_the_box], ids=lambda m: m.name)
-def test_a_bundle_of_it_runs_on_the_box(method: Method, tubes: World, tmp_path: Path):
+def test_a_bundle_of_it_runs_on_the_box(method: Method, tubes: HeldOutSet, tmp_path: Path):
     """Manifest, graph and golden sweeps in a folder: the box's classifier gives the model's logits from raw digits."""
     model, held = tubes.model(method), np.flatnonzero(tubes.held)[:4]
     golden, packed = io.BytesIO(), tubes.sweeps.samples[held]
@@ -190,7 +190,7 @@ def test_gauss_bears_little_and_collinear():
     assert np.isfinite(FeatureModel(to_onnx(gauss, 3)).logits(x)).all()
 
 
-def test_a_material_that_training_lacks_is_never_named(tubes: World):
+def test_a_material_that_training_lacks_is_never_named(tubes: HeldOutSet):
     """Five of six materials in training: the sixth has a column, finite and lowest, and its sweeps get another label."""
     known, given = np.flatnonzero(tubes.sweeps.labels != 2), tubes.given("L")
     for make in (Gauss, knn, svm):
@@ -207,7 +207,7 @@ def folds_of(sweeps: Dataset) -> list[tuple[np.ndarray, np.ndarray]]:
         return list(baselines._folds(sweeps))
 
 
-def test_the_temperature_sees_whole_positions_or_recordings(tubes: World):
+def test_the_temperature_sees_whole_positions_or_recordings(tubes: HeldOutSet):
     """Every sweep is held out once, with its position; where each material has its own position, with its recording.
 
     A material of two sweeps is no trouble.
@@ -223,7 +223,7 @@ def test_the_temperature_sees_whole_positions_or_recordings(tubes: World):
     assert len(folds_of(rare)) == baselines.FOLDS
 
 
-def test_without_anything_to_hold_out_the_temperature_is_one(tubes: World):
+def test_without_anything_to_hold_out_the_temperature_is_one(tubes: HeldOutSet):
     """One recording a material: no folds, and the model's logits are the plain estimator's."""
     sweeps = replace(tubes.sweeps, groups={"recording": tubes.sweeps.labels})
     assert not folds_of(sweeps)
@@ -250,7 +250,7 @@ def test_probabilities_are_honest(make: Callable[[], baselines.Estimator], stren
 
 
 @pytest.mark.parametrize(("index", "hint"), [([0, 0, 0, 0], "only one class"), ([0, -1], "2 sweeps are too few")])
-def test_too_little_to_learn_from_is_refused(tubes: World, index: list[int], hint: str):
+def test_too_little_to_learn_from_is_refused(tubes: HeldOutSet, index: list[int], hint: str):
     """One material, and fewer sweeps than neighbours."""
     with pytest.raises(FormatError, match=hint):
         METHODS[0].train(tubes.sweeps.take(np.array(index)), tubes.given("L")[index], 0)

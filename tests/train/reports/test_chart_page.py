@@ -35,7 +35,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
     return chart_report.write(tmp_path_factory.mktemp("chart"), DOTS).as_uri()
 
 
-class Seen:
+class BrowsedChart:
     """The page as a reader sees it."""
 
     def __init__(self, page: Any, address: str) -> None:
@@ -46,7 +46,7 @@ class Seen:
         page.on("request", lambda request: self.asked.append(request.url))
         self.asked: list[str] = []
 
-    def open(self, choice: str = "") -> Seen:
+    def open(self, choice: str = "") -> BrowsedChart:
         """Load it, with what was chosen in the address."""
         self.page.goto("about:blank")
         self.page.goto(self.address + choice)
@@ -78,17 +78,17 @@ class Seen:
 
 
 @pytest.fixture
-def seen(browser: Any, file: str) -> Iterator[Seen]:
+def seen(browser: Any, file: str) -> Iterator[BrowsedChart]:
     """The page on a desktop; nothing may be said on the console, and nothing but the file may be asked for."""
     context = browser.new_context(viewport={"width": 1000, "height": 800}, reduced_motion="reduce")
-    one = Seen(context.new_page(), file)
+    one = BrowsedChart(context.new_page(), file)
     yield one.open()
     assert one.troubles == []
     assert {url.split("#")[0] for url in one.asked} <= {file, "about:blank"}
     context.close()
 
 
-def test_it_shows_all_dots_and_the_front(seen: Seen):
+def test_it_shows_all_dots_and_the_front(seen: BrowsedChart):
     """As Python found it: further right is dearer, further up more accurate; the still picture gives way."""
     there = seen.places()
     assert len(there) == len(DOTS)
@@ -100,7 +100,7 @@ def test_it_shows_all_dots_and_the_front(seen: Seen):
 
 
 @pytest.mark.parametrize("cost", pareto.COSTS)
-def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: Seen, cost: str):
+def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: BrowsedChart, cost: str):
     """For every pair of axes the page's front is Python's."""
     before = seen.places(), seen.stairs()
     for accuracy in ("lopo", "hard"):
@@ -113,7 +113,7 @@ def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: Seen, cost: st
             assert (seen.places(), seen.stairs()) != before
 
 
-def test_hovering_names_a_dot_and_its_figures(seen: Seen):
+def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
     """Near a dot it is told, with its interval and what beats it; away from all dots nothing is."""
     x, y = seen.places()[3]
     frame = seen.page.locator("#plot svg").bounding_box()
@@ -127,7 +127,7 @@ def test_hovering_names_a_dot_and_its_figures(seen: Seen):
 def test_a_tap_names_a_dot_on_a_phone(browser: Any, file: str):
     """The tip is there after a tap and inside the picture."""
     context = browser.new_context(viewport={"width": 360, "height": 700}, has_touch=True, reduced_motion="reduce")
-    seen = Seen(context.new_page(), file).open()
+    seen = BrowsedChart(context.new_page(), file).open()
     seen.page.evaluate("document.getElementById('plot').scrollIntoView()")
     for i, (x, y) in seen.places().items():
         frame = seen.page.locator("#plot svg").bounding_box()
@@ -139,7 +139,7 @@ def test_a_tap_names_a_dot_on_a_phone(browser: Any, file: str):
     context.close()
 
 
-def test_filters_hide_dots_and_the_front_closes_up(seen: Seen):
+def test_filters_hide_dots_and_the_front_closes_up(seen: BrowsedChart):
     """Without int8 and MiniRocket others are on the front; shown again, all is as before."""
     seen.page.uncheck("#precision input[value=int8]")
     seen.page.uncheck("#family input[value=MiniRocket]")
@@ -151,14 +151,14 @@ def test_filters_hide_dots_and_the_front_closes_up(seen: Seen):
     assert seen.best() == FRONT["hard"]
 
 
-def test_nothing_left_is_no_trouble(seen: Seen):
+def test_nothing_left_is_no_trouble(seen: BrowsedChart):
     """With all hidden there is an empty plot and an empty table."""
     for box in seen.page.locator("#precision input").all():
         box.uncheck()
     assert (seen.places(), seen.stairs(), seen.rows()) == ({}, "", [])
 
 
-def test_scales_are_linear_or_logarithmic(seen: Seen):
+def test_scales_are_linear_or_logarithmic(seen: BrowsedChart):
     """A tenfold cost is equally far everywhere on a logarithmic scale, and not on a linear one; errors likewise."""
     ratio = lambda there: (there[3][0] - there[1][0]) / (there[5][0] - there[3][0])  # noqa: E731
     assert ratio(seen.places()) == pytest.approx(0.5, rel=0.01)  # .05 to .5 to 50 ms
@@ -169,7 +169,7 @@ def test_scales_are_linear_or_logarithmic(seen: Seen):
     assert (there[4][1] - there[0][1]) / (there[0][1] - there[2][1]) == pytest.approx(2.0, rel=0.01)  # .4 to .1 to .05
 
 
-def test_the_choice_is_in_the_address(seen: Seen):
+def test_the_choice_is_in_the_address(seen: BrowsedChart):
     """Chosen, it is there; opened again from there, it is as it was; what the address says wrongly is left."""
     seen.page.select_option("#x", "macs")
     seen.page.select_option("#y", "lopo")
@@ -187,14 +187,14 @@ def test_the_choice_is_in_the_address(seen: Seen):
     assert (seen.page.input_value("#x"), seen.page.input_value("#y")) == ("ms_p50", "hard")
 
 
-def test_the_address_may_change_while_the_page_is_open(seen: Seen):
+def test_the_address_may_change_while_the_page_is_open(seen: BrowsedChart):
     """A link to another choice of the same page is followed."""
     seen.page.evaluate("location.hash = '#y=lopo'")
     seen.page.wait_for_function("document.getElementById('y').value === 'lopo'")
     assert seen.best() == FRONT["lopo"]
 
 
-def test_the_keyboard_goes_from_dot_to_dot(seen: Seen):
+def test_the_keyboard_goes_from_dot_to_dot(seen: BrowsedChart):
     """One stop of Tab; arrows by cost, Home and End; Escape closes the tip."""
     order = [pareto.name(spot[0]) for spot in pareto.placed(DOTS, "ms_p50", "hard")]
     seen.page.locator("#family input").last.focus()
@@ -214,7 +214,7 @@ def test_the_keyboard_goes_from_dot_to_dot(seen: Seen):
     assert not seen.page.evaluate("document.activeElement.classList.contains('dot')")
 
 
-def test_the_first_dot_may_be_hidden_and_tab_still_finds_one(seen: Seen):
+def test_the_first_dot_may_be_hidden_and_tab_still_finds_one(seen: BrowsedChart):
     """The one stop of Tab is a dot that is shown."""
     seen.page.uncheck("#family input[value=Palpate]")
     seen.page.locator("#family input").last.focus()
@@ -222,14 +222,14 @@ def test_the_first_dot_may_be_hidden_and_tab_still_finds_one(seen: Seen):
     assert seen.tip()
 
 
-def test_dots_are_named_for_those_who_do_not_see_them(seen: Seen):
+def test_dots_are_named_for_those_who_do_not_see_them(seen: BrowsedChart):
     """Each has its name and the two figures chosen; the controls have labels."""
     assert seen.page.get_by_role("img", name="H-svm float: 93.0 %, 0.5 ms").count() == 1
     assert seen.page.get_by_label("accuracy", exact=True).count() == 1
     assert seen.page.get_by_label("log of the error").count() == 1
 
 
-def test_the_table_is_sorted_by_what_was_chosen(seen: Seen):
+def test_the_table_is_sorted_by_what_was_chosen(seen: BrowsedChart):
     """By accuracy first, by cost when asked; it says so."""
     by_accuracy = sorted(DOTS, key=lambda one: (-one["accuracy"]["hard"]["mean"], one["ms_p50"]))
     assert seen.rows() == [pareto.name(one) for one in by_accuracy]
@@ -247,7 +247,7 @@ def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: st
     context = browser.new_context(
         viewport={"width": width, "height": 700}, color_scheme=scheme, reduced_motion="reduce"
     )
-    page = Seen(context.new_page(), file).open().page
+    page = BrowsedChart(context.new_page(), file).open().page
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     frame = page.locator("#plot svg").bounding_box()
     assert frame["width"] > 0.88 * width

@@ -20,7 +20,7 @@ SURE, VOID = 9.0, {"meta", "br", "!doctype", "path", "use"}
 FIGURES = [f"figure-{n}" for n in (4, 5, 6, 7, 9, 10, 11, 12, 13)] + ["methods"]
 
 
-class Reader(HTMLParser):
+class PageReader(HTMLParser):
     """All text of a page, and every tag that is not closed in order."""
 
     def __init__(self, text: str) -> None:
@@ -161,7 +161,7 @@ def test_summary_pools_worlds_and_keeps_each_result(told):
 def test_the_page_is_one_file_that_a_phone_can_read(made):
     """It parses, is as wide as its reader, follows light and dark, names no address, and its tables scroll."""
     html, pictures = made
-    read = Reader(html)
+    read = PageReader(html)
     assert (read.wrong, read.open) == ([], [])
     assert all(link.startswith("#") for link in read.links)
     assert not re.search(r"@import|url\((?!#)|<script|<link", html)
@@ -175,7 +175,7 @@ def test_the_page_shows_every_figure_with_printed_beside_ours(told, made):
     """Figures 4 to 7, 9 to 13 and the table of all; each number of ours with interval, printed value and difference."""
     html, pictures = made
     assert sorted(pictures) == sorted(FIGURES)
-    text = " ".join(Reader(html).text.split())
+    text = " ".join(PageReader(html).text.split())
     for row in told["table"]:
         if row["printed"] is not None:
             difference = f"{100 * (row['share'][0] - row['printed']):+.1f}".replace("-", "−")
@@ -213,7 +213,7 @@ def test_a_plan_without_the_network_still_makes_a_page():
     """Figures 9 to 11 need the paper's CNN; all others are there."""
     html, pictures = paper_report.render(summary(cnn=""))
     assert set(FIGURES) - set(pictures) == {"figure-9", "figure-10", "figure-11", "figure-12"}
-    assert not Reader(html).wrong
+    assert not PageReader(html).wrong
 
 
 @pytest.mark.slow
