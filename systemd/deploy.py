@@ -15,7 +15,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleet import PALPATE, Box, Failed, each, options
+from fleet import PALPATE, Failed, FleetBox, each, options
 
 from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
@@ -73,7 +73,7 @@ def checked(folder: Path, signers: Path | None) -> BundleArchive:
     return BundleArchive(sha, f"{m.name} {m.version} ({loaded.id})", archive.getvalue())
 
 
-def deliver(box: Box, packed: BundleArchive, shadow: bool) -> str:
+def deliver(box: FleetBox, packed: BundleArchive, shadow: bool) -> str:
     """Install the bundle on one box, or make it the candidate there; the line for this box."""
     store, status = where(box)
     if not shadow and _runs(box, packed, store, status):
@@ -90,7 +90,7 @@ def deliver(box: Box, packed: BundleArchive, shadow: bool) -> str:
     return outcome(box, packed, ready=box.restart(READY_S, STARTS), shadow=shadow)
 
 
-def where(box: Box) -> tuple[str, str]:
+def where(box: FleetBox) -> tuple[str, str]:
     """Paths on the box: the folder of its store and its status file. Raises Failed where it would not use a delivered bundle."""
     lacks = "{ echo 'no Palpate is installed there; make install HOST=... first' >&2; exit 1; }"
     settings = tomllib.loads(box.run("asking for its settings", f"test -x {PALPATE} || {lacks}; {PALPATE} config"))
@@ -99,14 +99,14 @@ def where(box: Box) -> tuple[str, str]:
     return str(settings["store"]["folder"]), str(settings["store"]["status"])
 
 
-def _runs(box: Box, packed: BundleArchive, store: str, status: str) -> bool:
+def _runs(box: FleetBox, packed: BundleArchive, store: str, status: str) -> bool:
     """Whether the box runs the bundle now, and will after a restart."""
     look = f"readlink {store}/current && cat {status}"
     link, _, text = box.run("asking what runs", f"{look} || true", user="root").partition("\n")
     return link == f"bundles/{packed.sha}" and bool(text) and json.loads(text)["bundle"] == packed.sha[:8]
 
 
-def outcome(box: Box, packed: BundleArchive, *, ready: bool, shadow: bool) -> str:
+def outcome(box: FleetBox, packed: BundleArchive, *, ready: bool, shadow: bool) -> str:
     """What the box does with the bundle now, in words. Raises Failed where it has gone back already."""
     listed = json.loads(box.run("asking for its bundles", f"{PALPATE} bundles --json", user="palpate"))
     entry = next((one for one in listed if one["sha"] == packed.sha), None)

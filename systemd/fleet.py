@@ -50,7 +50,7 @@ class Failed(Exception):
     """The work cannot be done on this box; the message says why and what to try."""
 
 
-class Box:
+class FleetBox:
     """One box and the connection to it. `result`: figures that are written beside its line. verbose: prints each step."""
 
     def __init__(self, host: Host, verbose: bool) -> None:
@@ -151,7 +151,7 @@ def options(about: str, limit_s: int) -> argparse.ArgumentParser:
     return parser
 
 
-def each(args: argparse.Namespace, work: Callable[[Box], str]) -> int:
+def each(args: argparse.Namespace, work: Callable[[FleetBox], str]) -> int:
     """Do `work` on all boxes at once, and print for each the line that it returns, or why it failed.
 
     args: of a parser from `options`. Returns the exit code: 1 where any box failed.
@@ -165,7 +165,7 @@ def each(args: argparse.Namespace, work: Callable[[Box], str]) -> int:
     results: dict[str, dict[str, Any]] = {}
 
     def one(host: Host) -> None:
-        box = Box(host, args.verbose)
+        box = FleetBox(host, args.verbose)
         try:
             with gevent.Timeout(args.limit):  # a BaseException, so no code in between catches and retries it
                 host.connect(show_errors=False, raise_exceptions=True)

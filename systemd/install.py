@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from fleet import Box, Failed, each, options
+from fleet import Failed, FleetBox, each, options
 from release import ROOT, ReleaseArchives
 
 from appliance import __version__
@@ -79,7 +79,7 @@ def main(argv: list[str] | None = None) -> int:
         return each(args, lambda box: install(box, archives, box.data("board", args.board), signers))
 
 
-def install(box: Box, archives: ReleaseArchives, board: str, signers: str) -> str:
+def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) -> str:
     """Install this release on one box, whatever it has now; the line for this box."""
     machine = survey(box)
     packages(box)
@@ -101,7 +101,7 @@ def install(box: Box, archives: ReleaseArchives, board: str, signers: str) -> st
     return switch(box, name, release)
 
 
-def survey(box: Box) -> str:
+def survey(box: FleetBox) -> str:
     """The box's architecture as wheels name it. Raises Failed where Palpate does not run on such a box."""
     output = box.run(
         "looking at its system", '. /etc/os-release; echo "$PRETTY_NAME"; dpkg --print-architecture || true'
@@ -117,7 +117,7 @@ def survey(box: Box) -> str:
     return MACHINES[arch]
 
 
-def packages(box: Box) -> None:
+def packages(box: FleetBox) -> None:
     """Install the Debian packages that are missing. Raises Failed where they cannot be installed."""
     status = "dpkg-query -W -f '${db:Status-Status} ${binary:Package}\\n' " + " ".join(PACKAGES)
     output = box.run("looking for packages", f"{status} 2>/dev/null || true")
@@ -190,7 +190,7 @@ def self_test(release: str) -> str:
     return f"{as_user} {release}/bin/python -I -c {shlex.quote(SELF_TEST)} {release}/share/palpate"
 
 
-def switch(box: Box, name: str, release: str) -> str:
+def switch(box: FleetBox, name: str, release: str) -> str:
     """Swap the link and start the service from it, unless that is done already; the line for this box."""
     before = box.run("looking for the old release", f"readlink {LINK} || true")
     runs = f"""pid=$(systemctl show palpate -p MainPID --value)
@@ -212,7 +212,7 @@ def switch(box: Box, name: str, release: str) -> str:
     return f"{name} is READY {box.result['ready_s']} s after the command{lost}"
 
 
-def _swap_back(box: Box, release: str) -> str:
+def _swap_back(box: FleetBox, release: str) -> str:
     """Let the previous release run again, if there is one; text to append to the reason."""
     before = box.run("looking for the old release", f"readlink {LINK}.previous || true")
     if before in ("", Path(release).name):
@@ -233,8 +233,8 @@ ln -sfn {Path(release).name} {LINK}.new; sync -f /opt
 mv -T {LINK}.new {LINK}; sync -f /opt"""
 
 
-def _start(box: Box) -> bool:
-    """Let systemd and udev read the files behind the link, and start the service; see Box.restart."""
+def _start(box: FleetBox) -> bool:
+    """Let systemd and udev read the files behind the link, and start the service; see FleetBox.restart."""
     udev = "udevadm control --reload && udevadm trigger"
     box.run(
         "reading the unit", f"systemctl daemon-reload; ! command -v udevadm > /dev/null || {{ {udev}; }}", user="root"

@@ -176,6 +176,16 @@ def test_every_test_asserts(path: Path):
     assert not [test.name for test in tests if test.name.startswith("test_") and not asserts(test)]
 
 
+def test_each_class_name_stands_once():
+    """A class name says which class is meant: none stands in two modules, tests included."""
+    found: dict[str, list[str]] = {}
+    for path in [*SOURCES, *TESTS]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert {name: where for name, where in found.items() if len(where) > 1} == {}
+
+
 BANNED = (
     "taping", "underside", "yardstick", "what ends the program without being the bundle's doing",
 )  # fmt: skip

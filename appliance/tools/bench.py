@@ -16,7 +16,6 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -62,7 +61,7 @@ def run(bundle: Bundle, build: Build, references: Path, seed: int, report: Calla
     for name in bench_process.NAMES:
         add(_child(name, seed))
     add(_cold_start())
-    add({"bundle_kb": _size_kb(bundle), "date": f"{datetime.now(UTC):%Y-%m-%d}"})
+    add({"bundle_kb": _size_kb(bundle), "date": time.strftime("%Y-%m-%d", time.gmtime())})
     add({"load_average": {"before": _rounded(load_before), "after": _rounded(os.getloadavg())}})
     return figures
 

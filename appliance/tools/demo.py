@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from appliance.core.clock import Clock
 from appliance.runtime.loop import Box
 from appliance.sim.rig import Act
-from appliance.tools.score import Answer, Score
+from appliance.tools.score import Answer, AnswerScore
 
 FRAME_NS = 66_000_000
 """Time between two pictures of the skin."""
@@ -52,7 +52,7 @@ class Demo:
     """
 
     def __init__(self, played: Sequence[Act], far_end: int, clock: Clock, out: IO[str], *, raw: bool) -> None:
-        self.score = Score()
+        self.score = AnswerScore()
         self._played, self._clock, self._out = played, clock, out
         self._far_end, self._raw = far_end, raw
         self._live = not raw and out.isatty()

@@ -37,7 +37,7 @@ class Answer:
 
 
 @dataclass(slots=True)
-class Score:
+class AnswerScore:
     """Counts of the answers so far.
 
     right, total: by material. objects: whether the last answer for each object was right, where NEW OBJECT was

@@ -7,7 +7,7 @@ import numpy as np
 from appliance.core.types import Status, Verdict
 from appliance.io.robot_link import result
 from appliance.sim.rig import Act
-from appliance.tools.score import Answer, Score
+from appliance.tools.score import Answer, AnswerScore
 
 
 def answer(number: int, label: str, status: Status = Status.OK, share: float = 1.0) -> Answer:
@@ -25,7 +25,7 @@ def act(label: str, *, new_object: bool = False) -> Act:
 
 def test_only_ok_with_the_right_label_counts():
     """Another label, and the right one that is unsure, are wrong; percentages have their intervals."""
-    score = Score()
+    score = AnswerScore()
     answers = [answer(1, "wood"), answer(2, "wood"), answer(3, "wood", Status.UNSURE), answer(4, "wood", share=0.5)]
     right = [score.add(act(name), one) for name, one in zip(("wood", "paper", "wood", "wood"), answers, strict=True)]
     assert right == [True, False, False, True]
@@ -40,7 +40,7 @@ def test_only_ok_with_the_right_label_counts():
 
 def test_an_object_counts_by_its_last_answer():
     """Two sweeps of the first object, one of the second."""
-    score = Score()
+    score = AnswerScore()
     for new, label in ((True, "paper"), (False, "wood"), (True, "paper")):
         score.add(act("wood", new_object=new), answer(1, label))
     assert score.objects == [True, False]
