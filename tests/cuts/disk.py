@@ -1,4 +1,4 @@
-"""A disk that keeps only what it was told to keep. In: a folder, and the calls that change it. Out: all the folders that
+"""A disk that keeps for certain only what was synced. In: a folder, and the calls that change it. Out: all the folders that
 may be found when the power comes back.
 
 What a program has written is on the disk for sure only once it was synced: a file's content by an fsync of the file, a

@@ -2,7 +2,7 @@
 whose judge finds what is lost beyond the sweep in progress.
 
 `python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it goes on in the folder, says what a robot would hear,
-and which sweep it is told to discard.
+and which sweep it is asked to discard.
 """
 
 from __future__ import annotations

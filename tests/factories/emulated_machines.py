@@ -180,7 +180,7 @@ def run(*args: str | Path) -> str:
     return subprocess.run(args, check=True, capture_output=True, text=True).stdout
 
 
-def work(given: Path, told: Path) -> None:
+def work(given: Path, target: Path) -> None:
     """Run what lies in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy, into one .npz.
 
     A bundle: NAME/golden and NAME/sweeps are its logits. A shown.onnx: NAME/shown [n, ...] is all that it gives for the
@@ -192,18 +192,18 @@ def work(given: Path, told: Path) -> None:
     from appliance.core import clock
     from appliance.inference import classifier, session
 
-    said = {}
+    outputs = {}
     for path in sorted(given.iterdir()):
         sweeps = np.load(path / "sweeps.npy")
         if (path / bundle.MANIFEST).exists():
             box = classifier.Classifier(bundle.load(path), clock.SystemClock())
-            said[f"{path.name}/golden"] = np.stack([box.logits(sweep) for sweep in box.bundle.golden])
-            said[f"{path.name}/sweeps"] = np.stack([box.logits(sweep) for sweep in sweeps])
+            outputs[f"{path.name}/golden"] = np.stack([box.logits(sweep) for sweep in box.bundle.golden])
+            outputs[f"{path.name}/sweeps"] = np.stack([box.logits(sweep) for sweep in sweeps])
         if (path / "shown.onnx").exists():
             shown = session.session((path / "shown.onnx").read_bytes())
             each = [shown.run(None, {shown.get_inputs()[0].name: sweep[None]}) for sweep in sweeps]
-            said[f"{path.name}/shown"] = np.stack([np.concatenate([x.ravel() for x in one]) for one in each])
-    np.savez(told, **said)
+            outputs[f"{path.name}/shown"] = np.stack([np.concatenate([x.ravel() for x in one]) for one in each])
+    np.savez(target, **outputs)
 
 
 if __name__ == "__main__":

@@ -117,11 +117,11 @@ class Sprout:
     def add(self, domain: str, op: str, names: list[str], given: dict[str, Any]) -> bool:
         """Add a node, where its rule takes it."""
         inputs = [self.known[name] for name in names]
-        told = {k: v.encode() if isinstance(v, str) else v for k, v in given.items()}
-        if "value" in told:
-            told["value"] = Value("float32", (1,))
+        settings = {k: v.encode() if isinstance(v, str) else v for k, v in given.items()}
+        if "value" in settings:
+            settings["value"] = Value("float32", (1,))
         try:
-            outs = OPERATORS[domain, op].rule(Call(inputs, told))
+            outs = OPERATORS[domain, op].rule(Call(inputs, settings))
         except BundleError:
             return False
         outs = outs if isinstance(outs, list) else [outs]

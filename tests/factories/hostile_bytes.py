@@ -70,7 +70,7 @@ def misfits() -> Models:
     yield "two inputs", made, "2 inputs"
     made = model([node("Relu", ["x"], ["y"])])
     made.graph.output[0].type.tensor_type.shape.dim[1].dim_value = 3
-    yield "other logits than told", made, "'logits' is declared as"
+    yield "other logits than declared", made, "'logits' is declared as"
     made = model([node("Relu", ["x"], ["y"])])
     made.graph.output.append(info("x", 1, SWEEP))
     yield "another output", made, "allows logits"

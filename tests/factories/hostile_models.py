@@ -54,7 +54,7 @@ def foreign() -> Models:
         "domain 'evil'",
     )
     yield (
-        "custom domain, not told",
+        "custom domain, not declared",
         model([node("Add", ["x", "x"], ["y"], domain="evil")]),
         "no such operator of domain 'evil'",
     )
@@ -105,7 +105,7 @@ def endless() -> Models:
 
 
 def giant() -> Models:
-    """Tensors without measure, by every operator that a number tells how large its result is."""
+    """Huge tensors, by every operator whose result size is a number in the model."""
     large, column = [3 * MILLION, 1000], np.zeros((MILLION // 10, 1), np.float32)
     limit = r"bytes \(limit"
     one = helper.make_tensor("one", 1, [1], [1.0])

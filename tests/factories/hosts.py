@@ -40,8 +40,8 @@ NET = "10.213"
 
 def folder() -> Path:
     """Where the Debians lie, or will: others for other packages or another processor."""
-    said = repr((nspawn.SUITE, PACKAGES, WANTED, platform.machine())).encode()
-    return CACHE / hashlib.sha256(said).hexdigest()[:16]
+    key = repr((nspawn.SUITE, PACKAGES, WANTED, platform.machine())).encode()
+    return CACHE / hashlib.sha256(key).hexdigest()[:16]
 
 
 def check() -> None:
@@ -174,15 +174,15 @@ class Hosts:
             env=os.environ | {"HOME": str(self.work)}, capture_output=True, text=True, timeout=limit_s, check=False,
         )  # fmt: skip
 
-    def cut(self, command: str, *args: str | Path, said: str, after_s: float) -> None:
+    def cut(self, command: str, *args: str | Path, words: str, after_s: float) -> None:
         """The same, killed so long after it has said something."""
         with subprocess.Popen(
             [sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
             env=os.environ | {"HOME": str(self.work)}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         ) as process:  # fmt: skip
-            while said not in (line := process.stderr.readline()):
+            while words not in (line := process.stderr.readline()):
                 if not line:
-                    raise AssertionError(f"ended without {said!r}")
+                    raise AssertionError(f"ended without {words!r}")
             time.sleep(after_s)
             process.kill()
 
@@ -204,15 +204,15 @@ def figures(repeats: int = 5, many: int = 8) -> dict[str, Any]:
         (work / "signers").write_text(deliveries.line(key))
         install = ("--signers", work / "signers", "--board", "rpi5", "--wheel", next((work / "dist").glob("*.whl")))
         bundles = (deliveries.put(work / f"bundle-{n}", deliveries.files(n, key)) for n in count(1))
-        told: dict[str, Any] = {"commit": commit(), "machine": _machine()}
+        result: dict[str, Any] = {"commit": commit(), "machine": _machine()}
         with Hosts(1, work / "one") as one:
             at = ("--host", f"{USER}@127.0.0.1")
-            told["loopback"] = _measured(one, at, install, [next(bundles) for _ in range(repeats)], one.hosts[0])
+            result["loopback"] = _measured(one, at, install, [next(bundles) for _ in range(repeats)], one.hosts[0])
         with Hosts(many, work / "many") as several:
             at = ("--hosts", several.inventory())
-            told["many"] = _measured(several, at, install, [next(bundles) for _ in range(repeats)])
-        told["load_after"] = os.getloadavg()[0]
-    return told
+            result["many"] = _measured(several, at, install, [next(bundles) for _ in range(repeats)])
+        result["load_after"] = os.getloadavg()[0]
+    return result
 
 
 def _measured(
@@ -223,13 +223,13 @@ def _measured(
 
     def timed(command: str, *args: str | Path) -> dict[str, Any]:
         begin_s = time.monotonic()
-        done = place.desktop(command, *at, *args, "--json", place.work / "told.json", inside=inside)
+        done = place.desktop(command, *at, *args, "--json", place.work / "report.json", inside=inside)
         took_s = time.monotonic() - begin_s
         if done.returncode:
             raise RuntimeError(done.stdout + done.stderr)
-        told = json.loads((place.work / "told.json").read_text())
-        late_s = told["began_s"] - begin_s  # one clock for all processes of a machine
-        boxes = [box | {"ready_s": round(box["ready_s"] + late_s, 2)} for box in told["boxes"].values()]
+        result = json.loads((place.work / "report.json").read_text())
+        late_s = result["began_s"] - begin_s  # one clock for all processes of a machine
+        boxes = [box | {"ready_s": round(box["ready_s"] + late_s, 2)} for box in result["boxes"].values()]
         return {"command_s": round(took_s, 2), "boxes": boxes}
 
     installed = timed("install", *install)

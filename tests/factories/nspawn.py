@@ -64,8 +64,8 @@ BOOT_S = 60
 
 def folder() -> Path:
     """Where the Debian lies, or will: another one for another lock, suite or processor."""
-    said = repr((SUITE, PYTHON, PACKAGES, platform.machine())).encode()
-    return CACHE / hashlib.sha256(LOCK.read_bytes() + said).hexdigest()[:16]
+    key = repr((SUITE, PYTHON, PACKAGES, platform.machine())).encode()
+    return CACHE / hashlib.sha256(LOCK.read_bytes() + key).hexdigest()[:16]
 
 
 def check() -> None:
@@ -145,9 +145,9 @@ class Machine:
         first, end = "", time.monotonic() + BOOT_S
         while time.monotonic() < end and self._process.poll() is None:
             with suppress(TimeoutError):
-                said = dict(line.partition("=")[::2] for line in ear.recv(4096).decode().splitlines())
-                first = said.get("X_NSPAWN_LEADER_PID", first)
-                if said.get("READY") == "1":
+                key = dict(line.partition("=")[::2] for line in ear.recv(4096).decode().splitlines())
+                first = key.get("X_NSPAWN_LEADER_PID", first)
+                if key.get("READY") == "1":
                     return first
         raise Missing(f"systemd does not boot in a container here: {self._log.read_text(errors='replace').strip()}")
 
@@ -235,18 +235,18 @@ class Service:
         about = ("-u", "palpate", "-o", "cat", f"--since=@{self._begin:.6f}", *more)
         return self.machine.get("journalctl", "-q", *about).splitlines()
 
-    def told(self, *more: str) -> list[str]:
-        """The journal without systemd's words: what the program tells a person."""
+    def log_lines(self, *more: str) -> list[str]:
+        """The journal of the program, without the lines of systemd."""
         return self.journal("_SYSTEMD_UNIT=palpate.service", *more)
 
     def answers(self) -> list[str]:
         """The verdicts in the journal."""
-        return [line for line in self.told() if line.startswith("sweep ")]
+        return [line for line in self.log_lines() if line.startswith("sweep ")]
 
     def status(self) -> dict[str, Any]:
-        """What `palpate status --json` tells a user who is nobody in particular."""
-        told = self.machine.run("setpriv", "--reuid=nobody", "--clear-groups", PALPATE, "status", "--json").stdout
-        return dict(json.loads(told))
+        """The output of `palpate status --json` for an unprivileged user."""
+        text = self.machine.run("setpriv", "--reuid=nobody", "--clear-groups", PALPATE, "status", "--json").stdout
+        return dict(json.loads(text))
 
 
 def pack(parcel: Path, source: Path) -> None:

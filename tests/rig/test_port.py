@@ -120,7 +120,7 @@ def test_break_and_noise(cell: Cell, count: Count, note: Note) -> None:
     for junk in (b"x" * size, rng.bytes(size)):
         since = len(cell.serial.heard)
         cell.serial.say(junk + b"\r\n")
-        cell.state()  # by then noise has been told from commands, and answered; a robot waits so long at least
+        cell.state()  # by then noise is separated from commands, and answered; a robot waits at least as long
         cell.serial.say(b"$PPLP,ID\r\n")
         cell.serial.wait_for("$PPLP,ANS,ID,ok", 60, since)
     assert len(cell.state()) == 17

@@ -199,7 +199,7 @@ def by_hand(cell: Cell) -> str:
 
 
 def swept(cell: Cell) -> str:
-    """The status of a sweep; by hand where the board cannot tell when its frames reach a box that is behind."""
+    """The status of a sweep; by hand where the board cannot know when its frames reach a box that is behind."""
     since = len(cell.serial.heard)
     touch = cell.touch()
     if touch.played.wait(10):

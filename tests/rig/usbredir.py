@@ -1,7 +1,7 @@
 """The far end of a USB cable that leads into the guest. In: a board of the rig. Out: the usbredir protocol's messages.
 
 QEMU's usb-redir device sits on the guest's xHCI port and passes on what the guest's kernel asks of a device
-(usbredirproto.h of usbredir 0.13 tells the messages); a Board answers, as it does under the simulated bus.
+(messages as in usbredirproto.h of usbredir 0.13); a Board answers, as it does under the simulated bus.
 """
 
 from __future__ import annotations

@@ -227,7 +227,7 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
 ):
     """The desktop dies during the copy, or while the box builds: the old release starts, and a second command finishes."""
     new, before = changed(wheel, tmp_path, "appliance/more.py", f"# {said} {after_s}\n"), release(host)
-    site.cut("install", *at, "--wheel", new, said=said, after_s=after_s)
+    site.cut("install", *at, "--wheel", new, words=said, after_s=after_s)
     assert release(host) == before
     start_again(host)
     done = site.desktop("install", *at, "--wheel", new)
@@ -344,7 +344,7 @@ def test_a_delivery_that_is_cut_leaves_old_or_new(
 ):
     """The desktop dies at any time and the box restarts: it runs the old or the new bundle; a second delivery finishes."""
     bundle, before = sender.made(), serves(host)
-    site.cut("deploy", *at, bundle, "--verbose", said=said, after_s=after_s)
+    site.cut("deploy", *at, bundle, "--verbose", words=said, after_s=after_s)
     start_again(host)
     assert serves(host) in (before, sha(bundle)[:8])
     done = site.desktop("deploy", *at, bundle)

@@ -82,7 +82,7 @@ def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, servic
     assert (service["ActiveState"], service["NRestarts"]) == ("active", "0")
     machine.put("/run/skin", "")
     service.until("StatusText", STREAMS)
-    skin = [line for line in service.told() if line.startswith("skin: ")]
+    skin = [line for line in service.log_lines() if line.startswith("skin: ")]
     assert [line.split(" (")[0].split(";")[0] for line in skin] == [
         "skin: no skin 1209:7ac7 on USB",
         "skin: streaming",
@@ -138,7 +138,7 @@ def test_a_killed_process_is_started_again(machine: Machine, service: Service, s
     service.until("ActiveState", "active")
     assert int(service["MainPID"]) not in (0, first)
     assert sum("Main process exited, code=killed, status=" in line for line in service.journal()) == 1
-    lowered = [line for line in service.told() if line.startswith("palpate: outputs may not be low:")]
+    lowered = [line for line in service.log_lines() if line.startswith("palpate: outputs may not be low:")]
     assert [line.split(": ")[2].split(";")[0] for line in lowered] == ["this machine has no /dev/gpiochip*"]
 
 
@@ -151,7 +151,7 @@ def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service)
     time.sleep(2.5)  # longer than RestartSec
     assert (service["NRestarts"], service["ExecMainStatus"], service["SubState"]) == ("1", "78", "failed")
     named = f"palpate: {SITE}: sweep.max_duration_s = 'for ever'"
-    assert sum(line.startswith(named) for line in service.told()) == 1
+    assert sum(line.startswith(named) for line in service.log_lines()) == 1
     machine.get("rm", SITE)
     machine.get("systemctl", "start", "palpate")
     service.until("StatusText", STREAMS)
@@ -168,7 +168,7 @@ def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, servic
     print(f"three starts in {took_s:.1f} s")
     assert took_s > 4
     assert service["ExecMainStatus"] in ("0", "69")
-    named = [line for line in service.told() if line.startswith("palpate: this machine has no /dev/gpiochip*")]
+    named = [line for line in service.log_lines() if line.startswith("palpate: this machine has no /dev/gpiochip*")]
     assert len(named) in (3, 4)
 
 
@@ -193,15 +193,15 @@ def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
     service.start(CABLED)
     end = time.monotonic() + WAIT_S
     while len(service.answers()) < 2:
-        assert time.monotonic() < end, service.told()
+        assert time.monotonic() < end, service.log_lines()
         time.sleep(0.2)
     machine.get("rm", "/run/skin")
     service.until("StatusText", "skin absent.*")
-    lines = service.told()
+    lines = service.log_lines()
     assert [line for line in lines if not line.startswith(("sweep ", "skin: "))] == []
     assert lines[0] == "skin: streaming"
     assert re.fullmatch(r"sweep 1: [a-z ]+, [0-9.]+ % \([0-9.]+ ms\)", service.answers()[0])
-    warned = service.told("-p", "warning")
+    warned = service.log_lines("-p", "warning")
     assert warned[-1].startswith("skin: no skin 1209:7ac7 on USB")
     assert not [line for line in warned if " % (" in line]
 

@@ -135,7 +135,7 @@ def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Ser
     while store.starts(new) or not store.ledger["standings"][new]["committed"]:
         assert time.monotonic() < end, service.journal()
         time.sleep(0.2)
-    lines = [line for line in service.told() if line.startswith("bundle ")]
+    lines = [line for line in service.log_lines() if line.startswith("bundle ")]
     assert lines == [
         f"bundle {new[:8]} is on trial, start 1 of 3",
         f"bundle {new[:8]} has stood its trial and is committed",
@@ -159,7 +159,7 @@ def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
     serves(service, store.a)
     print(f"{does}: A serves again after {time.monotonic() - begin:.1f} s")
     assert store.current == store.a
-    *starts, left = [line for line in service.told() if line.startswith(f"bundle {new[:8]} ")]
+    *starts, left = [line for line in service.log_lines() if line.startswith(f"bundle {new[:8]} ")]
     assert starts == [f"bundle {new[:8]} is on trial, start {i} of 3" for i in (1, 2, 3)]
     assert LEFT in left
     assert left.endswith("it was started 3 times without being committed")
@@ -176,7 +176,7 @@ def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
     service.start(RUN)
     serves(service, store.a)
     assert (service["NRestarts"], store.current) == ("0", store.a)
-    lines = [line for line in service.told() if LEFT in line]
+    lines = [line for line in service.log_lines() if LEFT in line]
     assert len(lines) == 1
     assert "model.onnx was altered" in lines[0]
 
@@ -188,7 +188,7 @@ def test_a_bundle_that_does_not_fit_the_settings_is_left(machine: Machine, servi
     service.start(RUN)
     serves(service, store.a)
     assert (service["NRestarts"], store.current) == ("0", store.a)
-    assert any(f"bundle {new[:8]} {LEFT}" in line and "classifier.early" in line for line in service.told())
+    assert any(f"bundle {new[:8]} {LEFT}" in line and "classifier.early" in line for line in service.log_lines())
 
 
 def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
@@ -203,7 +203,7 @@ def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
     machine.run("systemctl", "start", "palpate")
     service.until("ActiveState", "failed")
     assert (service["ExecMainStatus"], service["NRestarts"]) == ("78", "0")
-    assert any("model.onnx was altered" in line and "palpate rollback" in line for line in service.told())
+    assert any("model.onnx was altered" in line and "palpate rollback" in line for line in service.log_lines())
     store.do("rollback")
     service.start(RUN)
     serves(service, store.a)
@@ -220,7 +220,7 @@ def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
         service.configure(REAL)
         machine.get("systemctl", "start", "--no-block", "palpate")
         service.until("NRestarts", "[4-9]")
-        assert any("no /dev/gpiochip" in line for line in service.told())
+        assert any("no /dev/gpiochip" in line for line in service.log_lines())
         machine.get("systemctl", "stop", "palpate")
     elif end == "stopped in order":
         for _ in range(4):
@@ -236,7 +236,7 @@ def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
             service.until("NRestarts", str(i + 1))
         wait_for(lambda: store.starts(new) == 0, service)
     assert (store.current, store.starts(new)) == (new, 0)
-    assert not [line for line in service.told() if LEFT in line]
+    assert not [line for line in service.log_lines() if LEFT in line]
 
 
 def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) -> None:
