@@ -26,8 +26,8 @@ PERCENT: dict[str, Callable[..., str]] = {
 FILTERS: dict[str, Callable[..., str]] = {
     "points": formatting.points,
     "seconds": formatting.seconds,
-    "sentence": lambda text: f"{text[:1].upper()}{text[1:]}",
-    "one_line": lambda text: " ".join(text.split()),
+    "sentence": lambda text: text[:1].upper() + text[1:],
+    "one_line": lambda text: type(text)(" ".join(text.split())),  # what is escaped stays so, and is not escaped twice
 }
 """Of all templates; those of PERCENT keep number and sign in one line of a page."""
 

@@ -1,4 +1,4 @@
-"""The interactive chart in a headless browser: every control does what it says, and no request leaves the page."""
+"""The interactive chart in a headless browser: every control works, and no request leaves the page."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class BrowsedChart:
     def __init__(self, page: Any, address: str) -> None:
         self.page, self.address = page, address
         self.troubles: list[str] = []
-        page.on("console", lambda said: self.troubles.append(said.text))
+        page.on("console", lambda message: self.troubles.append(message.text))
         page.on("pageerror", lambda error: self.troubles.append(str(error)))
         page.on("request", lambda request: self.asked.append(request.url))
         self.asked: list[str] = []
@@ -69,7 +69,7 @@ class BrowsedChart:
         return str(self.page.get_attribute("#stairs", "d"))
 
     def tip(self) -> str:
-        """What the tip says; "" where there is none."""
+        """The text of the tip; "" where there is none."""
         return str(self.page.inner_text("#tip")) if self.page.is_visible("#tip") else ""
 
     def rows(self) -> list[str]:
@@ -79,7 +79,7 @@ class BrowsedChart:
 
 @pytest.fixture
 def seen(browser: Any, file: str) -> Iterator[BrowsedChart]:
-    """The page on a desktop; nothing may be said on the console, and nothing but the file may be asked for."""
+    """The page on a desktop; nothing may appear on the console, and nothing but the file may be requested."""
     context = browser.new_context(viewport={"width": 1000, "height": 800}, reduced_motion="reduce")
     one = BrowsedChart(context.new_page(), file)
     yield one.open()
@@ -114,7 +114,7 @@ def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: BrowsedChart, 
 
 
 def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
-    """Near a dot it is told, with its interval and what beats it; away from all dots nothing is."""
+    """Near a dot its name is shown, with its interval and what beats it; away from all dots nothing is."""
     x, y = seen.places()[3]
     frame = seen.page.locator("#plot svg").bounding_box()
     seen.page.mouse.move(frame["x"] + x + 6, frame["y"] + y + 6)
@@ -170,7 +170,7 @@ def test_scales_are_linear_or_logarithmic(seen: BrowsedChart):
 
 
 def test_the_choice_is_in_the_address(seen: BrowsedChart):
-    """Chosen, it is there; opened again from there, it is as it was; what the address says wrongly is left."""
+    """A choice is in the address, and opening that address restores it; values that do not exist are ignored."""
     seen.page.select_option("#x", "macs")
     seen.page.select_option("#y", "lopo")
     seen.page.uncheck("#xlog")
@@ -201,11 +201,11 @@ def test_the_keyboard_goes_from_dot_to_dot(seen: BrowsedChart):
     seen.page.keyboard.press("Tab")
     assert seen.tip()
     seen.page.keyboard.press("Home")
-    told = [seen.tip().split("\n")[0]]
+    order_seen = [seen.tip().split("\n")[0]]
     for _ in order[1:]:
         seen.page.keyboard.press("ArrowRight")
-        told.append(seen.tip().split("\n")[0])
-    assert told == order
+        order_seen.append(seen.tip().split("\n")[0])
+    assert order_seen == order
     seen.page.keyboard.press("ArrowLeft")
     assert order[-2] in seen.tip()
     seen.page.keyboard.press("Escape")
@@ -230,7 +230,7 @@ def test_dots_are_named_for_those_who_do_not_see_them(seen: BrowsedChart):
 
 
 def test_the_table_is_sorted_by_what_was_chosen(seen: BrowsedChart):
-    """By accuracy first, by cost when asked; it says so."""
+    """By accuracy first, by cost when asked; the head shows which."""
     by_accuracy = sorted(DOTS, key=lambda one: (-one["accuracy"]["hard"]["mean"], one["ms_p50"]))
     assert seen.rows() == [pareto.name(one) for one in by_accuracy]
     seen.page.locator("button[data-sort=cost]").focus()

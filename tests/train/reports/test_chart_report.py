@@ -61,18 +61,18 @@ def test_weights_and_multiply_accumulates_are_counted():
 
 
 def test_the_family_counts_its_costs_as_the_chart_does():
-    """What ladder.py says of a shape is what cost.py counts in its graphs, but for the means of the responses, and for
+    """What architectures.py computes for a shape is what cost.py counts in its graphs, but for the means of the responses, and for
     the spectrum: its part of the head, and the few numbers that it is made of."""
     (method,) = methods.find(["compact-10k"], methods.Effort(share=0.0))
     known = sweeps()
     model = method.train(known, known.samples, 1)
-    told, bands = model.fit.architecture.cost(known.format, 2), model.fit.bands
+    shown, bands = model.fit.architecture.cost(known.format, 2), model.fit.bands
     alone = graph.trunk_graph(known.format, model.fit.scale, {}, ARCHITECTURES["bands"])
     more = [count(alone) + 2 * bands if bands else 0 for count in (cost.weights, cost.macs)]
     for one in (model, model.forms["float"]):
-        assert cost.weights(one.graph()) == told.weights + more[0]
+        assert cost.weights(one.graph()) == shown.weights + more[0]
         assert cost.macs(one.graph()) == pytest.approx(
-            told.macs + more[1], rel=0.15
+            shown.macs + more[1], rel=0.15
         )  # a window so short has long means
     assert cost.weights(alone) <= 7 * 4 + bands  # window, what is not heard (twice), shares of the bands
 
@@ -86,11 +86,11 @@ def test_a_gru_a_kernel_and_neighbours_are_counted():
                                          support_vectors=[0.0] * 15, coefficients=[0.0] * 3), 18),
     }  # fmt: skip
     for shape, node, expected in nodes.values():
-        held = [onnx.numpy_helper.from_array(np.zeros(of, np.float32), name)
+        weights = [onnx.numpy_helper.from_array(np.zeros(of, np.float32), name)
                 for name, of in (("w", [1, 12, 5] if node.op_type == "GRU" else [12, 5]), ("r", [1, 12, 4]))]  # fmt: skip
         x = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
         y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
-        graph = helper.make_graph([node], "one", [x], [y], held)
+        graph = helper.make_graph([node], "one", [x], [y], weights)
         domains = [helper.make_opsetid(name, v) for name, v in (("", 17), ("ai.onnx.ml", 3), ("com.microsoft", 1))]
         assert cost.macs(helper.make_model(graph, opset_imports=domains)) == expected
 
@@ -108,7 +108,7 @@ def test_a_graph_of_unknown_shapes_is_refused():
 
 
 def test_the_transforms_of_features_are_counted():
-    """L: one of 1500 frames for each of 16 taxels; H: 40 short ones of 75; raw digits: none."""
+    """L: one of 1500 frames for each of 16 taxels; H: 40 short ones of 75; raw counts: none."""
     assert cost.feature_macs("L", skin.FORMAT) == pytest.approx(16 * 1500 * np.log2(1500), abs=1)
     assert cost.feature_macs("H", skin.FORMAT) == pytest.approx(16 * 40 * 75 * np.log2(75), abs=1)
     assert cost.feature_macs("raw", skin.FORMAT) == 0
@@ -130,7 +130,7 @@ def curve(severities: list[float], accuracy: list[float]) -> dict:
     return {"severities": severities, "accuracy": accuracy, "total": 216, "unit": "", "about": ""} | ends
 
 
-def test_stress_is_told_by_the_worst_and_at_the_targets():
+def test_stress_is_given_by_the_worst_and_at_the_targets():
     """The worst is the lowest mean over severities above none; gain is the worse of both ways; noise is read at .3."""
     curves = {
         "noise": curve([0, 0.1, 0.3, 0.5], [0.9, 0.8, 0.7, 0.6]),
@@ -139,14 +139,14 @@ def test_stress_is_told_by_the_worst_and_at_the_targets():
         "gain-down": curve([0, 0.2], [0.9, 0.85]),
         "dead": curve([0, 1, 2], [0.9, 0.88, 0.1]),
     }
-    told = chart_report.under_stress({"curves": curves, "seeds": [1, 2]})
-    assert (told["stress"]["name"], told["stress"]["mean"], told["stress"]["n"]) == ("hum", 0.4, 108)
-    means = {key: entry["mean"] for key, entry in told.items()}
+    shown = chart_report.under_stress({"curves": curves, "seeds": [1, 2]})
+    assert (shown["stress"]["name"], shown["stress"]["mean"], shown["stress"]["n"]) == ("hum", 0.4, 108)
+    means = {key: entry["mean"] for key, entry in shown.items()}
     assert means["stress:none"] == 0.9
     assert means["stress:noise"] == 0.7
     assert means["stress:gain"] == 0.8
     assert means["stress:dead"] == 0.88
-    assert "stress:lost" not in told
+    assert "stress:lost" not in shown
 
 
 def test_touch_time_is_read_or_refused(tmp_path: Path):
@@ -185,7 +185,7 @@ def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
 
 
 def test_the_files(tmp_path: Path):
-    """chart.json is a list of dots; picture and page name them; what is left out is said; quick is stamped."""
+    """chart.json is a list of dots; picture and page name them; what is left out is named; a quick run is marked."""
     page = chart_report.write(tmp_path, DOTS, True, {"force": "no <data>"})
     assert json.loads((tmp_path / "chart.json").read_text()) == DOTS
     text = page.read_text()
@@ -205,12 +205,12 @@ def test_no_name_can_break_out_of_the_data():
 
 
 def test_the_picture_is_whole_and_names_do_not_collide():
-    """Well-formed, twice the same, in roles of colour; no two names overlap; the family is told by size."""
+    """Well-formed, twice the same, in roles of colour; no two names overlap; the family is named by size."""
     svg = scatter.chart(DOTS, ("hard", "lopo"))
     assert svg == scatter.chart(DOTS, ("hard", "lopo"))
     texts = list(ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text"))
-    said = [node.text for node in texts]
-    assert {"1k", "20k", "MiniRocket", "T-HARD, simulated", "T-REAL, simulated"} <= set(said)
+    words = [node.text for node in texts]
+    assert {"1k", "20k", "MiniRocket", "T-HARD, simulated", "T-REAL, simulated"} <= set(words)
     assert "var(--accent" in svg
     crowd = [dot(f"method-{i}", "float", 1 + i / 50, 0.9 + i / 1000, family="L and H") for i in range(12)]
     texts = ElementTree.fromstring(scatter.chart([*crowd, *DOTS])).iter("{http://www.w3.org/2000/svg}text")
@@ -231,8 +231,8 @@ def box(node: ElementTree.Element) -> tuple[float, float, float, float]:
 def test_the_front_of_the_picture_is_dark_and_the_rest_grey():
     """Ours is in the accent colour where it is on the front, grey where it is not; others dark."""
     spots = pareto.placed(DOTS, "ms_p50", "hard")
-    told = {pareto.name(spot[0]): scatter.colour(spot[0], spot[3]) for spot in spots}
-    assert told["compact-1k int8"] == scatter.ACCENT
-    assert told["compact-1k float"] == scatter.GREY
-    assert told["minirocket float in aeon"] == scatter.BLACK
-    assert told["minirocket float"] == scatter.GREY
+    shown = {pareto.name(spot[0]): scatter.colour(spot[0], spot[3]) for spot in spots}
+    assert shown["compact-1k int8"] == scatter.ACCENT
+    assert shown["compact-1k float"] == scatter.GREY
+    assert shown["minirocket float in aeon"] == scatter.BLACK
+    assert shown["minirocket float"] == scatter.GREY

@@ -1,10 +1,9 @@
-"""The paper's page: what is drawn together, how it is counted, what the page says, and that it needs nothing else."""
+"""The paper's page: which sweeps are fused, how results are counted, what the page shows, and that it needs nothing else."""
 
 from __future__ import annotations
 
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -12,39 +11,13 @@ import numpy as np
 import pytest
 
 from appliance.sim.skin import MATERIALS
+from tests.factories.page_reader import PageReader
 from train.evaluation.evaluate import Where
 from train.reports import paper_experiment, paper_report, paper_values
 from train.reports.paper_experiment import Outcome, PaperPart, Step
 
-SURE, VOID = 9.0, {"meta", "br", "!doctype", "path", "use"}
+SURE = 9.0
 FIGURES = [f"figure-{n}" for n in (4, 5, 6, 7, 9, 10, 11, 12, 13)] + ["methods"]
-
-
-class PageReader(HTMLParser):
-    """All text of a page, and every tag that is not closed in order."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.wrong: list[str] = []
-        self.links: list[str] = []
-        self.text = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Remember what is open, and every address."""
-        self.links += [v or "" for k, v in attrs if k in ("href", "src", "xlink:href", "srcset")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        """What closes must be what opened last."""
-        if tag not in VOID and (not self.open or self.open.pop() != tag):
-            self.wrong.append(tag)
-
-    def handle_data(self, data: str) -> None:
-        """Text as a reader sees it."""
-        self.text += data + " "
 
 
 def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: int = 3) -> Outcome:
@@ -54,15 +27,15 @@ def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: 
     given = np.where(np.random.default_rng(world).random(len(labels)) < right, labels, (labels + 1) % 6)
     confusion = np.zeros((6, 6), int)
     np.add.at(confusion, (labels, given), 1)
-    told = {"part": part, "method": method, "world": world, "materials": list(MATERIALS), "machine": "abacus, 2 cores",
+    about = {"part": part, "method": method, "world": world, "materials": list(MATERIALS), "machine": "abacus, 2 cores",
             "confusion": confusion.tolist(), "fit_s": 1.5, "ms_p50": 0.25, "ran": "7 beads" if "cnn" in method else "",
             "agreement": 1.0}  # fmt: skip
     costs = [np.array([[1, 1.7], [7, 0.5]])] * 2 if "cnn" in method else []
-    return Outcome(part, method, world, labels, SURE * np.eye(6, dtype=np.float32)[given], place, costs, told)
+    return Outcome(part, method, world, labels, SURE * np.eye(6, dtype=np.float32)[given], place, costs, about)
 
 
 def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
-    """What `run` would tell of made-up outcomes, as it reads back from results.json."""
+    """What `run` would write of made-up outcomes, as it reads back from results.json."""
     outcomes = [
         outcome(p, m, w)
         for p in paper_experiment.FULL
@@ -70,20 +43,20 @@ def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
         for w in (1, 2)
     ]
     outcomes += [outcome(p, cnn, right=0.9) for p in ("lopo", "hard") if cnn]
-    about = {"quick": quick, "commit": "c0ffee<", "took_s": 3}
-    return json.loads(paper_experiment._lines(paper_experiment.summary(outcomes, paper_experiment.FULL) | about))
+    more = {"quick": quick, "commit": "c0ffee<", "took_s": 3}
+    return json.loads(paper_experiment._lines(paper_experiment.summary(outcomes, paper_experiment.FULL) | more))
 
 
 @pytest.fixture(scope="module")
-def told() -> dict[str, Any]:
+def results() -> dict[str, Any]:
     """A summary that many tests look at."""
     return summary()
 
 
 @pytest.fixture(scope="module")
-def made(told: dict[str, Any]) -> tuple[str, dict[str, str]]:
+def made(results: dict[str, Any]) -> tuple[str, dict[str, str]]:
     """Its page and pictures."""
-    return paper_report.render(told)
+    return paper_report.render(results)
 
 
 def test_printed_numbers_are_the_papers():
@@ -109,7 +82,7 @@ def test_objects_begin_with_every_sweep_once_and_mix_nothing():
     assert not np.array_equal(drawn, paper_experiment.objects(labels, place, seed=2))
 
 
-def test_two_votes_say_what_the_first_said_and_a_product_can_be_better():
+def test_two_votes_give_what_the_first_gave_and_a_product_can_be_better():
     """Half of the sweeps are sure and right, half a little wrong: votes of two stay at .5, products go beyond it."""
     o = outcome("lopo", "H-svm", right=1)
     weak = np.arange(len(o.labels)) % 2 == 0
@@ -148,14 +121,14 @@ def test_a_cost_curve_keeps_its_ends_in_few_points():
     assert len(paper_experiment._thinned(cost[:1])) == 1
 
 
-def test_summary_pools_worlds_and_keeps_each_result(told):
+def test_summary_pools_worlds_and_keeps_each_result(results):
     """144 sweeps of two worlds, six places; printed beside it; every outcome in results, 11 confusion rows of 24."""
-    row = next(r for r in told["table"] if (r["part"], r["method"]) == ("lopo", "H-svm"))
+    row = next(r for r in results["table"] if (r["part"], r["method"]) == ("lopo", "H-svm"))
     assert (row["total"], row["worlds"], row["printed"], row["attachments"][0]) == (144, [1, 2], 0.86, 6)
     assert row["share"][0] == round(row["right"] / 144, 4)
-    assert len(told["results"]) == 4 * 6 * 2 + 2
-    assert np.sum(told["confusion"]["H-svm"], 1).tolist() == [24] * 6
-    assert told["costs"] == {"paper-cnn": [[[1, 1.7], [7, 0.5]]] * 2}
+    assert len(results["results"]) == 4 * 6 * 2 + 2
+    assert np.sum(results["confusion"]["H-svm"], 1).tolist() == [24] * 6
+    assert results["costs"] == {"paper-cnn": [[[1, 1.7], [7, 0.5]]] * 2}
 
 
 def test_the_page_is_one_file_that_a_phone_can_read(made):
@@ -171,18 +144,18 @@ def test_the_page_is_one_file_that_a_phone_can_read(made):
     assert all(svg in html and len(svg) < 150_000 for svg in pictures.values())
 
 
-def test_the_page_shows_every_figure_with_printed_beside_ours(told, made):
+def test_the_page_shows_every_figure_with_printed_beside_ours(results, made):
     """Figures 4 to 7, 9 to 13 and the table of all; each number of ours with interval, printed value and difference."""
     html, pictures = made
     assert sorted(pictures) == sorted(FIGURES)
     text = " ".join(PageReader(html).text.split())
-    for row in told["table"]:
+    for row in results["table"]:
         if row["printed"] is not None:
             difference = f"{100 * (row['share'][0] - row['printed']):+.1f}".replace("-", "−")
             low, high = (f"{100 * v:.1f}" for v in row["share"][1:])
             value = f"{100 * row['printed']:.1f}".removesuffix(".0")
             assert f"{low} – {high} % {value} % {difference} {row['right']} / {row['total']}" in text
-    for said in (
+    for fact in (
         "simulated sweeps",
         "c0ffee<",
         "abacus, 2 cores",
@@ -191,14 +164,14 @@ def test_the_page_shows_every_figure_with_printed_beside_ours(told, made):
         "81.9 to 96.4 %",
         "60 sweeps",
     ):
-        assert said in text
+        assert fact in text
 
 
 @pytest.mark.slow
-def test_only_a_quick_run_says_that_it_means_nothing(told, made):
+def test_only_a_quick_run_says_that_it_means_nothing(results, made):
     """The banner is there for --quick and not otherwise."""
     assert "quick run" not in made[0]
-    assert 'class="stop"' in paper_report.render(told | {"quick": True})[0]
+    assert 'class="stop"' in paper_report.render(results | {"quick": True})[0]
 
 
 def test_hard_protocols_come_first(made):
@@ -264,9 +237,9 @@ def test_run_writes_everything_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     made = paper_experiment.run(tmp_path / "a", True, where, lines.append)
     assert made == tmp_path / "a" / "index.html"
     assert 'class="stop"' in made.read_text()
-    told = json.loads((tmp_path / "a" / "results.json").read_text())
+    results = json.loads((tmp_path / "a" / "results.json").read_text())
     assert {p.stem for p in made.parent.glob("*.svg")} == {f"figure-{n}" for n in (4, 5, 6, 7, 13)} | {"methods"}
-    assert len(told["results"]) == 8
+    assert len(results["results"]) == 8
     assert len(lines) == 14
     assert "4/4 random, world 1" in lines[-1]
     assert all(" left" in line for line in lines)
@@ -274,4 +247,4 @@ def test_run_writes_everything_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     paper_experiment.run(tmp_path / "b", True, where)
     assert kept == {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
     again = json.loads((tmp_path / "b" / "results.json").read_text())
-    assert told | {"took_s": 0} == again | {"took_s": 0}
+    assert results | {"took_s": 0} == again | {"took_s": 0}

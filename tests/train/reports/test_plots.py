@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from train.reports import plot_style, plots
+from train.reports import paper_values, plot_style, plots
 
 SVG = "{http://www.w3.org/2000/svg}"
 ESTIMATE = (0.864, 0.81, 0.903)
@@ -89,8 +90,8 @@ def test_no_text_leaves_the_picture(name: str):
 
 def test_bars_show_ours_the_interval_and_what_was_printed():
     """All four numbers stand there, in the paper's way of writing; a guess has its line only where it is asked for."""
-    said = words(PICTURES["bars"]())
-    assert {"T-HARD", "H-svm", "86 %", "81 – 90 %", "70 %", "random guess"} <= set(said)
+    shown = words(PICTURES["bars"]())
+    assert {"T-HARD", "H-svm", "86 %", "81 – 90 %", "70 %", "random guess"} <= set(shown)
     plain = words(plots.bars({"": [plots.Bar("H-svm", ESTIMATE)]}, "bars"))
     assert "random guess" not in plain
     assert "70 %" not in plain
@@ -106,9 +107,9 @@ def test_a_cost_curve_has_its_marks_even_where_nothing_was_trained():
 
 def test_confusion_gives_shares_of_each_row():
     """Counts become shares of the truth; what the paper printed stands below them, where it printed anything."""
-    said = words(PICTURES["confusion"]())
-    assert [said.count(text) for text in ("80", "20", "100", "90", "10")] == [1, 1, 1, 1, 1]
-    assert said.count("◇ 20") == 1
+    shown = words(PICTURES["confusion"]())
+    assert [shown.count(text) for text in ("80", "20", "100", "90", "10")] == [1, 1, 1, 1, 1]
+    assert shown.count("◇ 20") == 1
     assert not any("◇" in text for text in words(plots.confusion(COUNTS, NAMES, "confusion")))
 
 
@@ -126,10 +127,10 @@ def test_matrix_puts_hard_protocols_and_good_methods_first():
     order = ("random:5", "split:force=1->2", "leave:speed")
     results = [result(m, p, r) for m, r in (("bad", 40), ("good", 90)) for p in order]
     results += [result("bad", p, 95, means_removed=False) for p in order]
-    said = places(plots.matrix(results))
-    assert said["good"][1] < said["bad"][1]
-    assert said["means removed"][1] < said["means kept"][1]
-    assert said["leave"][0] < said["split"][0] < said["random"][0]
+    shown = places(plots.matrix(results))
+    assert shown["good"][1] < shown["bad"][1]
+    assert shown["means removed"][1] < shown["means kept"][1]
+    assert shown["leave"][0] < shown["split"][0] < shown["random"][0]
 
 
 def test_matrix_takes_the_mean_over_seeds_and_counts_what_it_is_told():
@@ -141,6 +142,16 @@ def test_matrix_takes_the_mean_over_seeds_and_counts_what_it_is_told():
 
 def test_stress_has_a_picture_each_with_its_unit():
     """Every stress once, its greatest severity with the unit, shares as per cent; strong methods are named."""
-    said = words(plots.robustness({"methods": under_stress("compact") | under_stress("L-knn")}, ["compact"]))
-    assert {"dead", "gain-up", "0.5 taxels", "50 %", "━ compact"} <= {text.strip() for text in said}
-    assert "━ L-knn" not in said
+    shown = words(plots.robustness({"methods": under_stress("compact") | under_stress("L-knn")}, ["compact"]))
+    assert {"dead", "gain-up", "0.5 taxels", "50 %", "━ compact"} <= {text.strip() for text in shown}
+    assert "━ L-knn" not in shown
+
+
+def test_titles_of_panels_do_not_collide():
+    """Each title of several sweeps ends before the next begins, by a generous guess of its width."""
+    rules = dict.fromkeys(("vote", "product"), [ESTIMATE] * 3)
+    names = ["H-svm", *map(paper_values.short_name, paper_values.CNNS), "compact"]
+    at = places(plots.sweeps(dict.fromkeys(names, rules), {}, "sweeps"))
+    ends = [(at[name][0], at[name][0] + 0.65 * plot_style.MEDIUM * len(name)) for name in names]
+    assert all(end < begin for (_, end), (begin, _) in pairwise(ends))
+    assert ends[-1][1] < 360

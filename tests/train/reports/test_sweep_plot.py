@@ -55,24 +55,24 @@ def small(tmp_path: Path) -> str:
 
 def test_the_picture_says_what_is_known(small: str):
     """Label, places, file, format, losses, verdict, bundle, device, clock; numbers as they are; units at both fields."""
-    told = words(small)
+    shown = words(small)
     for text in (
         "cork, position 3, session mon", "sweep-000017.npy, sweep 7: ok", "4x4 uint8 at 750 Hz, window 1500",
         "2 frames lost, filled in from their neighbours", "verdict: status unsure, label cork, probability 0.9877",
         "bundle: 9f3c2a1b", "device: board readout, serial A4, firmware 1.4.2", "clock: jitter us 41.23", "grey: the skin at rest",
         "raw counts over seconds after the start edge", "raw counts per √Hz over Hz", "the noise of rounding to whole counts; without 1 that stand still",
     ):  # fmt: skip
-        assert text in told, text
-    assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(told.split("\n"))
+        assert text in shown, text
+    assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(shown.split("\n"))
 
 
 def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
-    """A recording of before, with no sidecar's extras: nothing is said of rest, verdict or device."""
+    """A recording of an older version, with nothing more in its sidecar: nothing of rest, verdict or device is shown."""
     record(tmp_path / "1.npy", "a")
-    told = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "1.npy"))))
-    assert told.startswith("a\n1.npy, sweep 1: ok")
+    shown = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "1.npy"))))
+    assert shown.startswith("a\n1.npy, sweep 1: ok")
     for text in ("rest", "verdict", "bundle", "device", "clock", "lost", "None"):
-        assert text not in told
+        assert text not in shown
 
 
 @pytest.mark.slow
@@ -104,14 +104,14 @@ def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
 
 def test_every_peak_is_in_the_line():
     """Thinned to what can be seen: first and last step, the one frame that stands out, the order of time."""
-    digits = np.zeros(5000)
-    digits[[3210, 4321]] = 99, -99
-    time_s, seen = sweep_plot._thinned(np.arange(5000) / 750, digits)
+    counts = np.zeros(5000)
+    counts[[3210, 4321]] = 99, -99
+    time_s, seen = sweep_plot._thinned(np.arange(5000) / 750, counts)
     assert len(seen) <= 2 * sweep_plot.FINEST
     assert (seen.max(), seen.min()) == (99, -99)
     assert time_s[seen.argmax()] == 3210 / 750
     assert (np.diff(time_s) > 0).all()
-    assert len(sweep_plot._thinned(np.arange(9), digits[:9])[1]) == 9
+    assert len(sweep_plot._thinned(np.arange(9), counts[:9])[1]) == 9
 
 
 def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
@@ -142,15 +142,15 @@ def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: i
     assert ("1,1" in words(svg).split("\n")) == (rows <= 8 and cols <= 8)
 
 
-@pytest.mark.parametrize("digits", [0, 255])
-def test_a_silent_skin_can_be_drawn(tmp_path: Path, digits: int):
+@pytest.mark.parametrize("count", [0, 255])
+def test_a_silent_skin_can_be_drawn(tmp_path: Path, count: int):
     """Nothing moves: no frequency has power, no axis is without length."""
     fmt = SweepFormat(2, 2, 100.0, 300, "uint8")
-    still = np.full((300, 2, 2), digits, np.uint8)
+    still = np.full((300, 2, 2), count, np.uint8)
     save(tmp_path / "a.npy", Sweep(1, 0, 1, Status.OK, Frames(np.arange(300) * 10**7, np.arange(300), still)), fmt)
-    told = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npy"))))
-    assert "no material" in told
-    assert "no spectrum: less than 8 frames, or nothing moves" in told
+    shown = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npy"))))
+    assert "no material" in shown
+    assert "no spectrum: less than 8 frames, or nothing moves" in shown
 
 
 @pytest.mark.slow

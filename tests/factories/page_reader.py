@@ -1,0 +1,37 @@
+"""Reads a page as its reader sees it. In: HTML. Out: its visible text, its addresses, and tags that are not closed in order."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+
+VOID = {"meta", "br", "!doctype", "path", "use", "image", "input", "rect", "circle", "line"}
+HIDDEN = {"style", "script"}
+
+
+class PageReader(HTMLParser):
+    """The page `text`; `text` of this object is what a reader sees, with single spaces."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.links: list[str] = []
+        self._parts: list[str] = []
+        self.feed(text)
+        self.text = " ".join(" ".join(self._parts).split())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Remember what is open, and every address."""
+        self.links += [v or "" for k, v in attrs if k in ("href", "src", "xlink:href", "srcset")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        """What closes must be what opened last."""
+        if tag not in VOID and (not self.open or self.open.pop() != tag):
+            self.wrong.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        """Text that is shown."""
+        if not self.open or self.open[-1] not in HIDDEN:
+            self._parts.append(data)
