@@ -1,7 +1,7 @@
 """Delivers a bundle to boxes. In: which boxes, the bundle's folder. Out: a line for each box.
 
 A box does not trust what is copied to it: `palpate install` checks signature, manifest, model and golden sweeps with the
-box's own runtime, and the bundle runs on trial from the next start on. If the delivery is interrupted at any moment, the
+box's runtime, and the bundle runs on trial from the next start on. If the delivery is interrupted at any moment, the
 box has the old bundle or the new one; run the command again to finish.
 """
 

@@ -185,7 +185,7 @@ def test_a_graph_without_tenths_has_no_early_heads(made):
 
 
 def test_enrolment_is_judged_as_the_box_enrols(made):
-    """doubt.enrolled_logits against appliance.enrol on the same sweeps, up to a term that all labels share."""
+    """enrolled_logits against appliance.inference.enrolment on the same sweeps, up to a term that all labels share."""
     done, x, digits, labels, whole = made
     drawn = np.flatnonzero(labels == 1)[:3]
     new = enrolment.enrol(whole, "new", digits[drawn]).bundle

@@ -36,9 +36,9 @@ def test_the_embedding_is_lda(whole: int):
 def test_features_that_nobody_trained_are_kept_whole():
     """With `whole` all of the last features' directions are seen: the distance is the whole Mahalanobis distance there."""
     x, y = gaussians(300, [[0, 0, 0], [6, 0, 0]])
-    stranger = np.array([[0.0, 0.0, 20.0]])
-    assert novelty.embed(x, y, 0).novelty(stranger)[0] < 10
-    assert novelty.embed(x, y, 1).novelty(stranger)[0] > 300
+    unknown = np.array([[0.0, 0.0, 20.0]])
+    assert novelty.embed(x, y, 0).novelty(unknown)[0] < 10
+    assert novelty.embed(x, y, 1).novelty(unknown)[0] > 300
 
 
 def test_two_sweeps_of_a_material_and_silent_channels_are_finite():

@@ -224,7 +224,7 @@ def test_what_changes_while_it_is_fetched_is_refused(ground: Ground):
 
 
 def test_what_goes_away_meanwhile_is_told(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Between list and stream: the others are kept, and the box's own words are passed on."""
+    """Between list and stream: the others are kept, and the words of the box are passed on."""
     ground.ssh("tar", f"rm '{ground.box}/run 0/sweep-000000.npy'")
     with pytest.raises(ApplianceError, match="run the same command again"):
         ground.fetch()
@@ -314,7 +314,7 @@ def test_a_folder_of_others_is_read_with_sudo(ground: Ground):
 
 
 def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Not there, and sudo wants a password: both in one message, after the box's own words."""
+    """Not there, and sudo wants a password: both in one message, after the words of the box."""
     ground.program("sudo", "#!/bin/sh\necho 'sudo: a password is required' >&2\nexit 1\n")
     with pytest.raises(ApplianceError, match=r"^user@box: /nowhere cannot be read; name another with --from, let .*"):
         pull.pull(RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None)

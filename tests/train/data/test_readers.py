@@ -1,4 +1,4 @@
-"""The room of files: HDF5, TactMat and the box's recordings become sets; what is broken is refused by name."""
+"""Readers: HDF5, TactMat and recordings of the box become sets; what is broken is refused by name."""
 
 from __future__ import annotations
 

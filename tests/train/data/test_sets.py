@@ -1,4 +1,4 @@
-"""The room of sweep sets: what is refused and how it is named, what belongs together and stays so."""
+"""Sweep sets: what is refused and how it is named, what belongs together and stays so."""
 
 from __future__ import annotations
 

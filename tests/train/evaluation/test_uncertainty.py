@@ -115,7 +115,7 @@ def test_unknown_materials_six_deviations_away_are_detected(figures):
     assert 0.9 < figures["unknown"]["mean"]["kept"] < 0.99
 
 
-def test_a_stranger_that_is_no_stranger_is_not_seen():
+def test_an_unknown_material_that_does_not_differ_is_not_seen():
     """Materials that do not differ: AUROC of a half."""
     held = [case(k, apart=0.0) for k in (0, 1)]
     done = [(c, fit_posthoc(c.seen, c.seen_labels, c.seen_groups, c.judged)) for c in held]

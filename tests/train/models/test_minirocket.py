@@ -1,4 +1,4 @@
-"""The room of MiniRocket: its graph against the definition, against aeon, and what the head makes of its features."""
+"""MiniRocket: its graph against the definition, against aeon, and what the head makes of its features."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_material_not_trained_on_is_never_said():
 
 
 def test_the_temperature_comes_from_held_out_groups():
-    """The first head misses whole recordings, the second none; labels that mean nothing give doubt."""
+    """The first head misses whole recordings, the second none; random labels give uncertain probabilities."""
     seen: list[np.ndarray] = []
 
     def spy(features: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

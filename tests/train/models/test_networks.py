@@ -1,4 +1,4 @@
-"""The room of neural methods: the paper's CNN as printed, graphs that say what PyTorch says, honest small trainings."""
+"""Neural methods: the paper's CNN as printed, graphs that give what PyTorch gives, small trainings with calibrated results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The room of ST-HMP: codes against scikit-learn's pursuit, pooling against plain loops, what comes of sets."""
+"""ST-HMP: codes against scikit-learn's pursuit, pooling against plain loops, what comes of sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The room of float against int8: what is lost and how sure that is, what each tensor reaches and what saturates."""
+"""Float against int8: what is lost, with its interval, the range of each tensor, and what saturates."""
 
 from __future__ import annotations
 

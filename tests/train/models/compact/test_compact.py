@@ -1,4 +1,4 @@
-"""The family: what a rung costs, what int8 keeps exactly, what a tenth knows, that a method is its int8 graph."""
+"""The family: what each size costs, what int8 keeps exactly, what a tenth knows, that a method is its int8 graph."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ def test_the_method_is_its_int8_graph():
 
 
 def test_the_family_is_one_recipe_in_several_shapes():
-    """Names in order of size; `compact` is one of the ladder that may lose all stages; effort reaches all."""
+    """Names in order of size; `compact` is one of the sizes that may lose all stages; effort reaches all."""
     made = {m.name: m for m in family.methods(Effort(share=0.01))}
     assert list(made) == [*(f"compact-{size}" for size in ARCHITECTURES), "compact"]
     assert made["compact"].train.keywords["architecture"] == replace(ARCHITECTURES["20k"], fewest=0)
@@ -309,7 +309,7 @@ def test_a_cut_network_gives_what_its_first_stages_gave():
 
 @pytest.fixture(scope="module")
 def bare() -> family.CompactModel:
-    """The box's own method where its stages tell nothing of what was held out."""
+    """The method of the box where its stages say nothing about what was held out."""
 
     def blind(model: Compact, *others: object) -> fit.HeadInputs:
         told, size = seen_by_heads(model, *others), sum(model.architecture.channels)

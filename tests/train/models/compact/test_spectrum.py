@@ -185,9 +185,9 @@ def test_a_window_too_short_has_no_spectrum():
     made = fit.fit(short, 1, FitRecipe(steps=2))
     assert (made.architecture.spectrum, made.bands) == (False, 0)
     assert made.architecture.channels
-    rung = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]
+    method = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]
     with pytest.raises(FormatError, match="a window of 39 frames is too short for a spectrum; take another size"):
-        rung.train(short, short.samples, 1)
+        method.train(short, short.samples, 1)
     enough = replace(easy(12), samples=easy(12).samples[:, :40])
     assert spectrum.count(enough.format) == 3
-    assert rung.train(enough, enough.samples, 1).logits(enough.samples).shape == (36, 3)
+    assert method.train(enough, enough.samples, 1).logits(enough.samples).shape == (36, 3)
