@@ -46,7 +46,9 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         (["--set", "sim:T-LAB:1:1", "--rest", "rest.npz"], "--rest needs --split"),
     ],
 )
-def test_a_named_trouble_is_one_line(args: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_an_error_of_the_project_is_one_line(
+    args: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """The exit code of a FormatError and its message on the error stream."""
     assert main(["fit", "--seed", "1", "--out", str(tmp_path / "fit.npz"), *args]) == FormatError.exit_code
     err = capsys.readouterr().err

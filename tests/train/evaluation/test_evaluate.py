@@ -31,7 +31,7 @@ HERE = Where(jobs=1, cache=None)
 
 
 @pytest.mark.slow
-def test_it_finds_what_is_there_to_find():
+def test_it_finds_what_distinguishes_materials():
     """Hums of three pitches are distinguished under every protocol, by window and by recording."""
     for result in every(
         tones(), HERE, "L-gauss", "H-svm", protocols=("leave:session", "random:3", "split:session=0,1->2")
@@ -90,7 +90,7 @@ def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
     assert np.array_equal(one[0].logits, two[0].logits)
 
 
-def test_what_was_interrupted_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupted_evaluation_continues_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Folds that are done are not trained again; the result is the same."""
     where = Where(jobs=1, cache=tmp_path)
     calls: list[int] = []
@@ -119,7 +119,7 @@ def test_what_was_interrupted_goes_on_where_it_was(tmp_path: Path, monkeypatch: 
 
 
 def test_a_broken_cache_file_is_done_again(tmp_path: Path):
-    """Half a file is as none."""
+    """Half a file counts as none."""
     where = Where(jobs=1, cache=tmp_path)
     (first,) = every(tones(), where, "L-gauss")
     path = min(tmp_path.glob("*.npz"))

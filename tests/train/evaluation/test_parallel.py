@@ -47,7 +47,7 @@ def test_every_task_is_done_once_with_its_data():
 
 
 def test_each_task_has_one_thread():
-    """Linear algebra does not fight for cores, in this process and in others."""
+    """Linear algebra does not compete for cores, in this process and in others."""
     for jobs in (1, 2):
         assert {n for _, n in parallel.results(threads, [0], [], jobs=jobs)} == {1}
 
@@ -58,7 +58,7 @@ def test_an_error_in_a_task_is_the_callers():
         list(parallel.results(add, [99], [np.arange(3.0)], jobs=2))
 
 
-def test_progress_tells_how_much_is_left():
+def test_progress_shows_how_much_is_left():
     """Done, all, a time, and what was done."""
     lines: list[str] = []
     progress = parallel.Progress(2, lines.append)
@@ -158,7 +158,7 @@ def always_dies(task: int) -> None:
 
 
 def test_a_task_that_kills_every_worker_ends_with_a_reason(cluster, monkeypatch: pytest.MonkeyPatch):
-    """Nothing hangs when nobody is left."""
+    """Nothing hangs when no worker is left."""
     monkeypatch.setattr(parallel, "CONNECT_S", 1)
     with pytest.raises(FormatError, match=r"died too often|has no worker"):
         list(parallel.results(always_dies, [1], [], scheduler=cluster[0]))

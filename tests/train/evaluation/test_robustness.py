@@ -1,4 +1,4 @@
-"""Stress: each thing that goes wrong does what it says and nothing else, and what is counted is counted rightly."""
+"""Robustness: each corruption does what it says and nothing else, and right answers are counted correctly."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class NearestMean:
         return -(((_figures(given)[:, None] - self.means) ** 2).sum(axis=2)).astype(np.float32)
 
     def graph(self) -> onnx.ModelProto:
-        """Stress is put on the desktop's answers; no graph is asked for."""
+        """Corrupted sweeps go to the model itself; no graph is needed."""
         raise AssertionError("the corruption asked for a graph")
 
 
@@ -78,8 +78,8 @@ FAKE = Method("fake", "two figures, nearest mean", "raw", learn)
     "sweeps", [small(), small("float32", (4, 128, 16, 1), 35.6), small("uint8", (2, 40, 1, 1), 10)]
 )
 @pytest.mark.parametrize("name", DIGITAL)
-def test_digits_stay_digits(name: str, sweeps: Dataset):
-    """For any grid, rate and type: none is bit for bit none, severe is another sweep of the same form, twice the same."""
+def test_counts_stay_counts(name: str, sweeps: Dataset):
+    """For any grid, rate and type: severity 0 changes no bit, the severest gives another sweep of the same form, repeatably."""
     entry, trial = BY_NAME[name], EvaluationSweeps(sweeps)
     before = sweeps.samples.copy()
     assert entry.apply(trial, 0, 3) is sweeps.samples
@@ -105,7 +105,7 @@ def test_the_scene_is_drawn_anew(name: str):
 
 @pytest.mark.parametrize("name", ["dead", "stuck", "gain-spread", "gain-down", "gain-up", "drift", "bits", "lost",
                                   "saturation", "hum", "noise", "noisy", "shift-grid", "turn-grid"])  # fmt: skip
-def test_a_stress_only_grows(name: str):
+def test_a_corruption_only_grows(name: str):
     """The more severe, the further from the sound sweep."""
     trial = EvaluationSweeps(small("float32"))
     away = [np.abs(BY_NAME[name].apply(trial, s, 1) - trial.sweeps.samples).mean() for s in BY_NAME[name].severities]
@@ -114,12 +114,12 @@ def test_a_stress_only_grows(name: str):
 
 @pytest.mark.parametrize("severity", [-1, 5, np.nan])
 def test_no_severity_beyond_the_scale(severity: float):
-    """What the scale does not know is refused by name."""
+    """A severity out of range is refused by name."""
     with pytest.raises(FormatError, match=r"of stress 'dead' is out of range; use 0 to 4"):
         BY_NAME["dead"].apply(EvaluationSweeps(small()), severity, 0)
 
 
-def test_stresses_by_name():
+def test_corruptions_by_name():
     """Found by name, unknown ones are refused; simulated sweeps are drawn anew, the raw counts of a file are changed."""
     assert [s.name for s in corruptions.find(["hum", "dead"])] == ["hum", "dead"]
     with pytest.raises(FormatError, match="stress 'cold' is unknown; use some of shift-rows, "):
@@ -224,7 +224,7 @@ def test_stretching_moves_frequencies(name: str, share: float, hz: float):
 
 
 def test_gains_drift_steps_and_clipping():
-    """The plain ones, each by its own law."""
+    """Gains, drift, steps and clipping, each by its own formula."""
     trial = EvaluationSweeps(small("float32"))
     was = trial.sweeps.samples
 
@@ -243,7 +243,7 @@ def test_gains_drift_steps_and_clipping():
     assert apply("saturation", 0.3).max() == pytest.approx(0.7 * trial.load)
 
 
-def test_hum_and_noise_are_as_strong_as_said():
+def test_hum_and_noise_have_their_strength():
     """50 Hz on all taxels alike; white noise as a share of each taxel's own deviation."""
     sweeps = small("float32", (4, 600, 2, 2), 300.0)
     sweeps.samples[:, :, 0, 0] *= 4
@@ -256,7 +256,7 @@ def test_hum_and_noise_are_as_strong_as_said():
     assert np.allclose(noise.std(axis=(0, 1)), 0.5 * trial.deviation, rtol=0.1)
 
 
-def test_digits_are_digitized_again():
+def test_counts_are_digitized_again():
     """uint8 ends at 255 and int16 stays whole: more gain saturates, it does not wrap."""
     sweeps = small("uint8")
     sweeps.samples[:, :, 1, 1] = 200
@@ -352,8 +352,8 @@ def test_the_table_says_where_each_falls():
     assert "- c: too short" in text
 
 
-def test_the_table_tells_what_becomes_of_sweeps_that_tell_nothing():
-    """How many methods do what, and the box's status where it is known."""
+def test_the_table_shows_the_answers_to_uninformative_sweeps():
+    """How many methods give which answer, and the box's status where it is known."""
     result = robustness.merge(
         [robustness.evaluate_method(FAKE, small(), EvaluationSweeps(small()), corruptions.find(["hum"]), 0)]
     )
@@ -426,7 +426,7 @@ def test_what_cannot_be_done_is_said():
     assert (entry["curves"], entry["clean"]) == ({}, None)
 
 
-def test_an_answer_that_is_no_number_is_wrong():
+def test_an_answer_that_is_not_finite_is_wrong():
     """It is counted as wrong and as broken, also where the label would have been right."""
 
     class NanModel(NearestMean):
@@ -442,7 +442,7 @@ def test_an_answer_that_is_no_number_is_wrong():
     assert robustness.uninformative_answers(FAKE, model, EvaluationSweeps(small()))["silent"] == "not finite"
 
 
-def test_trouble_has_a_name():
+def test_each_answer_to_an_uninformative_sweep_has_a_name():
     """Sound methods stay finite or refuse; a value that is not finite never reaches them; a crash is reported, and the worst
     answer counts."""
     model = learn(small(), small().samples, 0)

@@ -1,4 +1,4 @@
-"""Tests of the simulator's calibration (`train.calibrate`): the printed numbers, and what is measured beside them."""
+"""Tests of the simulator's calibration (`train.evaluation.sim_calibration`): the printed numbers, and what is measured beside them."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_the_table_shows_every_number(measured: dict) -> None:
 
 
 def test_without_ablation_nothing_is_switched_off() -> None:
-    """`measure` asks for no more than it was asked for, and says how far it is."""
+    """`measure` computes nothing beyond what it was asked for, and logs its progress."""
     lines: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sim_calibration, "accuracies", lambda sweeps, seed: sim_calibration.PRINTED + seed - SEED)

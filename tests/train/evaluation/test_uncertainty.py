@@ -52,7 +52,7 @@ def figures():
     return json.loads(json.dumps(uncertainty.figures(held, NAMES, 1)))
 
 
-def test_error_is_the_gap_between_said_and_right():
+def test_error_is_the_gap_between_probability_and_accuracy():
     """A probability of 0.9 with 0.7 right is an error of 0.2, whatever the number; a calibrated one is 0; bins count by
     their sweeps."""
     right = np.arange(100) < 70
@@ -67,7 +67,7 @@ def test_error_is_the_gap_between_said_and_right():
     }
 
 
-def test_an_overconfident_head_is_made_honest():
+def test_temperature_scaling_corrects_an_overconfident_head():
     """Positions that shift the materials: LDA is overconfident, the temperature found across positions corrects that."""
     one = case(apart=2.5, places=12)
     # sweeps of one position close together: their scatter says little of other positions
@@ -97,8 +97,8 @@ def test_more_sweeps_for_more_certainty(figures):
         assert held["points"][-1]["right_of_decided"] > 0.995
 
 
-def test_the_sequential_test_stops_where_it_is_sure():
-    """By hand: two objects, one sure at the second sweep, one never; the limit ends it."""
+def test_the_sequential_test_stops_at_the_wanted_probability():
+    """By hand: two objects, one decided at the second sweep, one never; the limit ends it."""
     fused = np.array([[[0.6, 0.4], [0.9, 0.1], [0.99, 0.01]], [[0.5, 0.5], [0.4, 0.6], [0.45, 0.55]]])
     point = uncertainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.9)
     assert (point["sweeps"], point["decided"], point["accuracy"], point["right_of_decided"]) == (2.5, 0.5, 0.5, 1.0)
@@ -106,7 +106,7 @@ def test_the_sequential_test_stops_where_it_is_sure():
 
 
 def test_unknown_materials_six_deviations_away_are_detected(figures):
-    """A material left out is six deviations from the others, known ones are chi-squared: AUROC above .95."""
+    """A material left out is six deviations from the others, known ones are chi-squared: AUROC above 0.95."""
     for row in figures["unknown"]["materials"].values():
         assert row["low"] <= row["auroc"] <= row["high"]
         assert (row["known"], row["unknown"]) == (216, 72)
@@ -134,7 +134,7 @@ def test_enrolment_from_more_sweeps_comes_nearer(figures):
 
 
 def test_early_needs_half_the_sweep_where_that_suffices(figures):
-    """All is known at the fifth tenth: the share is below .6 and accuracy is that of the whole sweep."""
+    """All is known at the fifth tenth: the share is below 0.6 and accuracy is that of the whole sweep."""
     early = figures["early"]
     assert early["share"] < 0.6
     assert abs(early["lost"]) <= 0.02
@@ -142,7 +142,7 @@ def test_early_needs_half_the_sweep_where_that_suffices(figures):
     assert early["always"][0]["accuracy"] < early["always"][5]["accuracy"]
 
 
-def test_two_materials_leave_nobody_out():
+def test_of_two_materials_none_is_left_out():
     """Of two materials none can be left out: calibration, sweeps and early answers are reported, and the page has no more."""
     one = case()
     two, test = one.seen_labels < 2, one.labels < 2

@@ -50,7 +50,7 @@ def test_all_take_turns():
 
 @pytest.mark.slow
 def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
-    """Costs of a real bundle: the keys that the issue names, resident memory of Python with numpy and onnxruntime."""
+    """Costs of a real bundle: the keys of chart.json, resident memory of Python with numpy and onnxruntime."""
     made = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
     (costs, _) = model_forms.measured(made, sweeps().samples, 2)
     assert set(KEYS) <= costs.keys()

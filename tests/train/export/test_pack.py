@@ -25,7 +25,7 @@ ON_THE_BOX = [name for name, method in METHODS.items() if method.runs_on_the_box
 
 
 @pytest.mark.parametrize("name", ON_THE_BOX)
-def test_the_box_says_what_the_desktop_says(name: str, tmp_path: Path):
+def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
     """Trained, packed, loaded, checked by its golden sweeps; each held-out sweep gets the label that training saw."""
     content = pack.trained(METHODS[name], tones(), 1)
     manifest = pack.pack(content, tmp_path / "b", "any", "1", "0123abcd")

@@ -266,13 +266,13 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
     assert "take a larger network" in str(refused.value)
 
 
-def test_a_box_that_would_refuse_is_no_box(fitted: Fit, tmp_path: Path):
+def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path: Path):
     """A full scale that the sweeps pass: they count as saturated, which export reports before a robot meets it."""
     with pytest.raises(ExportRefused, match=r"the box would refuse \d+ of \d+ held-out sweeps"):
         quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
 
 
-def test_the_box_must_say_what_export_saw(fitted: Fit, packed: Path):
+def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
     """Other labels from the box than from the int8 model are refused, with how many."""
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
     assert "held-out" in pack.training_logits(packed, fitted.held, logits, "held-out")
@@ -366,7 +366,7 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
 
 
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
-    """Nothing in it is int8: both forms are one, the box's labels are its network's, no tensor is reported; what another
+    """Nothing in it is int8: both forms are the same, the box's labels are its network's, no tensor is reported; what another
     head says is refused here as well."""
     made = fit.fit(easy(), 1, FitRecipe(), architecture=ARCHITECTURES["bands"])
     quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")

@@ -377,7 +377,7 @@ def test_materials_that_look_alike_are_proposed_as_one(fakes):
 
 
 @pytest.mark.slow
-def test_what_was_interrupted_goes_on(fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupted_choice_continues(fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Trainings that are done are not done again, and the choice is the same."""
     where, calls, train = Where(jobs=1, cache=tmp_path), [], evaluate.run
 
