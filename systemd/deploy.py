@@ -1,8 +1,8 @@
 """Delivers a bundle to boxes. In: which boxes, the bundle's folder. Out: a line for each box.
 
-A box does not trust what is copied to it: `palpate install` checks signature, manifest, model and golden sweeps with the
-box's runtime, and the bundle runs on trial from the next start on. If the delivery is interrupted at any moment, the
-box has the old bundle or the new one; run the command again to finish.
+A box does not trust what is copied to it: `palpate install` checks signature, manifest, model and golden sweeps with
+the box's runtime, and the bundle runs on trial from the next start on. If the delivery is interrupted at any
+moment, the box has the old bundle or the new one; run the command again to finish.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ LIMIT_S = 300
 
 @dataclass(frozen=True)
 class BundleArchive:
-    """A bundle as it is copied to boxes. sha: of its manifest, hexadecimal. name: for a person. archive: a tar of its files."""
+    """A bundle as it is copied to boxes. sha: of its manifest, hexadecimal. name: for a person. archive: a tar of its
+    files."""
 
     sha: str
     name: str
@@ -54,7 +55,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def checked(folder: Path, signers: Path | None) -> BundleArchive:
-    """The bundle in `folder`, once it has passed its checks and golden sweeps here. Raises ApplianceError where it does not."""
+    """The bundle in `folder`, once it has passed its checks and golden sweeps here. Raises ApplianceError where it does
+    not."""
     files = bundle.files(folder)
     loaded = bundle.from_files(files, str(folder))
     Classifier(loaded, SystemClock()).self_test()
@@ -91,7 +93,8 @@ def deliver(box: FleetBox, packed: BundleArchive, shadow: bool) -> str:
 
 
 def where(box: FleetBox) -> tuple[str, str]:
-    """Paths on the box: the folder of its store and its status file. Raises Failed where it would not use a delivered bundle."""
+    """Paths on the box: the folder of its store and its status file. Raises Failed where it would not use a delivered
+    bundle."""
     lacks = "{ echo 'no Palpate is installed there; make install HOST=... first' >&2; exit 1; }"
     settings = tomllib.loads(box.run("asking for its settings", f"test -x {PALPATE} || {lacks}; {PALPATE} config"))
     if own := settings["classifier"]["bundle"]:

@@ -1,8 +1,9 @@
-"""Works on many boxes at once, over ssh. In: one USER@HOST or an inventory, and the work for a box. Out: a line for each box.
+"""Works on many boxes at once, over ssh. In: one USER@HOST or an inventory, and the work for a box. Out: a line for
+each box.
 
-pyinfra provides inventory, connections and commands. Its operations are not used: they wait for the slowest box after each
-step, and have no deadline for a box that hangs while files are copied to it. Here the boxes are independent, and each
-ends by itself, by a failure or by its deadline.
+pyinfra provides inventory, connections and commands. Its operations are not used: they wait for the slowest box after
+each step, and have no deadline for a box that hangs while files are copied to it. Here the boxes are independent, and
+each ends by itself, by a failure or by its deadline.
 """
 
 # ruff: noqa: E402
@@ -51,7 +52,8 @@ class Failed(Exception):
 
 
 class FleetBox:
-    """One box and the connection to it. `result`: figures that are written beside its line. verbose: prints each step."""
+    """One box and the connection to it. `result`: figures that are written beside its line. verbose: prints each
+    step."""
 
     def __init__(self, host: Host, verbose: bool) -> None:
         self._host, self._verbose = host, verbose
@@ -67,9 +69,11 @@ class FleetBox:
         print(f"{self.name}: {text}", file=sys.stderr, flush=True)
 
     def run(self, what: str, command: str, *, user: str = "", stdin: str = "", limit_s: float = SHORT_S) -> str:
-        """Output of a command that the shell of the login user, or of `user`, runs; stdin: a file in the login user's home.
+        """Output of a command that the shell of the login user, or of `user`, runs; stdin: a file in the login user's
+        home.
 
-        Raises Failed, with `what` and the last line of the output, where the command fails or takes longer than limit_s.
+        Raises Failed, with `what` and the last line of the output, where the command fails or takes longer than
+        limit_s.
         """
         if self._verbose:
             self.report(what)

@@ -1,9 +1,9 @@
 """Installs or upgrades the runtime on bare Debian boxes. In: which boxes, this checkout. Out: a line for each box.
 
-A release is one folder, /opt/palpate-<version>-<hash>: virtual environment, unit, users, rules, board files, manual. All
-paths outside lead into it through the link /opt/palpate, which is swapped by one rename when the folder is complete and
-has passed its self-test. So after an interruption at any moment a box starts with the old runtime and the old unit, or with
-the new ones; run the command again to finish. The boxes need internet only for missing Debian packages.
+A release is one folder, /opt/palpate-<version>-<hash>: virtual environment, unit, users, rules, board files, manual.
+All paths outside lead into it through the link /opt/palpate, which is swapped by one rename when the folder is complete
+and has passed its self-test. So after an interruption at any moment a box starts with the old runtime and the old unit,
+or with the new ones; run the command again to finish. The boxes need internet only for missing Debian packages.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ settings = config.load(None, folder=Path(sys.argv[1]))
 for one in (bundle.load(bundle.DEFAULT), load_bundle(settings)):
     classifier.Classifier(one, clock.SystemClock()).self_test()
 """
-"""Program that a new release must run without an error: reads the settings, and runs the golden sweeps of the packaged bundle
-and of the one in use."""
+"""Program that a new release must run without an error: reads the settings, and runs the golden sweeps of the packaged
+bundle and of the one in use."""
 PACKAGES_S = BUILD_S = 600
 """Limits for installing packages and for building the environment, on a slow card."""
 READY_S, STARTS = 40, 2
@@ -153,7 +153,8 @@ sync -f {release}"""
 
 
 def prepare(release: str, board: str, signers: str) -> str:
-    """Commands that set up users, folders, settings and links outside the release. The old release can run with them, too."""
+    """Commands that set up users, folders, settings and links outside the release. The old release can run with them,
+    too."""
     share = f"{release}/share/palpate"
     lines = [
         "set -e; umask 022",
@@ -185,7 +186,8 @@ def _put(file: str, text: str) -> str:
 
 
 def self_test(release: str) -> str:
-    """The command that runs SELF_TEST in the new runtime as the service's user, with the settings and bundles of the box."""
+    """The command that runs SELF_TEST in the new runtime as the service's user, with the settings and bundles of the
+    box."""
     as_user = "setpriv --reuid=palpate --regid=palpate --init-groups"
     return f"{as_user} {release}/bin/python -I -c {shlex.quote(SELF_TEST)} {release}/share/palpate"
 

@@ -1,6 +1,8 @@
-"""Packs a release for a box. In: the wheel, the lock, files of this checkout. Out: an archive for each architecture and Python.
+"""Packs a release for a box. In: the wheel, the lock, files of this checkout. Out: an archive for each architecture and
+Python.
 
-Wheels for another architecture or Python are fetched here, each checked by its hash: the boxes need no internet for them.
+Wheels for another architecture or Python are fetched here, each checked by its hash: the boxes need no internet for
+them.
 """
 
 from __future__ import annotations
@@ -71,8 +73,8 @@ def _plain(member: tarfile.TarInfo) -> tarfile.TarInfo:
 
 
 def locked(text: str, python: str, machine: str) -> str:
-    """The lock without the lines for another Python or architecture: pip evaluates markers for the Python it runs on, also when
-    it fetches for another."""
+    """The lock without the lines for another Python or architecture: pip evaluates markers for the Python it runs on,
+    also when it fetches for another."""
     box = {
         "python_full_version": python, "python_version": python.rpartition(".")[0], "platform_machine": machine,
     }  # fmt: skip

@@ -1,4 +1,5 @@
-"""Where the skin is touched, for `palpate align`. In: frames of a finger at rest. Out: a View, five times a second, to displays."""
+"""Where the skin is touched, for `palpate align`. In: frames of a finger at rest. Out: a View, five times a second, to
+displays."""
 
 from __future__ import annotations
 
@@ -103,7 +104,8 @@ class Alignment:
 def run(
     settings: SensorConfig, model: Bundle, devices: Devices, displays: Iterable[Display], stopped: Callable[[], bool]
 ) -> None:
-    """Show on `displays` where the skin is touched, until `stopped()`. A slow display makes frames late, which does no harm."""
+    """Show on `displays` where the skin is touched, until `stopped()`. A slow display makes frames late, which does no
+    harm."""
     shown_on = tuple(displays)
     with closing(Alignment(settings, model, devices)) as alignment:
         next_ns = devices.clock.now_ns()

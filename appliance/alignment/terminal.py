@@ -1,7 +1,8 @@
-"""Shows in a terminal where the skin is touched. In: Views. Out: a picture that is drawn again and again, or plain lines.
+"""Shows in a terminal where the skin is touched. In: Views. Out: a picture that is drawn again and again, or plain
+lines.
 
-Nothing depends on colour: five characters and numbers show the load, signs the positions. Where the output is no terminal,
-or a dumb one, it gets one line a second.
+Nothing depends on colour: five characters and numbers show the load, signs the positions. Where the output is no
+terminal, or a dumb one, it gets one line a second.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Serves a page that shows where the skin is touched. In: Views. Out: the page and its state, to browsers on this machine.
+"""Serves a page that shows where the skin is touched. In: Views. Out: the page and its state, to browsers on this
+machine.
 
-It listens on 127.0.0.1 alone and only answers GET on two paths; of a request nothing beyond the head is read. The server
-runs in its own thread, so that no slow browser keeps the loop from reading the skin. The two share one value, the newest
-state, which is replaced as a whole. `palpate run` does not use this module.
+It listens on 127.0.0.1 alone and only answers GET on two paths; of a request nothing beyond the head is read. The
+server runs in its own thread, so that no slow browser keeps the loop from reading the skin. The two share one value,
+the newest state, which is replaced as a whole. `palpate run` does not use this module.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from appliance.core.errors import ConfigError
 HERE = "127.0.0.1"
 PAGE = Path(__file__).with_name("page.html")
 NAMES = ("localhost", HERE)
-"""Names by which a browser may ask for this machine. Another name belongs to another site that points here (DNS rebinding)."""
+"""Names by which a browser may ask for this machine. Another name belongs to another site that points here (DNS
+rebinding)."""
 DEADLINE_NS = 2_000_000_000
 """Limit from the start of a connection to the end of the request's head, and again for the answer."""
 MOST_HEAD = 8192
@@ -63,8 +65,8 @@ class PageHandler(BaseHTTPRequestHandler):
         self.connection.settimeout(DEADLINE_NS / 1e9)  # `sendall` counts it for the whole answer
 
     def _head(self) -> bytes:
-        """Up to the empty line and what came with it; nothing where the limit is reached or the other side closes first.
-        Raises TimeoutError at the deadline."""
+        """Up to the empty line and what came with it; nothing where the limit is reached or the other side closes
+        first. Raises TimeoutError at the deadline."""
         clock, head = self.server.clock, b""
         until_ns = clock.now_ns() + DEADLINE_NS
         while b"\r\n\r\n" not in head:

@@ -1,4 +1,5 @@
-"""Runs work that may crash, hang or take all memory in a limited child process. In: a callable. Out: nothing, or why it failed.
+"""Runs work that may crash, hang or take all memory in a limited child process. In: a callable. Out: nothing, or why it
+failed.
 
 The child is a fork: it has what was read and checked here, byte for byte, and what it does to itself stays with it.
 """

@@ -1,7 +1,7 @@
 """Shadow mode: a candidate bundle classifies beside the one in service, before anybody commits to it.
 
-In: sweeps with the verdicts that were sent. Out: how often the candidate agrees, and the sweeps on which it does not, in
-a folder. The candidate cannot affect the robot: it gets a sweep only after the answer has been sent.
+In: sweeps with the verdicts that were sent. Out: how often the candidate agrees, and the sweeps on which it does not,
+in a folder. The candidate cannot affect the robot: it gets a sweep only after the answer has been sent.
 """
 
 from __future__ import annotations
@@ -120,7 +120,8 @@ class Shadow(Observer):
     """Observer of a running box that lets the candidate judge each sweep by the same rules, and counts.
 
     current: the bundle in service. folder: for agreement and kept sweeps; those of another pair of bundles are removed.
-    judge: makes a bundle's classifier by the settings. Raises ApplianceError where the candidate or the folder cannot be used.
+    judge: makes a bundle's classifier by the settings. Raises ApplianceError where the candidate or the folder cannot
+    be used.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Signs and verifies bundles. In: a manifest, its signature, a file of trusted signers. Out: the signer's name.
 
-ssh-keygen does the work (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its manual), with keys and tools
-that people have already. A manifest names the hash of every other file, so its signature covers the whole bundle.
+ssh-keygen does the work (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its manual), with keys and
+tools that people have already. A manifest names the hash of every other file, so its signature covers the whole bundle.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ NAMESPACE = "palpate-bundle"
 MOST_SIGNATURE, MOST_SIGNERS = 16 << 10, 256 << 10
 """Bytes. A signature by the longest usual key, RSA of 16,384 bits, takes 6 kB."""
 DEADLINE_S, INTERACTIVE_S = 10.0, 120.0
-"""For ssh-keygen by itself, some milliseconds on a desktop; and with a person who types a passphrase or touches a key."""
+"""For ssh-keygen by itself, some milliseconds on a desktop; and with a person who types a passphrase or touches a
+key."""
 LINE = re.compile(
     r'[\w.@+-]+[ \t]+(namespaces="[^"]*"[ \t]+)?'
     r"(?P<kind>ssh-ed25519|ssh-rsa|ecdsa-sha2-nistp(256|384|521)|sk-(ssh-ed25519|ecdsa-sha2-nistp256)@openssh\.com)"
     r"[ \t]+(?P<key>[A-Za-z0-9+/]+={0,2})([ \t].*)?",
     re.ASCII,
 )
-"""A line of the signers' file: one name, one key. ssh-keygen allows more: patterns, certificates, and dates, for which a box
-must know the time."""
+"""A line of the signers' file: one name, one key. ssh-keygen allows more: patterns, certificates, and dates, for which
+a box must know the time."""
 DATED = re.compile(r"valid-after|valid-before|cert-authority", re.IGNORECASE)
 
 
@@ -110,7 +111,8 @@ def _is_signer(line: str) -> bool:
 
 @contextmanager
 def _as_file(data: bytes) -> Iterator[str]:
-    """Path of a file in memory with `data`, which a child can open: it reads what was checked here, and no disk is needed."""
+    """Path of a file in memory with `data`, which a child can open: it reads what was checked here, and no disk is
+    needed."""
     at = os.memfd_create("palpate", 0)  # children inherit it
     try:
         os.write(at, data)

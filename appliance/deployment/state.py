@@ -1,6 +1,8 @@
-"""What the store knows of each bundle beside its files. In: the bytes of ledger.json. Out: a StoreState, and changed ones.
+"""What the store knows of each bundle beside its files. In: the bytes of ledger.json. Out: a StoreState, and changed
+ones.
 
-Values only; `store` reads and writes the file. A bundle is named by the sha256 of its manifest, the packaged one by PACKAGED.
+Values only; `store` reads and writes the file. A bundle is named by the sha256 of its manifest, the packaged one by
+PACKAGED.
 """
 
 from __future__ import annotations
@@ -60,7 +62,8 @@ class StoreState:
         return replace(self, standings=self.standings | {sha: replace(self.of(sha), **changes)})
 
     def activated(self, sha: str, counter: int, now: str) -> StoreState:
-        """As it must be before `sha` replaces the current bundle `now`: on trial, and going back to a committed bundle."""
+        """As it must be before `sha` replaces the current bundle `now`: on trial, and going back to a committed
+        bundle."""
         back = now if self.of(now).committed else self.of(now).previous
         fresh = self if sha != self.candidate else replace(self, candidate=PACKAGED)
         if sha == back:
@@ -75,12 +78,14 @@ class StoreState:
         return replace(made, counter=counter, highest=sha) if counter >= self.counter else made
 
     def left(self, sha: str, why: str) -> StoreState:
-        """With the trial of `sha` failed for this reason. Its starts are used up, in case the power goes before `current` changes."""
+        """With the trial of `sha` failed for this reason. Its starts are used up, in case the power goes before
+        `current` changes."""
         text = "".join(c if c.isprintable() else " " for c in why)
         return self.changed(sha, starts=MOST_STARTS, why=text[:MOST_WHY])
 
     def exchanged(self, sha: str) -> StoreState:
-        """As it must be before the bundle that `sha` goes back to becomes current: going back twice returns to `sha`."""
+        """As it must be before the bundle that `sha` goes back to becomes current: going back twice returns to
+        `sha`."""
         return self.changed(self.of(sha).previous, previous=sha)
 
     def chain(self, sha: str) -> tuple[str, ...]:

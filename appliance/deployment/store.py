@@ -1,8 +1,9 @@
-"""What the box runs. In: bundles that were copied to it. Out: the one for this start, old or new, whole at every moment.
+"""What the box runs. In: bundles that were copied to it. Out: the one for this start, old or new, whole at every
+moment.
 
-In the store's folder, `bundles/SHA/` are whole, verified bundles, the symlink `current` names the one that runs (missing:
-the packaged one), and `ledger.json` holds all else (StoreState). Each step is one atomic rename of a file, a folder or
-the link, and what the step relies on is on the disk before:
+In the store's folder, `bundles/SHA/` are whole, verified bundles, the symlink `current` names the one that runs
+(missing: the packaged one), and `ledger.json` holds all else (StoreState). Each step is one atomic rename of a file, a
+folder or the link, and what the step relies on is on the disk before:
 
 - install: the bundle's folder gets its name; its state is written, on trial and with the bundle to go back to; then
   `current` leads to it. The state of the bundle that was current is unchanged, and holds if the power goes in between.
@@ -60,7 +61,8 @@ class SignedBundle:
 
 
 class BundleFolder:
-    """Whole, verified bundles in `folder`, each under the sha256 of its manifest. signers: the file of trusted signers."""
+    """Whole, verified bundles in `folder`, each under the sha256 of its manifest. signers: the file of trusted
+    signers."""
 
     def __init__(self, folder: Path, signers: Path) -> None:
         self.folder, self._signers = folder, signers
@@ -121,9 +123,9 @@ class Choice:
 class Store:
     """The bundles on this box and which of them runs.
 
-    prove: raises where this machine does not run a bundle as it should: golden sweeps, and whether it fits the settings.
-    The methods raise OSError for trouble with the disk, BundleError for a bundle that must not run, ConfigError where
-    the settings name no trusted signers, and ApplianceError where another command holds the lock.
+    prove: raises where this machine does not run a bundle as it should: golden sweeps, and whether it fits the
+    settings. The methods raise OSError for trouble with the disk, BundleError for a bundle that must not run,
+    ConfigError where the settings name no trusted signers, and ApplianceError where another command holds the lock.
     """
 
     def __init__(self, settings: StoreConfig, prove: Callable[[Bundle], object], clock: Clock | None = None) -> None:
@@ -166,8 +168,8 @@ class Store:
     def install(self, incoming: Path, shadow: bool = False) -> str:
         """Install the bundle in `incoming`, so that it runs on trial from the next start on; its sha256.
 
-        shadow: it becomes the candidate instead. Other files in `incoming` are ignored. Somebody else may own the folder
-        and change it meanwhile: the files are read once, and what was checked is what is written.
+        shadow: it becomes the candidate instead. Other files in `incoming` are ignored. Somebody else may own the
+        folder and change it meanwhile: the files are read once, and what was checked is what is written.
         """
         signed = self.examine(incoming)
         self.bundles.folder.mkdir(parents=True, exist_ok=True)
@@ -249,7 +251,8 @@ class Store:
         return back
 
     def note(self, sha: str, starts: int, sweeps: int, streamed_s: float) -> None:
-        """Write down how far the trial of `sha` has come. Does not wait: ApplianceError where another command is at work."""
+        """Write down how far the trial of `sha` has come. Does not wait: ApplianceError where another command is at
+        work."""
         with self._locked(0.0) as state:
             self._write(state.changed(sha, starts=starts, sweeps=sweeps, streamed_s=round(streamed_s, 1)))
 

@@ -1,5 +1,5 @@
-"""A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store records: starts that count
-against the bundle, its progress, and the commit once enough went well.
+"""A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store records: starts that
+count against the bundle, its progress, and the commit once enough went well.
 
 `Store.choose` counts a start before the bundle is touched. The count is taken back while the skin is away, and when the
 program ends in order or because a device is missing.

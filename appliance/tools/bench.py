@@ -101,11 +101,12 @@ class _Watch(Observer):
 
 
 def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
-    """SWEEPS simulated sweeps from USB bytes to sentence, at skin positions that no training set has. Computing takes its
-    real time, waiting is skipped.
+    """SWEEPS simulated sweeps from USB bytes to sentence, at skin positions that no training set has. Computing takes
+    its real time, waiting is skipped.
 
     edge_to_sentence_ms: from the moment when stop edge and last frame of the window have been read to the sentence at
-    the port. edge_seen_ms: from the kernel's time stamp of the stop edge to that moment (glitch filter, rest of a packet).
+    the port. edge_seen_ms: from the kernel's time stamp of the stop edge to that moment (glitch filter, rest of a
+    packet).
     """
     clock = rig.SkippingClock()
     watch = _Watch(clock)

@@ -1,6 +1,7 @@
 """The figures of the bench that are measured in a process of their own: memory and processor share.
 
-In: recorded sweeps and a way to build a box. Out: figures. The simulated skin is not loaded here: it is no part of the box.
+In: recorded sweeps and a way to build a box. Out: figures. The simulated skin is not loaded here: it is no part of the
+box.
 """
 
 from __future__ import annotations

@@ -75,7 +75,8 @@ class Demo:
             self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}", *touch)
 
     def _read(self, sent: int, wanted: int) -> None:
-        """Read what has come to the robot's end; wait for answers that were sent and have not come; stop at `wanted`."""
+        """Read what has come to the robot's end; wait for answers that were sent and have not come; stop at
+        `wanted`."""
         while select.select([self._far_end], [], [], ARRIVAL_S if self.score.total.total() < sent else 0)[0]:
             *lines, self._rest = (self._rest + os.read(self._far_end, 65536)).split(b"\r\n")
             for line in lines:

@@ -41,7 +41,8 @@ class AnswerScore:
     """Counts of the answers so far.
 
     right, total: by material. objects: whether the last answer for each object was right, where NEW OBJECT was
-    signalled. early: answers that did not need the whole window. slide_frames: frames from START to STOP, of all sweeps.
+    signalled. early: answers that did not need the whole window. slide_frames: frames from START to STOP, of all
+    sweeps.
     """
 
     right: Counter[str] = field(default_factory=Counter)

@@ -155,7 +155,8 @@ def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: 
 
 
 def test_what_a_person_put_there_stays(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
-    """A settings file of theirs is kept and named; a file in the way of the program ends the install before anything else."""
+    """A settings file of theirs is kept and named; a file in the way of the program ends the install before anything
+    else."""
     settings, program, pid = "/etc/palpate/sensor.toml", "/usr/local/bin/palpate", host.service["MainPID"]
     for path in (settings, program):
         host.machine.get("rm", path)
@@ -225,7 +226,8 @@ def test_a_release_that_fails_its_self_test_is_never_swapped_in(
 def test_an_install_that_is_cut_is_finished_by_the_next(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path, said: str, after_s: float
 ):
-    """The desktop dies during the copy, or while the box builds: the old release starts, and a second command finishes."""
+    """The desktop dies during the copy, or while the box builds: the old release starts, and a second command
+    finishes."""
     new, before = changed(wheel, tmp_path, "appliance/more.py", f"# {said} {after_s}\n"), release(host)
     site.cut("install", *at, "--wheel", new, words=said, after_s=after_s)
     assert release(host) == before
@@ -237,7 +239,8 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
 
 
 def test_a_swap_that_is_cut_leaves_old_or_new(host: hosts.Host, upgraded: list[tuple[str, str]]):
-    """The box dies before the N-th command of the swap, for each N: it starts with one release or the other, complete."""
+    """The box dies before the N-th command of the swap, for each N: it starts with one release or the other,
+    complete."""
     new, old = (host.machine.get("readlink", link) for link in ("/opt/palpate", "/opt/palpate.previous"))
     script = run_here(f"import install; print(install.swap('/opt/{old}', '{new}'))")
     found = []
@@ -342,7 +345,8 @@ def test_a_bundle_with_an_unknown_key_is_refused(
 def test_a_delivery_that_is_cut_leaves_old_or_new(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, said: str, after_s: float
 ):
-    """The desktop dies at any time and the box restarts: it runs the old or the new bundle; a second delivery finishes."""
+    """The desktop dies at any time and the box restarts: it runs the old or the new bundle; a second delivery
+    finishes."""
     bundle, before = sender.made(), serves(host)
     site.cut("deploy", *at, bundle, "--verbose", words=said, after_s=after_s)
     start_again(host)
@@ -381,7 +385,8 @@ def test_a_candidate_is_delivered_beside(site: hosts.Hosts, host: hosts.Host, at
 
 
 def test_boxes_that_fail_do_not_stop_the_others(site: hosts.Hosts, host: hosts.Host, sender: Sender, tmp_path: Path):
-    """One refuses the connection, one never answers, one hangs, one has no Palpate: each has its reason, the good one is READY."""
+    """One refuses the connection, one never answers, one hangs, one has no Palpate: each has its reason, the good one
+    is READY."""
     with socket.create_server(("127.0.0.1", 0)) as dumb, stalling(host) as hangs:
         shared = {"ssh_user": hosts.USER, "ssh_key": str(site.work / ".ssh/id_ed25519")}
         there = {"refuses": 1, "dumb": dumb.getsockname()[1], "hangs": hangs}
@@ -470,7 +475,8 @@ for text in ("pi@box", "Box.lab:2222", "pi@[fe80::1]:22", "pi@", "a@b@c"):
 
 @pytest.mark.slow
 def test_the_lock_is_read_for_the_box_not_for_the_desktop():
-    """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay with their packages."""
+    """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay with their
+    packages."""
     for python, numpy in (("3.11.2", "2.4"), ("3.13.5", "2.5")):
         code = f"import release; print(release.locked(release.LOCK.read_text(), {python!r}, 'aarch64'))"
         lock = run_here(code)

@@ -1,4 +1,5 @@
-"""The unit under a real systemd, in a container: start, notify, watchdog, restart, exit codes, stop, privileges, journal."""
+"""The unit under a real systemd, in a container: start, notify, watchdog, restart, exit codes, stop, privileges,
+journal."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 
 def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, before: list[bool]):
-    """User, groups and folders, with owners and modes; none of them existed before, and a second run changes nothing."""
+    """User, groups and folders, with owners and modes; none of them existed before, and a second run changes
+    nothing."""
     assert before == [False, False, False]
     for _ in range(2):
         assert set(machine.get("id", "-nG", "palpate").split()) == {"palpate", "dialout", "gpio", "plugdev"}

@@ -126,7 +126,8 @@ def serves(service: Service, sha: str) -> None:
 
 
 def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Service, store: DeliveredStore):
-    """On trial at its first start, which `palpate status` shows; committed after its sweeps, with a line in the journal."""
+    """On trial at its first start, which `palpate status` shows; committed after its sweeps, with a line in the
+    journal."""
     new = store.deploy()
     machine.put(SITE, "[store]\ntrial_sweeps = 1\n")
     service.start(RUN)
@@ -213,7 +214,8 @@ def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
 def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
     machine: Machine, service: Service, store: DeliveredStore, end: str
 ):
-    """Four restarts, four kills while the skin is away, or four ends with exit 69: still on trial, at its first start."""
+    """Four restarts, four kills while the skin is away, or four ends with exit 69: still on trial, at its first
+    start."""
     new = store.deploy()
     if end == "without a GPIO chip":
         machine.put(SITE, "[trigger]\nstart = 'GPIO17'\nstop = 'GPIO27'\n")
@@ -248,8 +250,8 @@ def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) ->
 
 
 def test_a_candidate_classifies_beside_and_becomes_the_one(machine: Machine, service: Service, store: DeliveredStore):
-    """Deployed as a candidate, it classifies in the shadow from the next start on; `palpate status` and `palpate bundles` show
-    its figures; once promoted it is on trial, and no longer in the shadow."""
+    """Deployed as a candidate, it classifies in the shadow from the next start on; `palpate status` and `palpate
+    bundles` show its figures; once promoted it is on trial, and no longer in the shadow."""
     new = store.deploy("--shadow")
     assert store.current == store.a
     service.start(RUN)

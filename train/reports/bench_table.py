@@ -1,5 +1,5 @@
-"""The table of the box's figures in README and manual. In: docs/bench.json, which `palpate bench --json` wrote. Out: the
-table in Markdown, and documents with it between the markers BEGIN and END.
+"""The table of the box's figures in README and manual. In: docs/bench.json, which `palpate bench --json` wrote. Out:
+the table in Markdown, and documents with it between the markers BEGIN and END.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ def table(figures: Json) -> str:
 
 
 def insert(text: str, figures: Json, name: str) -> str:
-    """`text` with the table between its markers. Raises FormatError, naming the document, where they are not there once."""
+    """`text` with the table between its markers. Raises FormatError, naming the document, where they are not there
+    once."""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end or BEGIN in after:

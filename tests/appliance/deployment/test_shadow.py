@@ -102,7 +102,8 @@ def test_two_that_agree_are_counted_and_nothing_is_kept(side):
 
 
 def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
-    """Sweep and counts are on the disk at the end of the turn; judged again, the sweep gives both verdicts bit for bit."""
+    """Sweep and counts are on the disk at the end of the turn; judged again, the sweep gives both verdicts bit for
+    bit."""
     pair = side(renamed)
     pair.judge(A)
     (path,) = pair.kept()
@@ -211,7 +212,8 @@ def strange() -> None:
 
 
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: list[str]):
-    """Three failures in a row are logged once, and the candidate is not asked any more; a success starts the count anew."""
+    """Three failures in a row are logged once, and the candidate is not asked any more; a success starts the count
+    anew."""
     pair = side()
     pair.shadow._classifier = FailingClassifier(pair.shadow._classifier, lambda s: s.id != 3, strange)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 10)))
@@ -236,7 +238,8 @@ def test_a_candidate_that_is_too_slow_has_failed(side, logged: list[str]):
 
 
 def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path: Path):
-    """The same pair continues its counts; for another candidate, or another current bundle, counts and sweeps start anew."""
+    """The same pair continues its counts; for another candidate, or another current bundle, counts and sweeps start
+    anew."""
     pair = side(renamed)
     pair.judge(A)
     pair.shadow.stopping()
@@ -254,7 +257,8 @@ def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, t
 
 
 def test_a_candidate_that_kills_the_program_stays_away(side):
-    """After three starts without an orderly end within a minute there is no fourth; an orderly end, or a minute, resets the count."""
+    """After three starts without an orderly end within a minute there is no fourth; an orderly end, or a minute, resets
+    the count."""
 
     def start(judged_s: float) -> Shadow:
         pair = side()
@@ -290,7 +294,8 @@ def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
-    """Another format, golden sweeps with other results, a folder that is a file: each is an error that says what to try."""
+    """Another format, golden sweeps with other results, a folder that is a file: each is an error that says what to
+    try."""
     with pytest.raises(BundleError, match="wants 4x4 uint8"):
         side(lambda b: default_bundle)
     with pytest.raises(BundleError, match="golden sweeps"):

@@ -140,7 +140,8 @@ def test_a_key_that_cannot_sign_is_named(tmp_path: Path, capfd: pytest.CaptureFi
 
 
 def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.CaptureFixture[str]):
-    """`palpate-train sign` puts the counter into the manifest and the signature beside it; without a counter it refuses."""
+    """`palpate-train sign` puts the counter into the manifest and the signature beside it; without a counter it
+    refuses."""
     folder = deliveries.put(tmp_path / "bundle", deliveries.files(0, None))
     with pytest.raises(BundleError, match="counter 0, which no box takes"):
         sign.sign(folder, signers.ours)

@@ -139,7 +139,8 @@ def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
 
 @pytest.mark.slow
 def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
-    """The counter must be above all committed ones, also after a rollback; the newest bundle itself may be installed again."""
+    """The counter must be above all committed ones, also after a rollback; the newest bundle itself may be installed
+    again."""
     one, two = box.committed(1), box.committed(2)
     box.store.rollback()
     for counter in (1, 2):

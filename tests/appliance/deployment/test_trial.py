@@ -161,7 +161,8 @@ def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
     ids=repr,
 )
 def test_what_ends_the_program_decides_whether_the_start_counts(box: Trying, error: BaseException | None, counts: int):
-    """Missing hardware and a person who stops the program do not count; an error that the bundle may have caused does."""
+    """Missing hardware and a person who stops the program do not count; an error that the bundle may have caused
+    does."""
     with suppress(type(error)), box.tried():
         if error:
             raise error

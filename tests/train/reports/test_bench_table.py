@@ -1,4 +1,5 @@
-"""The one table of the box's figures: README and manual show docs/bench.json, and name none of its figures elsewhere."""
+"""The one table of the box's figures: README and manual show docs/bench.json, and name none of its figures
+elsewhere."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ def running_text(path: Path) -> str:
 
 
 def named(text: str, figures: dict[str, Any]) -> list[str]:
-    """The figures of the bench that a text names: by what they measure, and by their values as the table prints them."""
+    """The figures of the bench that a text names: by what they measure, and by their values as the table prints
+    them."""
     found = [match[0] for pattern in MEASURED.values() for match in re.finditer(pattern, text)]
     values = set(re.findall(r"[\d.]+ (?:ms|MiB|kB|s)\b|\d+\.\d %", bench_table.table(figures)))
     shown = {value for value in values if len(re.sub(r"\D", "", value)) > 2}  # of 1.0 ms there may be others
