@@ -1,4 +1,4 @@
-"""Deciding early, desktop side: the rule on constructed tenths, heads, and the graph against what the box computes."""
+"""Early decisions on the desktop: the rule on constructed tenths, heads, and the graph against what the box computes."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from train.onnx_tools.graph_builder import run
 
 
 def tenths(n: int, places: int = 8, seed: int = 0, strength=None):
-    """Features [N, 10, 5] of n sweeps of three materials at each place, told apart better with each tenth."""
+    """Features [N, 10, 5] of n sweeps of three materials at each position, better separated with each tenth."""
     rng = np.random.default_rng(seed)
     labels = np.tile(np.repeat(np.arange(3), n), places)
     means = 4 * np.eye(5)[:3]
@@ -40,7 +40,7 @@ def certain(labels, when, wrong=()):
     return p
 
 
-def test_the_rule_decides_when_the_steps_are_sure():
+def test_the_rule_decides_when_the_steps_are_certain():
     """All sweeps are clear from the third tenth on: decided there with one step, and nothing is lost."""
     labels = np.arange(300) % 3
     found = early_exit.find_rule(certain(labels, np.full(300, 2)), labels)
@@ -50,7 +50,7 @@ def test_the_rule_decides_when_the_steps_are_sure():
 
 
 def test_a_rule_asks_for_agreement_where_one_step_deceives():
-    """A tenth that is sure and wrong for 2 % of the sweeps, once: two steps in agreement do not fall for it."""
+    """A tenth that is certain and wrong for 2 % of the sweeps, once: two steps that agree are not deceived."""
     labels = np.arange(300) % 3
     p = certain(labels, np.full(300, 2))
     p[:6, 2] = np.roll(p[:6, 2], 1, axis=1)
@@ -91,7 +91,7 @@ def test_no_looser_level_after_one_that_lost():
 
 @pytest.mark.parametrize("agree", [1, 2, 3])
 def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
-    """early.decide against appliance.early.decides on random probabilities, some levels above 1."""
+    """early.decide against the appliance's inference.early_exit on random probabilities, some levels above 1."""
     rng = np.random.default_rng(agree)
     p = classifier.softmax(2 * rng.standard_normal((200, 10, 3)))
     rule = Early(tuple(rng.choice([0.5, 0.7, 0.9, 1.5], 9).tolist()), agree)
@@ -102,8 +102,8 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
 
 
 @pytest.mark.slow
-def test_temperatures_make_each_step_honest():
-    """Crossed over places, the mean of the highest probability is what is right, at every step."""
+def test_temperatures_calibrate_each_step():
+    """Cross-fitted over positions, the mean of the highest probability is the accuracy, at every step."""
     x, y, at = tenths(40)
     done = posthoc.fit_posthoc(x, y, at, np.ones(len(y), bool))
     new, labels, _ = tenths(60, seed=9)
@@ -140,14 +140,14 @@ def test_a_material_of_one_place_and_two_materials():
 
 @pytest.fixture(scope="module")
 def made():
-    """A bundle's parts on the toy trunk, one of whose features nobody trained: Posthoc, model, digits, labels, whole Bundle."""
+    """A bundle's parts on the toy trunk, one of whose features is untrained: Posthoc, features, raw counts, labels, Bundle."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(3), 4), 6)
     level = np.array([[[20, 60], [40, 40]], [[60, 20], [40, 40]], [[40, 40], [60, 20]]])
-    digits = level[labels][:, None] + rng.normal(0, [4, 9, 6], (FORM.window, 2, 2, 3))[None, ..., 0].repeat(72, 0)
-    digits = np.rint(digits + rng.normal(0, 5, digits.shape)).astype(np.int16)
+    counts = level[labels][:, None] + rng.normal(0, [4, 9, 6], (FORM.window, 2, 2, 3))[None, ..., 0].repeat(72, 0)
+    counts = np.rint(counts + rng.normal(0, 5, counts.shape)).astype(np.int16)
     trunks = trunk(FORM, True)
-    x, size = run(trunks, digits), 1
+    x, size = run(trunks, counts), 1
     done = posthoc.fit_posthoc(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
     model = done.graph(trunks)
@@ -156,39 +156,39 @@ def made():
                         {k: bundle.file_entry(v) for k, v in files.items()}, early=done.rule.early, known=done.known())  # fmt: skip
     means = done.embedding.means
     classes = Classes(means, -(means**2).sum(1) / 2, np.zeros(3, np.int64), np.ones(3, np.float32))
-    whole = bundle.Bundle(manifest, "0", files[bundle.MODEL], digits[:2], run(model, digits[:2]), classes)
-    return done, x, digits, labels, whole
+    whole = bundle.Bundle(manifest, "0", files[bundle.MODEL], counts[:2], run(model, counts[:2]), classes)
+    return done, x, counts, labels, whole
 
 
 def test_the_graph_gives_what_training_computed(made):
     """Logits, embedding and the heads of all tenths in the box's classifier are those of Posthoc."""
-    done, x, digits, _, whole = made
+    done, x, counts, _, whole = made
     box = classifier.Classifier(whole, SystemClock())
     box.self_test()
     for i in (0, 17, 40):
-        assert np.allclose(box.embedding(digits[i]), done.embedding(x[i, -1]), atol=1e-3)
-        have = classifier.softmax(np.vstack([box.early(digits[i]), box.logits(digits[i])]))
+        assert np.allclose(box.embedding(counts[i]), done.embedding(x[i, -1]), atol=1e-3)
+        have = classifier.softmax(np.vstack([box.early(counts[i]), box.logits(counts[i])]))
         assert np.allclose(have, done.probabilities(x[i : i + 1])[0], atol=1e-3)
 
 
 def test_a_graph_without_tenths_has_no_early_heads(made):
     """From a trunk of the whole window: logits and embedding alone; without a rule none either."""
-    done, x, digits, _, _ = made
+    done, x, counts, _, _ = made
     for model in (
         done.graph(trunk(FORM)),
         replace(done, rule=early_exit.EarlyRule(None, "why")).graph(trunk(FORM, True)),
     ):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
         assert np.allclose(
-            classifier.softmax(run(model, digits[:2])), classifier.softmax(done.logits(x[:2, -1])), atol=1e-3
+            classifier.softmax(run(model, counts[:2])), classifier.softmax(done.logits(x[:2, -1])), atol=1e-3
         )
 
 
 def test_enrolment_is_judged_as_the_box_enrols(made):
     """enrolled_logits against appliance.inference.enrolment on the same sweeps, up to a term that all labels share."""
-    done, x, digits, labels, whole = made
+    done, x, counts, labels, whole = made
     drawn = np.flatnonzero(labels == 1)[:3]
-    new = enrolment.enrol(whole, "new", digits[drawn]).bundle
+    new = enrolment.enrol(whole, "new", counts[drawn]).bundle
     z = done.embedding(x[:, -1])
     means = Means(new.classes, new.manifest.known, new.manifest.labels)
     want = means.logits(means.distances(z)) * done.warmth

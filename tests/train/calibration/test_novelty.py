@@ -1,4 +1,4 @@
-"""Knowing what is known, on Gaussians whose truth is known: the embedding is LDA, the limit keeps what it promises."""
+"""Novelty on Gaussians whose truth is known: the embedding is LDA, the limit keeps the share that it states."""
 
 import numpy as np
 import pytest
@@ -17,24 +17,24 @@ def gaussians(n: int, means, seed: int = 0, mix=None):
     return means[labels] + (noise if mix is None else noise @ mix), labels
 
 
-@pytest.mark.parametrize("whole", [0, 3])
-def test_the_embedding_is_lda(whole: int):
+@pytest.mark.parametrize("fixed", [0, 3])
+def test_the_embedding_is_lda(fixed: int):
     """Logits from distances are those of shrinkage LDA with equal priors but for a common term; the covariance is 1."""
     mix = np.random.default_rng(1).standard_normal((7, 7))
     x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 7)) @ mix, mix=mix)
-    one = novelty.embed(x, y, whole)
-    assert one.means.shape == (4, 3 + whole)
+    one = novelty.embed(x, y, fixed)
+    assert one.means.shape == (4, 3 + fixed)
     lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", store_covariance=True).fit(x, y)
     want = x @ lda.coef_.T + lda.intercept_
     have = one.logits(x)
     assert np.allclose(have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=1e-3)
     half = -one.distances(one(x)) / 2
     assert np.allclose(half - half.mean(1, keepdims=True), have - have.mean(1, keepdims=True), atol=1e-3)
-    assert np.allclose(one.projection.T @ lda.covariance_ @ one.projection, np.eye(3 + whole), atol=1e-4)
+    assert np.allclose(one.projection.T @ lda.covariance_ @ one.projection, np.eye(3 + fixed), atol=1e-4)
 
 
-def test_features_that_nobody_trained_are_kept_whole():
-    """With `whole` all of the last features' directions are seen: the distance is the whole Mahalanobis distance there."""
+def test_untrained_features_are_kept_completely():
+    """With `fixed` all directions of the last features are kept: the distance is the full Mahalanobis distance there."""
     x, y = gaussians(300, [[0, 0, 0], [6, 0, 0]])
     unknown = np.array([[0.0, 0.0, 20.0]])
     assert novelty.embed(x, y, 0).novelty(unknown)[0] < 10
@@ -77,12 +77,12 @@ def test_the_limit_keeps_what_it_promises():
 def test_the_limit_knows_positions_that_were_not_seen():
     """Places that shift all sweeps: judged across groups the limit keeps 95 % at new places, within them it does not."""
 
-    def world(places, seed):
+    def drawn(places, seed):
         x, y = gaussians(5 * places, [[0, 0], [30, 0]], seed)
         at = np.tile(np.repeat(np.arange(places), 5), 2)
         return x + 3 * np.random.default_rng(seed + 1).standard_normal((places, 2))[at], y, at
 
-    (x, y, at), (new, _, _) = world(300, 0), world(400, 5)
+    (x, y, at), (new, _, _) = drawn(300, 0), drawn(400, 5)
     one, every = novelty.embed(x, y, 2), np.ones(len(y), bool)
     across = novelty.limit(novelty.cross_fitted_distances(x, y, at, every, 2), 0.95)
     assert 0.93 < np.mean(one.novelty(new) <= across) < 0.97

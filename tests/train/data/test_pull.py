@@ -34,7 +34,7 @@ SSHD = Path("/usr/sbin/sshd")
 
 
 class Ground:
-    """A box whose folder is `box`, and the folder `here`; `ssh` can be told to do something else."""
+    """A box whose folder is `box`, and the folder `here`; `ssh` can be replaced."""
 
     def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.box, self.here, self.bin = path / "box", path / "here", path / "bin"
@@ -160,7 +160,7 @@ def test_what_is_left_of_a_kill_is_made_whole(ground: Ground):
 
 
 def test_half_a_recording_is_left_there(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Without its sidecar, or the sidecar of a sweep in progress: told, not fetched; the others are."""
+    """Without its sidecar, or the sidecar of a sweep in progress: reported and not fetched; the others are."""
     (ground.box / "run 0" / "sweep-000000.json").unlink()
     (ground.box / "run 1" / "sweep-000003.npy").unlink()
     (ground.box / "run 1" / "sweep-000004.npy.part").write_bytes(b"half")
@@ -185,7 +185,7 @@ def test_another_sweep_of_the_same_name_is_never_written_over(ground: Ground, ca
 
 
 def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """The sidecar is the user's to edit: told, and no failure; so is one that was edited on the box."""
+    """The user may edit a sidecar: it is reported and not a failure; the same for one that was edited on the box."""
     ground.fetch()
     mine = ground.here / "run 0" / "sweep-000000.json"
     mine.write_text(json.dumps(json.loads(mine.read_text()) | {"material": "cork"}))
@@ -351,7 +351,7 @@ def test_ssh_is_asked_without_questions(ground: Ground):
 
 
 def test_no_ssh_here_is_told(ground: Ground, monkeypatch: pytest.MonkeyPatch):
-    """It is said what to install."""
+    """The message says what to install."""
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(ApplianceError, match="ssh is not installed; apt install openssh-client"):
         ground.fetch()

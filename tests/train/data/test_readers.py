@@ -52,7 +52,7 @@ def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
     b = hdf5(tmp_path / "b.data", rate_hz=None, materials=np.array([b"a", b"b", "ç".encode()]), samples=None)
     with h5py.File(b, "a") as file:
         file["samples"] = held()["samples"].astype(">i2")
-        file["notes"] = h5py.ExternalLink("/nowhere.h5", "/x")  # nobody asks for it
+        file["notes"] = h5py.ExternalLink("/nowhere.h5", "/x")  # not read
         file.attrs["rate_hz"] = 50
     b = sets.load(b)
     assert b.samples.dtype.isnative
@@ -61,7 +61,7 @@ def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.hdf5"])
 def test_every_form_is_read_back(tmp_path: Path, name: str):
-    """What save writes is what load reads, and the ending says in which form."""
+    """What save writes is what load reads; the suffix selects the format."""
     whole = sets.load(hdf5(tmp_path / "whole.h5"))
     whole.save(tmp_path / name)
     assert sets.digest(sets.load(str(tmp_path / name))) == sets.digest(whole)
@@ -187,7 +187,7 @@ def test_a_damaged_hdf5_is_refused(tmp_path: Path, signature: bytes):
 
 @pytest.mark.parametrize("dtype", ["uint8", "int64", "float32", "float64"])
 def test_tactmat_is_read(tmp_path: Path, dtype: str):
-    """Labels from the first axis, repetitions from the second, digits of a byte in whatever type they are kept."""
+    """Labels from the first axis, repetitions from the second, counts of a byte in whatever type they are stored."""
     samples = tactmat(tmp_path / "t.h5", dtype)
     s = sets.load(str(tmp_path / "t.h5"))
     assert str(s.format) == "4x4 uint8 at 750 Hz, window 50"
@@ -199,14 +199,14 @@ def test_tactmat_is_read(tmp_path: Path, dtype: str):
 
 
 def test_tactmat_s_own_rate_goes_first(tmp_path: Path):
-    """A rate in the file is used, and nothing is said to be assumed."""
+    """A rate in the file is used, and no assumption is reported."""
     tactmat(tmp_path / "t.h5", rate_hz=1000.0)
     s = sets.load(str(tmp_path / "t.h5"))
     assert (s.rate_hz, s.source) == (1000.0, "t.h5")
 
 
 def test_a_broken_tactmat_is_refused(tmp_path: Path):
-    """Names that do not fit, none, digits beyond a byte, labels of which nobody knows what they are."""
+    """Names that do not fit, none, counts beyond a byte, unexpected labels."""
     for more, message in (
         ({"materials": ["cork", "felt"]}, "are of 3 materials, 2 are named"),
         ({"labels": np.arange(12) % 3}, "lacks rate_hz"),
@@ -249,7 +249,7 @@ def test_recordings_are_a_set(tmp_path: Path):
 
 
 def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
-    """Where all names are whole numbers a group has these, so that --only position=12 means what it says."""
+    """Where all names are whole numbers a group has these, so that --only position=12 selects the position named 12."""
     for i, (position, session) in enumerate([("12", "7"), ("3", "07"), ("3", "8"), ("0", "7")]):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], position=position, session=session)
     groups = sets.load(str(tmp_path)).groups
@@ -282,7 +282,7 @@ def test_what_the_box_refused_is_left_out(tmp_path: Path):
 
 
 def test_objects_of_several_runs_in_one_folder_stay_apart(tmp_path: Path):
-    """Each run of the box counts its objects anew and says in the sidecar which run it was."""
+    """Each run of the box counts its objects from 1 and writes its name into the sidecar."""
     for i, (run, obj) in enumerate([(0, 1), (0, 1), (2, 1), (2, 2)]):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, object=obj)
         save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), {"run": run})
@@ -321,7 +321,7 @@ def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, mess
 
 
 def test_broken_recordings_are_named(tmp_path: Path):
-    """A table cut in two, a sidecar that is gone or says nothing, nothing that is ok, nothing at all, one material."""
+    """A table cut in two, a sidecar that is missing or empty, nothing that is ok, nothing at all, one material."""
     with pytest.raises(FormatError, match="no recorded sweep is ok; record some"):
         sets.load(str(tmp_path))
     record(tmp_path / "0.npy", status=Status.SHORT)

@@ -19,7 +19,7 @@ from train.data import sets
 
 
 def test_a_file_is_read_as_it_is_described(tmp_path: Path):
-    """Format, materials, groups and digits come out as they were put in; save writes the same form."""
+    """Format, materials, groups and raw counts come out as they were put in; save writes the same form."""
     s = sets.load(write(tmp_path / "good.npz"))
     assert str(s.format) == "2x3 int16 at 50 Hz, window 8"
     assert s.materials == ("a", "b", "c")
@@ -190,13 +190,13 @@ def test_split_never_trains_without_a_material():
     """Where one group alone has a material it is in the first part, or the split is refused."""
     s = easy(8).take(np.arange(19))  # 8 low, 8 middle, 3 high
     s.groups["box"] = np.array([0] * 8 + [1] * 4 + [2] * 7)
-    told = set()
+    outcomes = set()
     for seed in range(20):
         try:
-            told.add(s.split("box", 0.5, seed)[0].labels.max())
+            outcomes.add(s.split("box", 0.5, seed)[0].labels.max())
         except FormatError as e:
-            told.add(str(e))
-    assert told == {2, "easy: split by 'box': the first part lacks 'high'; it has 3 groups, use a finer one"}
+            outcomes.add(str(e))
+    assert outcomes == {2, "easy: split by 'box': the first part lacks 'high'; it has 3 groups, use a finer one"}
 
 
 def test_join_keeps_recordings_apart_and_forces_together():

@@ -17,7 +17,7 @@ from train.data import sets, summary
 
 
 def lines(s: sets.Dataset) -> list[str]:
-    """What is told of a set."""
+    """What is text of a set."""
     return summary.description(s, {})
 
 
@@ -46,7 +46,7 @@ def test_what_is_confounded_is_told():
     """Values that hold one material, a material that one value takes with it, recordings of several; not one value."""
     s = easy(4, pieces=8)
     s.groups.update(object=s.labels // 2, one=np.zeros(12, int))
-    told = [
+    text = [
         "    confounded: one material only at 1",
         "    confounded: 'low' only at 0; leaving that out leaves none to train on",
         "    confounded: 'middle' only at 0; leaving that out leaves none to train on",
@@ -57,10 +57,10 @@ def test_what_is_confounded_is_told():
         "    1 of them hold sweeps of several materials: number recordings within one material",
         "  materials: 3: low 4, middle 4, high 4",
         "  object: 2: 0, 1",
-        *told,
+        *text,
         "  one: 1: 0",
         "  speed: 2: 0, 1",
-        *told,
+        *text,
     ]
 
 
@@ -114,17 +114,17 @@ def test_recordings_are_described_by_name(tmp_path: Path):
 
 
 def test_recordings_are_described_while_they_grow(tmp_path: Path):
-    """One material alone, names that are still lacking: counted, and what keeps it from being trained on is said."""
+    """One material alone, names that are still missing: counted, and the reason why it cannot be trained on is given."""
     record(tmp_path / "0.npy", "a", position="2")
-    told = summary.describe(str(tmp_path)).splitlines()
-    assert "  materials: 1: a 1" in told
-    assert told[-1] == f"  cannot be trained on yet: {tmp_path}: only one class, 'a'; a classifier needs two"
+    text = summary.describe(str(tmp_path)).splitlines()
+    assert "  materials: 1: a 1" in text
+    assert text[-1] == f"  cannot be trained on yet: {tmp_path}: only one class, 'a'; a classifier needs two"
     record(tmp_path / "1.npy", "")
-    told = summary.describe(str(tmp_path)).splitlines()
-    assert "  materials: 2: (none) 1, a 1" in told
-    assert "  position: 2: 0 (none), 1 2" in told
-    assert not any("session" in line for line in told)
-    assert told[-1].startswith(f"  cannot be trained on yet: {tmp_path / '1.npy'}: has no ")
+    text = summary.describe(str(tmp_path)).splitlines()
+    assert "  materials: 2: (none) 1, a 1" in text
+    assert "  position: 2: 0 (none), 1 2" in text
+    assert not any("session" in line for line in text)
+    assert text[-1].startswith(f"  cannot be trained on yet: {tmp_path / '1.npy'}: has no ")
     record(tmp_path / "2.npy", status=Status.SHORT)
     (tmp_path / "0.npy").unlink()
     (tmp_path / "1.npy").unlink()
@@ -133,15 +133,15 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
 
 
 def test_what_is_known_can_be_loaded():
-    """Every simulated set in the list has as many sweeps as it says (the large one: sixty for each of its worlds)."""
-    said = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
-    assert said == {"sim:T-LAB": "240", "sim:T-REAL": "540", "sim:T-HARD": "60", "sim:T-HARD:1-20": "1200"}
+    """Every simulated set in the list has as many sweeps as it states (the large one: sixty for each of its scenes)."""
+    stated = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
+    assert stated == {"sim:T-LAB": "240", "sim:T-REAL": "540", "sim:T-HARD": "60", "sim:T-HARD:1-20": "1200"}
     assert len(sets.load("sim:T-LAB", 1001)) == 240
     assert len(sets.load("sim:T-HARD:1001-1002")) == 120
 
 
 def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Alone it lists, `describe` tells of several, `view` writes a picture and names it."""
+    """`sets` lists, `describe` describes several, `view` writes a picture and prints its path."""
     command()
     assert capsys.readouterr().out == summary.known() + "\n"
     one = write(tmp_path / "a.npz")

@@ -1,4 +1,4 @@
-"""Less of everything: what is left of the sweeps is what a sensor so set would give, and the telling taxels stay."""
+"""Reductions: the sweeps that are left are those that a sensor set so would give, and the informative taxels stay."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from train.data.transforms import WHOLE, Change
 
 
 def counting(shape: tuple[int, ...] = (2, 12, 2, 3), kind: str = "int16") -> Dataset:
-    """Digits that name sweep, frame and taxel: 1000 i + 10 t + m."""
+    """Raw counts that name sweep, frame and taxel: 1000 i + 10 t + m."""
     n, frames, rows, cols = shape
     taxel = np.arange(rows * cols).reshape(rows, cols)
     x = 1000 * np.arange(n)[:, None, None, None] + 10 * np.arange(frames)[:, None, None] + taxel
@@ -37,7 +37,7 @@ def test_the_window_is_the_middle():
 
 @pytest.mark.parametrize(("kind", "mean"), [("int16", [20, 70]), ("float32", [20, 70])])
 def test_frames_are_averaged(kind: str, mean: list[int]):
-    """Five into one, what does not make a whole one is left out; digits stay digits, the rate is a fifth."""
+    """Five into one, an incomplete group is left out; the data type stays, the rate is a fifth."""
     part = Change(rate=5).of(counting(kind=kind))
     assert part.samples[0, :, 0, 0].tolist() == mean
     assert (part.rate_hz, part.samples.dtype.name) == (12, kind)
@@ -47,7 +47,7 @@ def test_frames_are_averaged(kind: str, mean: list[int]):
 
 
 def test_low_bits_are_cut_off():
-    """Of whole digits, negative ones too; a float set counts as eight bits of its range."""
+    """Of integer counts, negative ones too; a float set is taken as eight bits over its range."""
     x = np.array([-5, -1, 0, 3, 4, 127], np.int16).reshape(1, 6, 1, 1).repeat(2, 0)
     cut = Change(bits=2).of(Dataset(x, np.array([0, 1]), ("a", "b"), 1.0))
     assert cut.samples[0].ravel().tolist() == [-8, -4, 0, 0, 4, 124]
@@ -75,21 +75,21 @@ def test_changes_add_up():
     assert str(both) == "window 0.5, rate 2, taxels 1"
 
 
-def textured(tells: dict[int, list[float]], taxels: int = 9, each: int = 12) -> Dataset:
-    """White noise of strength 3 on every taxel; `tells`: by taxel, how much stronger it is with each material."""
-    kinds = len(next(iter(tells.values())))
+def textured(factors_of: dict[int, list[float]], taxels: int = 9, each: int = 12) -> Dataset:
+    """White noise of strength 3 on every taxel; `factors_of`: by taxel, how much stronger it is with each material."""
+    kinds = len(next(iter(factors_of.values())))
     labels = np.tile(np.arange(kinds), each)
     rng = np.random.default_rng(5)
     strength = 3 * np.exp(0.2 * rng.standard_normal((len(labels), taxels)))
-    for taxel, factors in tells.items():
+    for taxel, factors in factors_of.items():
         strength[:, taxel] *= np.array(factors)[labels]
     x = 100 + strength[:, None] * rng.standard_normal((len(labels), 80, taxels))
     names = tuple("abcdef"[:kinds])
     return Dataset(np.rint(x).astype(np.int16)[..., None], labels, names, 100.0, {}, "textured")
 
 
-def test_the_telling_taxels_come_first():
-    """Two taxels that each tell half of it, anywhere on the skin."""
+def test_the_informative_taxels_come_first():
+    """Two taxels that each separate half of the materials, anywhere on the skin."""
     assert set(transforms.order(textured({7: [1, 3, 1, 3], 2: [1, 1, 3, 3]}))[:2]) == {2, 7}
 
 

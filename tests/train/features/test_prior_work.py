@@ -99,7 +99,7 @@ def test_a_still_taxel_takes_no_part_in_correlations():
 
 @pytest.mark.parametrize("level", [0, 255])
 def test_a_silent_or_saturated_skin_has_plain_answers(level: int):
-    """Constant digits: floors, rates and levels, nothing else."""
+    """Constant counts: floors, rates and levels, nothing else."""
     x = np.full((100, 2, 2), level, np.uint8)
     low = math.log(time_series.FLOOR)
     np.testing.assert_allclose(spectrogram(x, RATE), np.full(125, low))
@@ -109,7 +109,7 @@ def test_a_silent_or_saturated_skin_has_plain_answers(level: int):
 
 
 def test_a_mean_that_rounding_left_is_none():
-    """Float32 digits whose means were removed: equal weights, and no feature shows what rounding left."""
+    """Float32 counts whose means were removed: equal weights, and no feature shows what rounding left."""
     x = noise()
     centred = (x - x.mean(axis=0, dtype=np.float64)).astype(np.float32)
     assert centred.mean(axis=0, dtype=np.float64).any()
@@ -138,7 +138,7 @@ _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
 @settings(max_examples=60, deadline=None)
 @given(_DIGITS, st.floats(1, 5000), st.sampled_from(KINDS))
 def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, kind: str):
-    """Whatever the digits, float32 numbers come out."""
+    """Whatever the counts, float32 numbers come out."""
     assert np.isfinite(kinds.compute(kind, taxels, rate_hz)).all()
 
 

@@ -9,7 +9,7 @@ from appliance.inference.classifier import softmax
 from train.metrics.score import Score, accuracy_figure, fuse, interval
 
 
-def test_a_tally_counts():
+def test_a_score_counts():
     """Right of how many, as plain numbers."""
     assert Score.of(np.array([True, False, True])).json() == {"right": 2, "total": 3}
 
@@ -20,7 +20,7 @@ def test_one_pool_has_the_papers_wilson_interval():
 
 
 def test_sweeps_that_fail_together_widen_the_interval():
-    """Two of ten positions all wrong: far less sure than a pool with as many wrong; never surer than Wilson's."""
+    """Two of ten positions all wrong: a much wider interval than of a pool with as many wrong; never narrower than Wilson's."""
     position = np.repeat(np.arange(10), 50)
     right = position >= 2
     low, high = interval(right, position)
@@ -51,7 +51,7 @@ def test_windows_of_a_recording_are_fused_as_a_product():
 
 
 def test_no_window_can_veto_all_others():
-    """One that is sure beyond float does not outweigh with log 0."""
+    """One with a probability of 0 in float does not outweigh the others with log 0."""
     scores, _ = fuse(np.array([[1e4, 0.0]] + [[0.0, 9.0]] * 5, np.float32), np.zeros(6, int))
     assert np.isfinite(scores).all()
     assert scores.argmax() == 1

@@ -88,7 +88,7 @@ def test_every_method_learns(method: Method, tubes: HeldOutSet):
 @by_name
 @pytest.mark.parametrize("removed", [False, True])
 def test_every_method_takes_another_skin(method: Method, removed: bool):
-    """3x3 taxels at 100 Hz in int16, and 16x1 at 120 Hz in float32 without means: three materials told apart."""
+    """3x3 taxels at 100 Hz in int16, and 16x1 at 120 Hz in float32 without means: three materials are separated."""
     sweeps = ripples(128, 16, 1, 120.0, "float32").without_means() if removed else ripples(200, 3, 3, 100.0, "int16")
     held = np.arange(len(sweeps)) >= 15
     assert HeldOutSet(sweeps, held).accuracy(method) > 0.8
@@ -114,7 +114,7 @@ def test_training_twice_gives_the_same_bytes(method: Method, tubes: HeldOutSet):
 
 @pytest.mark.parametrize("method", [m for m in METHODS if m.runs_on_the_box], ids=lambda m: m.name)
 def test_a_bundle_of_it_runs_on_the_box(method: Method, tubes: HeldOutSet, tmp_path: Path):
-    """Manifest, graph and golden sweeps in a folder: the box's classifier gives the model's logits from raw digits."""
+    """Manifest, graph and golden sweeps in a folder: the box's classifier gives the model's logits from raw counts."""
     model, held = tubes.model(method), np.flatnonzero(tubes.held)[:4]
     golden, packed = io.BytesIO(), tubes.sweeps.samples[held]
     logits = model.logits(tubes.given(method.input)[held])

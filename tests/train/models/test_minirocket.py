@@ -21,7 +21,7 @@ from train.onnx_tools import graph_builder
 KINDS = {"uint8": (2, 2, 64), "int16": (3, 3, 40), "uint16": (1, 1, 9), "float32": (16, 1, 33)}
 
 
-def digits(dtype: str, n: int = 3) -> np.ndarray:
+def raw_counts(dtype: str, n: int = 3) -> np.ndarray:
     """Random walks [n, T, R, C] of the grid and length that KINDS has for the type; float32 less their means."""
     rows, cols, window = KINDS[dtype]
     rng = np.random.default_rng(7)
@@ -31,7 +31,7 @@ def digits(dtype: str, n: int = 3) -> np.ndarray:
 
 
 def parameters(window: int, taxels: int) -> tuple[np.ndarray, ...]:
-    """A transform made up: all dilations that fit, one to three taxels a kernel, biases between whole digits."""
+    """A transform made up: all dilations that fit, one to three taxels a kernel, biases between integer counts."""
     rng = np.random.default_rng(3)
     dilations = np.arange(1, (window - 1) // 8 + 1)
     per_kernel = rng.integers(1, 4, len(dilations))
@@ -41,7 +41,7 @@ def parameters(window: int, taxels: int) -> tuple[np.ndarray, ...]:
 
 
 def by_definition(sweep: np.ndarray, found: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Dempster et al. 2021, frame by frame: shares above each bias, of digits [T, R, C]."""
+    """Dempster et al. 2021, frame by frame: shares above each bias, of counts [T, R, C]."""
     counts, chosen, dilations, per_kernel, biases = found
     x = sweep.reshape(len(sweep), -1).astype(np.float64)
     taxels, left, shares = iter(np.split(chosen, np.cumsum(counts)[:-1])), iter(biases), []
@@ -56,8 +56,8 @@ def by_definition(sweep: np.ndarray, found: tuple[np.ndarray, ...]) -> np.ndarra
 
 @pytest.mark.parametrize("dtype", KINDS)
 def test_the_graph_is_the_definition(dtype: str):
-    """Kernels, dilations, sums over taxels, padding in turn, shares above biases: any grid, digits and length."""
-    sweep, (rows, cols, window) = digits(dtype)[0], KINDS[dtype]
+    """Kernels, dilations, sums over taxels, alternating padding, shares above biases: any grid, data type and length."""
+    sweep, (rows, cols, window) = raw_counts(dtype)[0], KINDS[dtype]
     found = parameters(window, rows * cols)
     graph = minirocket.transform(SweepFormat(rows, cols, 50.0, window, dtype), found)
     np.testing.assert_allclose(graph_builder.run(graph, sweep[None])[0], by_definition(sweep, found), rtol=0, atol=1e-6)
@@ -66,10 +66,10 @@ def test_the_graph_is_the_definition(dtype: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
-    """Every share, in aeon's order: whole digits exactly, others but where a frame lies on a bias within rounding."""
+    """Every share, in aeon's order: integer counts exactly, others except where a frame equals a bias within rounding."""
     aeon = pytest.importorskip("aeon.transformations.collection.convolution_based")
     monkeypatch.setattr(minirocket, "FEATURES", 1000)
-    given, (rows, cols, window) = digits(dtype), KINDS[dtype]
+    given, (rows, cols, window) = raw_counts(dtype), KINDS[dtype]
     graph = minirocket.transform(SweepFormat(rows, cols, 50.0, window, dtype), minirocket.fitted(given, 5))
     series = np.ascontiguousarray(given.reshape(len(given), window, -1).transpose(0, 2, 1), np.float32)
     want = aeon.MiniRocket(1000, random_state=5).fit(series).transform(series)
@@ -80,7 +80,7 @@ def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
 
 
 def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
-    """The whole of it says what aeon's own classifier says, also of sweeps that are hard to tell apart."""
+    """The whole method answers as aeon's own classifier does, also for sweeps that are hard to separate."""
     aeon = pytest.importorskip("aeon.classification.convolution_based")
     monkeypatch.setattr(minirocket, "FEATURES", 500)
     sweeps = easy(20)
@@ -115,7 +115,7 @@ def test_the_box_gives_the_logits():
 
 
 def test_a_material_not_trained_on_is_never_said():
-    """Its logit is there, far below; the two others are told apart, which scikit-learn does with one row."""
+    """Its logit is there, far below; the two others are separated, for which scikit-learn gives one row."""
     sweeps = easy(20)
     two = sweeps.take(sweeps.labels != 1)
     logits = head(two).logits(sweeps.samples)

@@ -80,11 +80,11 @@ def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
     """Zero padding handles over-flow: what is left at the end makes one step more, and is seen."""
     net = paper_cnn.ImageNetwork(SweepFormat(1, 1, 100.0, window, "float32"), 2, 1.0, 0.0, paper_cnn.PAPER)
     assert net.dense.in_features == 64 * steps[1]
-    digits = torch.rand(1, window, 1, 1)
+    counts = torch.rand(1, window, 1, 1)
     with torch.no_grad():
-        before = net(digits)
-        digits[0, -1] += 100
-        assert not torch.equal(net(digits), before)
+        before = net(counts)
+        counts[0, -1] += 100
+        assert not torch.equal(net(counts), before)
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_the_loop_is_adam_as_the_paper_prints_it():
         torch.manual_seed(3)
         mine = paper_cnn.ImageNetwork(s.format, 2, 0.1, 60.0, replace(paper_cnn.PAPER, dense=8))
         plain = pickle.loads(pickle.dumps(mine))
-    learnt, cost = training.learn(mine, s, r, 7)
+    trained, cost = training.learn(mine, s, r, 7)
     rng = torch.Generator().manual_seed(7)
     order = torch.cat([torch.randperm(6, generator=rng) for _ in range(4)])
     adam = torch.optim.Adam(plain.parameters(), 1e-4, betas=(0.9, 0.999), eps=1e-8)
@@ -107,7 +107,7 @@ def test_the_loop_is_adam_as_the_paper_prints_it():
         loss.backward()
         adam.step()
         assert cost[step] == (step + 1, pytest.approx(loss.item(), rel=1e-5))
-    for have, want in zip(learnt.parameters(), plain.parameters(), strict=True):
+    for have, want in zip(trained.parameters(), plain.parameters(), strict=True):
         torch.testing.assert_close(have, want, rtol=1e-5, atol=1e-7)
 
 
@@ -124,8 +124,8 @@ def test_adversarial_training_sees_the_worse_sweep():
     worse.backward()
     want = [p.grad.clone() for p in net.parameters()]
     net.zero_grad()
-    told = training.backward(net, x, labels, FitRecipe(adversarial=0.1, smoothing=0.0))
-    assert told == pytest.approx(cost.item())
+    loss = training.backward(net, x, labels, FitRecipe(adversarial=0.1, smoothing=0.0))
+    assert loss == pytest.approx(cost.item())
     for p, gradient in zip(net.parameters(), want, strict=True):
         torch.testing.assert_close(p.grad, gradient)
 
@@ -155,18 +155,18 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
         "tactnet2": paper_cnn.build_tactnet2,
         "recurrent": recurrent.build_recurrent,
     }.get(name)
-    digits = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
+    counts = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
     with torch.random.fork_rng():
         torch.manual_seed(0)
         form, plain = skin.FORMAT, network.Compact(skin.FORMAT, 6, 0.1, norm=False)
-        net = build(form, 6, digits) if build else plain
-    check_agrees(training.NetworkModel(net.eval(), ""), digits)
+        net = build(form, 6, counts) if build else plain
+    check_agrees(training.NetworkModel(net.eval(), ""), counts)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_easy_is_learnt(name: str):
-    """Three tones on sweeps of another seed; the cost falls; what was run is told."""
+    """Three tones on sweeps of another seed; the cost falls; what was run is reported."""
     model = train(name, easy(), Effort(share=0.25, paper_steps=40))
     other = easy(seed=9)
     p = softmax(model.logits(other.samples))
@@ -222,7 +222,7 @@ def test_small_sets_are_trained_whole(name: str):
 
 @pytest.mark.slow
 def test_one_sweep_of_each_is_too_little_for_a_discriminant():
-    """Named instead of scikit-learn's own words; copies as the scene varies, or gradient heads, take what there is."""
+    """Refused with a message of ours; augmented copies, or heads trained by gradient, work with what there is."""
     one, labels = np.eye(3), np.arange(3)
     with pytest.raises(FormatError, match="3 sweeps of as many materials are too few for a linear discriminant"):
         closed_form_head(one, labels, one, labels)
@@ -263,8 +263,8 @@ def test_compact_is_what_palpate_train_fits():
             want = same.network()(torch.from_numpy(given.samples.astype(np.float32))).numpy()
         have = model.forms["float"].logits(given.samples)
         np.testing.assert_allclose(have, want - want.mean(1, keepdims=True), rtol=1e-4, atol=1e-3)
-        said = graph_builder.run(graph_builder.with_head(same.trunk(), *same.int8_head()), given.samples)
-        np.testing.assert_allclose(model.logits(given.samples), said, atol=1e-3)
+        int8 = graph_builder.run(graph_builder.with_head(same.trunk(), *same.int8_head()), given.samples)
+        np.testing.assert_allclose(model.logits(given.samples), int8, atol=1e-3)
 
 
 @pytest.mark.slow
@@ -279,7 +279,7 @@ def test_a_window_too_short_is_named():
 
 @pytest.mark.slow
 def test_bfloat16_is_used_where_it_is_asked_for_and_there():
-    """It is told, its answers stay float32 and near, and a processor without it says so."""
+    """It is reported, its answers stay float32 and close, and its absence on a processor is reported too."""
     s = easy(8)
     exact = train("paper-cnn", s, Effort(paper_steps=4))
     rough = train("paper-cnn", s, Effort(paper_steps=4, bfloat16=True))
@@ -323,7 +323,7 @@ def test_the_paper_s_cnn_has_an_int8_form(name: str):
 
 
 def test_forms_are_kept_and_counted(tmp_path: Path):
-    """Logits of the other precision come back from the file as they were, and evaluate tells them beside the others."""
+    """Logits of the other precision come back from the file as they were, and evaluate reports them beside the others."""
     s = easy(12)
     order = np.arange(len(s))
     made_ = fold.run(fold.FoldTask("paper-cnn", BRIEF, 1, order[::2], order[1::2]), s, s.samples)
@@ -331,7 +331,7 @@ def test_forms_are_kept_and_counted(tmp_path: Path):
     again = fold.Fold.load(tmp_path / "fold.npz")
     assert set(again.forms) == {"int8"}
     np.testing.assert_array_equal(again.forms["int8"], made_.forms["int8"])
-    told = evaluate.Result("paper-cnn", "random:2", False, 1, s, [again]).json()["forms"]["int8"]
-    assert told["window"]["right"] == int((made_.forms["int8"].argmax(1) == s.labels[made_.test]).sum())
-    assert told["agreement"] == np.mean(made_.forms["int8"].argmax(1) == made_.logits.argmax(1)).round(4)
-    assert 0 < told["probability_difference"] < 0.2
+    figures = evaluate.Result("paper-cnn", "random:2", False, 1, s, [again]).json()["forms"]["int8"]
+    assert figures["window"]["right"] == int((made_.forms["int8"].argmax(1) == s.labels[made_.test]).sum())
+    assert figures["agreement"] == np.mean(made_.forms["int8"].argmax(1) == made_.logits.argmax(1)).round(4)
+    assert 0 < figures["probability_difference"] < 0.2

@@ -22,7 +22,7 @@ SETS = {"uint8": (4, 4, 90), "int16": (3, 3, 24), "uint16": (1, 1, 20), "float32
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A dictionary that is learnt in no time."""
+    """A dictionary that is learned quickly."""
     for name, value in {"ATOMS": 20, "SAMPLED": 300, "ROUNDS": 3}.items():
         monkeypatch.setattr(sthmp, name, value)
 
@@ -57,7 +57,7 @@ def test_a_patch_of_fewer_atoms_stays_so():
 
 
 def by_loops(sweep: np.ndarray, d: np.ndarray, scale: float) -> np.ndarray:
-    """The features of digits [T, R, C], cell by cell."""
+    """The features of counts [T, R, C], cell by cell."""
     frames, height, width = d.shape[1:]
     steps = range(0, len(sweep) - frames + 1, sthmp.STEP)
     rows, cols = sweep.shape[1] - height + 1, sweep.shape[2] - width + 1
@@ -139,7 +139,7 @@ def test_the_box_gives_the_logits():
 
 
 def test_a_material_not_trained_on_is_never_said():
-    """Its logit is there, far below, and the others are told apart."""
+    """Its logit is there, far below, and the others are separated."""
     sweeps = easy(20)
     two = sweeps.take(sweeps.labels != 1)
     logits = sthmp.train(two, two.samples, 0).logits(sweeps.samples)
@@ -150,7 +150,7 @@ def test_a_material_not_trained_on_is_never_said():
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", SETS)
 def test_any_set_can_be_trained_on(dtype: str):
-    """Grid, length and digits of the user's, even a silent skin: finite logits, the same for the same seed."""
+    """Any grid, length and data type, even a silent skin: finite logits, the same for the same seed."""
     rows, cols, window = SETS[dtype]
     labels = np.arange(12) % 2
     silent = np.full((12, window, rows, cols), 7, dtype)

@@ -81,7 +81,7 @@ def test_sweeps_that_fail_together_count_together():
 
 
 def test_differences_by_hand():
-    """A logit's common part tells nothing; the largest and the mean difference of a probability are of sweeps."""
+    """The common part of logits does not count; the largest and the mean difference of a probability are of sweeps."""
     want = np.float32([[1, 0], [0, 0.1]])
     have = np.float32([[6, 5], [0.3, 0]])
     apart = parity.compare(want, have)
@@ -92,13 +92,13 @@ def test_differences_by_hand():
     assert (apart.logit_difference, apart.logit_mean) == (pytest.approx(0.2, abs=1e-6), pytest.approx(0.1, abs=1e-6))
 
 
-def test_tensors_are_told_as_pytorch_has_them(fitted: Fit):
+def test_tensors_are_reported_as_pytorch_has_them(fitted: Fit):
     """Percentiles and the share beyond reach of each stage, against its responses in PyTorch; weights of seven bits."""
     found = measured(fitted)
     model = fitted.network()
     with torch.no_grad():
-        digits = torch.from_numpy(fitted.held.samples.astype(np.float32))
-        responses = [x.numpy() for x in model.responses(model.prepare(digits))]
+        counts = torch.from_numpy(fitted.held.samples.astype(np.float32))
+        responses = [x.numpy() for x in model.responses(model.prepare(counts))]
     stages = activations(found)
     assert len(stages) == len(responses)
     for layer, x in zip(stages, responses, strict=True):
@@ -137,7 +137,7 @@ def test_a_tap_that_was_moved_is_found(fitted: Fit):
     assert parity.tap_sum(int8) == 1
 
 
-def test_any_quantized_graph_can_be_looked_at(fitted: Fit):
+def test_any_quantized_graph_can_be_compared(fitted: Fit):
     """What onnxruntime quantizes has its twins in the float graph, too, behind the ReLU."""
     reference, _ = quantized_bundle.graphs(fitted)
     int8 = quantize(reference, fitted.train.samples)
@@ -147,7 +147,7 @@ def test_any_quantized_graph_can_be_looked_at(fitted: Fit):
     assert found.tap_sum > 0
 
 
-def test_a_bundle_is_told_without_float(fitted: Fit):
+def test_a_bundle_is_compared_without_float(fitted: Fit):
     """Each tensor against itself, before it is rounded; a graph without int8 is named."""
     reference, int8 = quantized_bundle.graphs(fitted)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels)
@@ -158,15 +158,15 @@ def test_a_bundle_is_told_without_float(fitted: Fit):
         parity.measure(reference, fitted.held.samples, fitted.held.labels)
 
 
-def test_the_command_tells_fits_and_bundles(fitted: Fit, tmp_path: Path):
+def test_the_command_reports_fits_and_bundles(fitted: Fit, tmp_path: Path):
     """Table and JSON of both; a set of another kind is named."""
     fitted.save(tmp_path / "fit.npz")
     quantized_bundle.export(fitted, tmp_path / "bundle", "close", "1", "")
-    table = quantized_bundle.compared(tmp_path / "fit.npz", fitted.held, tmp_path / "told.json")
-    told = json.loads((tmp_path / "told.json").read_bytes())
-    assert told["lost"]["total"] == len(fitted.held)
-    assert len(told["layers"]) == len(measured(fitted).layers)
-    assert told["set"] == "close"
+    table = quantized_bundle.compared(tmp_path / "fit.npz", fitted.held, tmp_path / "parity.json")
+    figures = json.loads((tmp_path / "parity.json").read_bytes())
+    assert figures["lost"]["total"] == len(fitted.held)
+    assert len(figures["layers"]) == len(measured(fitted).layers)
+    assert figures["set"] == "close"
     assert [line.split()[0] for line in table.splitlines()[:3]] == ["labels", "float", "first"]
     assert "holds no float form" in quantized_bundle.compared(tmp_path / "bundle", fitted.held)
     with pytest.raises(FormatError, match=r"fit.npz is of 2x2 uint8 .* name a set of the same kind"):

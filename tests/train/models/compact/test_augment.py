@@ -87,7 +87,7 @@ def test_a_shift_reads_between_rows_and_fills_the_edge():
 
 @pytest.mark.parametrize("rows", [1, 16])
 def test_a_line_of_taxels_is_not_moved(rows: int):
-    """Where there is one row, or one taxel in each, nothing tells how far apart they are in the sliding."""
+    """Where there is one row, or one taxel in each, their distance along the slide is unknown."""
     x = sweeps()
     assert torch.equal(varied(x, rows, shift=1.0, moved=1.0), x)
 
@@ -201,7 +201,7 @@ def test_what_is_clipped_is_cut_off_above():
     [(1, 1, 1), (1, 1, 2), (3, 9, 20), (16, 16, 128), (1, 5, 33), (2, 6, 3000), (6, 12, 21)],
 )
 def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames: int):
-    """One taxel, one frame, odd lengths: with every name up, silent sweeps stay finite and keep their shape."""
+    """One taxel, one frame, odd lengths: with every parameter on, silent sweeps stay finite and keep their shape."""
     everything = replace(Augmentation(), **dict.fromkeys(NAMES, 0.5))
     x = torch.zeros(5, taxels, frames)
     now = augment(x, rows, everything, torch.Generator().manual_seed(7))

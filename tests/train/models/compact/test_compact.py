@@ -18,7 +18,7 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.models import methods
 from train.models.compact import fit, graph, network, spectrum
-from train.models.compact import methods as family
+from train.models.compact import methods as compact_methods
 from train.models.compact.architectures import ARCHITECTURES, DEFAULT, Architecture
 from train.models.compact.augment import Augmentation
 from train.models.compact.fit import Fit, FitRecipe
@@ -29,13 +29,13 @@ from train.onnx_tools import graph_builder
 
 SMALL = Architecture((6, 8, 8), 8, 2)
 LIMITS = {"compact-10k": (1e6, 24), "compact-100k": (12e6, 96)}
-"""Multiply-accumulates and kilobytes that the issue allows."""
-RUNGS = {name: shape for name, shape in ARCHITECTURES.items() if shape.channels}
-"""Those that have stages."""
+"""Multiply-accumulates and kilobytes that are allowed."""
+CONVOLUTIONAL = {name: shape for name, shape in ARCHITECTURES.items() if shape.channels}
+"""Those with stages."""
 
 
 def drawn(form: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
-    """Digits of n sweeps: every taxel with an offset of its own, a tone and noise; none trembles far more than others."""
+    """Raw counts of n sweeps: every taxel with an offset of its own, a tone and noise; none is much noisier than others."""
     rng, t = np.random.default_rng(seed), np.arange(form.window)[:, None, None]
     taxels = (n, 1, form.rows, form.cols)
     x = rng.uniform(80, 120, taxels) + rng.uniform(8, 14, taxels) * np.sin(t * rng.uniform(0.6, 1.2, taxels))
@@ -55,10 +55,10 @@ def trunks(
     return model, *(graph.trunk_graph(form, 0.1, weights, architecture, ranges, **asked) for ranges in (None, found))
 
 
-def seen(model: Compact, digits: np.ndarray) -> np.ndarray:
-    """What PyTorch's head sees of the digits."""
+def seen(model: Compact, counts: np.ndarray) -> np.ndarray:
+    """What PyTorch's head sees of the counts."""
     with torch.no_grad():
-        return model.head_input(torch.from_numpy(digits.astype(np.float32))).numpy()
+        return model.head_input(torch.from_numpy(counts.astype(np.float32))).numpy()
 
 
 @pytest.fixture(scope="module")
@@ -70,16 +70,16 @@ def fitted() -> Fit:
 @pytest.mark.parametrize(("rows", "cols", "window", "dtype"),
                          [(4, 4, 1500, "uint8"), (3, 3, 150, "int16"), (1, 1, 20, "uint16"), (16, 1, 128, "float32")])  # fmt: skip
 def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str):
-    """Any digits and window: float to rounding, int8 near it; a silent sweep gives the same as one at another level."""
+    """Any data type and window: float up to rounding, int8 close to it; a silent sweep gives the same as one at another level."""
     form = SweepFormat(rows, cols, 100.0, window, dtype)
     model, plain, int8 = trunks(form)
-    digits = drawn(form, seed=1)
-    want = seen(model, digits)
-    np.testing.assert_allclose(graph_builder.run(plain, digits), want, atol=1e-3)
-    have = graph_builder.run(int8, digits)
+    counts = drawn(form, seed=1)
+    want = seen(model, counts)
+    np.testing.assert_allclose(graph_builder.run(plain, counts), want, atol=1e-3)
+    have = graph_builder.run(int8, counts)
     assert have.shape == want.shape
     assert np.abs(have - want).mean() < 0.1
-    silent = np.stack([np.full(digits.shape[1:], level, dtype) for level in (0, 90)])
+    silent = np.stack([np.full(counts.shape[1:], level, dtype) for level in (0, 90)])
     quiet = graph_builder.run(int8, silent)
     np.testing.assert_array_equal(quiet[0], quiet[1])
     assert np.isfinite(quiet).all()
@@ -93,9 +93,9 @@ def test_no_offset_moves_a_bit_of_bytes():
     first = next(v for v in values.values() if v.dtype == np.int8 and v.ndim == 3)
     np.testing.assert_array_equal(first.sum(axis=2, dtype=int), 0)
     assert np.abs(first).max() == graph.MAX_TAP
-    digits = drawn(form, 2)
+    counts = drawn(form, 2)
     offset = np.random.default_rng(1).integers(0, 60, (2, 1, 4, 4)).astype(np.uint8)
-    np.testing.assert_array_equal(graph_builder.run(int8, digits + offset), graph_builder.run(int8, digits))
+    np.testing.assert_array_equal(graph_builder.run(int8, counts + offset), graph_builder.run(int8, counts))
 
 
 def test_rounding_to_zero_sums_moves_as_little_as_it_can():
@@ -120,21 +120,21 @@ def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: s
     """Row d stays to the bit whatever comes after (d + 1) / 10 of the window, and hears what came just before."""
     form = SweepFormat(2, 2, 100.0, window, dtype)
     trunk, whole = trunks(form, tenths=True)[1 + int8], trunks(form)[1 + int8]
-    digits, other = drawn(form, 3), drawn(form, 3, seed=7)
-    want = graph_builder.run(trunk, digits)
+    counts, other = drawn(form, 3), drawn(form, 3, seed=7)
+    want = graph_builder.run(trunk, counts)
     assert want.shape == (3, 10, 22)
-    np.testing.assert_allclose(want[:, -1], graph_builder.run(whole, digits), atol=2e-5)
+    np.testing.assert_allclose(want[:, -1], graph_builder.run(whole, counts), atol=2e-5)
     for d in range(9):
         end = window * (d + 1) // 10
-        have = graph_builder.run(trunk, np.concatenate([digits[:, :end], other[:, end:]], axis=1))
+        have = graph_builder.run(trunk, np.concatenate([counts[:, :end], other[:, end:]], axis=1))
         np.testing.assert_array_equal(have[:, : d + 1], want[:, : d + 1])
         held = graph_builder.run(
-            trunk, np.concatenate([digits[:, :end], np.repeat(digits[:, end - 1 : end], window - end, 1)], 1)
+            trunk, np.concatenate([counts[:, :end], np.repeat(counts[:, end - 1 : end], window - end, 1)], 1)
         )
         np.testing.assert_array_equal(held[:, d], want[:, d])
     if window == 1500:
         assert not np.array_equal(have[:, 9], want[:, 9])
-        early = digits.copy()
+        early = counts.copy()
         early[:, 1200:1300] = other[:, 1200:1300]
         assert (graph_builder.run(trunk, early)[:, 8:] != want[:, 8:]).any(axis=2).all()
 
@@ -154,14 +154,14 @@ def test_the_first_kernels_do_not_hear_the_mains():
         assert (short.convs[0](hum) - short.convs[0].bias[:, None]).abs().max() > 0.1
 
 
-def test_a_trembling_taxel_is_turned_down():
+def test_a_noisy_taxel_is_attenuated():
     """To three times the fifth of sixteen; the others stay to the bit, and all do where only a few are touched."""
     x = torch.randn(2, 16, 1500, generator=torch.Generator().manual_seed(0))
     loud = x.clone()
     loud[0, 3] *= 40
     have = network.limit_noise(loud)
-    trembling = (have[:, :, 1::10] - have[:, :, :-1:10]).abs().mean(2)
-    assert trembling[0, 3] == pytest.approx(3 * trembling[0].sort(descending=True).values[4].item(), rel=1e-5)
+    noise = (have[:, :, 1::10] - have[:, :, :-1:10]).abs().mean(2)
+    assert noise[0, 3] == pytest.approx(3 * noise[0].sort(descending=True).values[4].item(), rel=1e-5)
     others = torch.arange(16) != 3
     assert torch.equal(have[:, others], x[:, others])
     assert torch.equal(have[1], x[1])
@@ -171,30 +171,30 @@ def test_a_trembling_taxel_is_turned_down():
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
-def test_int8_turns_down_as_the_network_does(dtype: str):
-    """A noisy taxel changes the graphs' features as PyTorch's, and by much less than without the cap."""
+def test_int8_attenuates_as_the_network_does(dtype: str):
+    """A noisy taxel changes the graphs' features as PyTorch's, and by much less than without the limit."""
     form = SweepFormat(4, 4, 750.0, 600, dtype)
     model, plain, int8 = trunks(form)
-    digits = drawn(form, 4)
-    digits[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, digits.shape[:2])
-    want = seen(model, digits)
-    np.testing.assert_allclose(graph_builder.run(plain, digits), want, atol=1e-3)
-    assert np.abs(graph_builder.run(int8, digits) - want).mean() < 0.1
+    counts = drawn(form, 4)
+    counts[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, counts.shape[:2])
+    want = seen(model, counts)
+    np.testing.assert_allclose(graph_builder.run(plain, counts), want, atol=1e-3)
+    assert np.abs(graph_builder.run(int8, counts) - want).mean() < 0.1
 
 
 def test_tenths_are_means_of_what_was_known():
     """In float: the first half's features are those of a window of half the length, as both see the same responses."""
     form = SweepFormat(2, 2, 100.0, 800, "uint8")
     model, trunk, _ = trunks(form, tenths=True)
-    digits = drawn(form, 3)
-    half = graph_builder.run(trunk, digits)[:, 4]
-    np.testing.assert_allclose(half, seen(model, digits[:, :400]), atol=1e-3)
+    counts = drawn(form, 3)
+    half = graph_builder.run(trunk, counts)[:, 4]
+    np.testing.assert_allclose(half, seen(model, counts[:, :400]), atol=1e-3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RUNGS)
-def test_a_rung_costs_what_it_says(name: str):
-    """Weights of the float graph, multiply-accumulates of its convolutions and head; within what the issue allows."""
+@pytest.mark.parametrize("name", CONVOLUTIONAL)
+def test_a_size_costs_what_it_states(name: str):
+    """Weights of the float graph, multiply-accumulates of its convolutions and head; within what is allowed."""
     cost = ARCHITECTURES[name].cost(skin.FORMAT, 6)
     assert cost.weights == pytest.approx(1000 * int(name[:-1]), rel=0.45)
     plain = Compact(skin.FORMAT, 6, 0.1, norm=False, architecture=ARCHITECTURES[name]).eval().graph()
@@ -243,9 +243,9 @@ def test_the_method_is_its_int8_graph():
     assert model.features(s.samples[:2], tenths=True).shape == (2, 10, size)
 
 
-def test_the_family_is_one_recipe_in_several_shapes():
+def test_all_sizes_share_one_recipe():
     """Names in order of size; `compact` is one of the sizes that may lose all stages; effort reaches all."""
-    made = {m.name: m for m in family.methods(Effort(share=0.01))}
+    made = {m.name: m for m in compact_methods.methods(Effort(share=0.01))}
     assert list(made) == [*(f"compact-{size}" for size in ARCHITECTURES), "compact"]
     assert made["compact"].train.keywords["architecture"] == replace(ARCHITECTURES["20k"], fewest=0)
     assert {name: shape.fewest for name, shape in ARCHITECTURES.items()} == dict.fromkeys(ARCHITECTURES, 1) | {
@@ -296,26 +296,26 @@ def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, ban
 def test_a_cut_network_gives_what_its_first_stages_gave():
     """Each stage as it was before; the spectrum behind them, or nothing but that."""
     model, _, _ = trunks(SweepFormat(2, 2, 100.0, 64, "uint8"))
-    digits = drawn(model.form)
+    counts = drawn(model.form)
     model.architecture = replace(SMALL, spectrum=True)
-    every = seen(model, digits)
+    every = seen(model, counts)
     assert every.shape == (6, 27)
     for depth, banded, columns in ((2, False, FIRST | SECOND), (1, True, FIRST | BANDS), (0, True, BANDS)):
         less = model.cut(depth, banded)
-        np.testing.assert_array_equal(seen(less, digits), every[:, columns])
+        np.testing.assert_array_equal(seen(less, counts), every[:, columns])
         assert less.architecture.stages(64) == SMALL.stages(64)[:depth]
         assert less.architecture.zero_sum(64) == SMALL.zero_sum(64)
 
 
 @pytest.fixture(scope="module")
-def bare() -> family.CompactModel:
+def bare() -> compact_methods.CompactModel:
     """The method of the box where its stages say nothing about what was held out."""
 
     def blind(model: Compact, *others: object) -> fit.HeadInputs:
-        told, size = seen_by_heads(model, *others), sum(model.architecture.channels)
-        for _, held in told:
+        inputs, size = seen_by_heads(model, *others), sum(model.architecture.channels)
+        for _, held in inputs:
             held[:, :size] = 9 * np.random.default_rng(0).standard_normal((len(held), size))
-        return told
+        return inputs
 
     seen_by_heads, s = fit._head_inputs, easy()
     with pytest.MonkeyPatch.context() as patch:
@@ -324,37 +324,37 @@ def bare() -> family.CompactModel:
 
 
 @pytest.mark.slow
-def test_the_box_s_own_may_end_without_a_convolution(bare: family.CompactModel):
-    """Then nothing in its graph is int8, its float form says the same, and it learns what is easy."""
+def test_compact_may_end_without_a_convolution(bare: compact_methods.CompactModel):
+    """Then nothing in its graph is int8, its float form gives the same, and it learns what is easy."""
     assert bare.fit.architecture == DEFAULT.cut(0, spectrum=True)
     assert bare.fit.ranges.responses == ()
     done = {n.op_type for n in bare.graph().graph.node}
     assert not {"Conv", "QuantizeLinear", "DequantizeLinear", "MatMulInteger"} & done
     other = easy(seed=9).samples
-    said = bare.logits(other)
-    np.testing.assert_array_equal(said, graph_builder.run(bare.graph(), other))
-    np.testing.assert_allclose(bare.forms["float"].logits(other), said, atol=2e-3)
-    np.testing.assert_allclose(graph_builder.run(bare.forms["float"].graph(), other), said, atol=2e-3)
-    assert np.mean(said.argmax(1) == easy(seed=9).labels) > 0.9
+    logits = bare.logits(other)
+    np.testing.assert_array_equal(logits, graph_builder.run(bare.graph(), other))
+    np.testing.assert_allclose(bare.forms["float"].logits(other), logits, atol=2e-3)
+    np.testing.assert_allclose(graph_builder.run(bare.forms["float"].graph(), other), logits, atol=2e-3)
+    assert np.mean(logits.argmax(1) == easy(seed=9).labels) > 0.9
     assert bare.features(other[:2], tenths=True).shape == (2, 10, bare.fit.bands)
 
 
-def test_a_fit_without_a_convolution_survives_its_file(bare: family.CompactModel, tmp_path: Path):
-    """It says the same, to the bit, in PyTorch and in its graphs."""
+def test_a_fit_without_a_convolution_survives_its_file(bare: compact_methods.CompactModel, tmp_path: Path):
+    """It gives the same bits in PyTorch and in its graphs."""
     bare.fit.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
     assert (again.architecture, again.ranges, again.bands) == (bare.fit.architecture, bare.fit.ranges, 5)
-    digits = easy(2).samples
+    counts = easy(2).samples
     with torch.no_grad():
-        x = torch.from_numpy(digits.astype(np.float32))
+        x = torch.from_numpy(counts.astype(np.float32))
         assert torch.equal(again.network()(x), bare.fit.network()(x))
     for tenths in (False, True):
         assert again.trunk(tenths=tenths) == bare.fit.trunk(tenths=tenths)
         assert again.trunk(int8=False, tenths=tenths) == again.trunk(tenths=tenths)
 
 
-def test_copies_are_digits_of_the_scene():
-    """Nothing varies: the very sweeps, twice. The default scene: others, of the same type, the same of the same seed."""
+def test_copies_are_augmented_raw_counts():
+    """No augmentation: the same sweeps, twice. The default one: others, of the same type, the same for the same seed."""
     for s in (easy(4), replace(easy(4), samples=easy(4).samples.astype(np.float32) / 7)):
         model = Compact(s.format, 3, 0.1, architecture=SMALL)
         still = Augmentation(shift=0, gain=0, gains=0, silent=0, damped=0, colour=0, noise=0)

@@ -1,4 +1,4 @@
-"""Networks of the compact family and their training: shapes, invariance, augmentation, a fit on an easy set."""
+"""Compact networks and their training: shapes, invariance, augmentation, a fit on an easy set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The spectrum against its definition, in PyTorch and in graphs: what it hears, what it is deaf to, when it is there."""
+"""The spectrum against its definition, in PyTorch and in graphs: what it responds to, what it ignores, when there is one."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FORMS = {
 
 
 def drawn(form: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
-    """Digits of n sweeps: noise that all taxels feel, and some of their own; none trembles far more than others."""
+    """Raw counts of n sweeps: noise that all taxels feel, and some of their own; none is much noisier than others."""
     rng = np.random.default_rng(seed)
     own = rng.standard_normal((n, form.window, form.rows, form.cols))
     x = 90 + 8 * rng.standard_normal((n, form.window, 1, 1)) + 4 * own
@@ -53,69 +53,69 @@ def trunk(form: SweepFormat, scale: float = 0.1, tenths: bool = False) -> onnx.M
     return graph.trunk_graph(form, scale, {}, BARE, tenths=tenths)
 
 
-def heard(form: SweepFormat, digits: np.ndarray, scale: float = 0.1) -> np.ndarray:
+def heard(form: SweepFormat, counts: np.ndarray, scale: float = 0.1) -> np.ndarray:
     """What PyTorch's head sees where there is nothing but the spectrum."""
     with torch.no_grad():
         model = Compact(form, 3, scale, norm=False, architecture=BARE)
-        return model.head_input(torch.from_numpy(digits.astype(np.float32))).numpy()
+        return model.head_input(torch.from_numpy(counts.astype(np.float32))).numpy()
 
 
 def turned(x: np.ndarray) -> np.ndarray:
     """What each taxel of [n, T, R * C] is multiplied with: more than three times the fifth of sixteen is turned down."""
     step = max(x.shape[1] // 150, 1)
-    trembling = np.abs(x[:, 1::step] - x[:, :-1:step]).mean(1, keepdims=True)
-    limit = 3 * -np.sort(-trembling, axis=2)[:, :, [x.shape[2] // 4]]
-    return np.minimum(limit / trembling, 1)
+    noise = np.abs(x[:, 1::step] - x[:, :-1:step]).mean(1, keepdims=True)
+    limit = 3 * -np.sort(-noise, axis=2)[:, :, [x.shape[2] // 4]]
+    return np.minimum(limit / noise, 1)
 
 
-def defined(form: SweepFormat, digits: np.ndarray, mains: bool, scale: float = 0.1, cap: bool = True) -> np.ndarray:
+def defined(form: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0.1, limited: bool = True) -> np.ndarray:
     """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128.
 
     Of each tenth of the taxels' mean what offset and mains fit best is taken away; Hann's window, a transform at half
     bins, the mean of each band.
     """
-    x, length = digits.reshape(len(digits), form.window, -1).astype(np.float64), form.window // 10
-    wave = scale * (x * turned(x) if cap else x).mean(2)[:, : 10 * length].reshape(-1, length)
+    x, length = counts.reshape(len(counts), form.window, -1).astype(np.float64), form.window // 10
+    wave = scale * (x * turned(x) if limited else x).mean(2)[:, : 10 * length].reshape(-1, length)
     turn = 2 * np.pi * 50 / form.rate_hz * np.arange(length)
     fits = np.stack([np.ones(length), np.sin(turn), np.cos(turn)][: 3 if mains else 1], axis=1)
     wave = wave - (fits @ np.linalg.lstsq(fits, wave.T, rcond=None)[0]).T
     window = np.hanning(length + 2)[1:-1]
     power = np.abs(np.fft.fft(wave * window, 2 * length)) ** 2 / (window**2).sum()
     edges = sorted({round(2 * ((length + 1) / 2) ** (i / 24)) for i in range(25)})
-    bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(len(digits), 10, -1)
+    bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(len(counts), 10, -1)
     return np.log(bands.cumsum(1) / np.arange(1, 11)[:, None] + 1e-4)
 
 
 @pytest.mark.parametrize(("form", "mains"), FORMS.values(), ids=FORMS)
 def test_the_spectrum_is_that_of_its_definition(form: SweepFormat, mains: bool):
     """In PyTorch, in the graph, in the graph of tenths; the mains are taken away where a tenth holds two periods."""
-    digits = drawn(form)
-    want = defined(form, digits, mains)
-    rows, whole = graph_builder.run(trunk(form, tenths=True), digits), graph_builder.run(trunk(form), digits)
+    counts = drawn(form)
+    want = defined(form, counts, mains)
+    rows, whole = graph_builder.run(trunk(form, tenths=True), counts), graph_builder.run(trunk(form), counts)
     assert rows.shape == want.shape == (2, 10, spectrum.count(form))
     np.testing.assert_allclose(rows, want, atol=2e-3)
     np.testing.assert_allclose(whole, want[:, -1], atol=2e-3)
-    np.testing.assert_allclose(heard(form, digits), whole, atol=1e-3)
+    np.testing.assert_allclose(heard(form, counts), whole, atol=1e-3)
     if mains:
-        assert np.abs(defined(form, digits, False) - want).max() > 0.1
+        assert np.abs(defined(form, counts, False) - want).max() > 0.1
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
-def test_a_noisy_taxel_is_turned_down_as_for_the_trunk(dtype: str):
-    """Behind the trunk's own features, in float and in int8; without the cap it would be heard."""
+def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
+    """Behind the trunk's own features, in float and in int8; without the limit it would be measured."""
     form = SweepFormat(4, 4, 750.0, 600, dtype)
-    digits = drawn(form)
-    digits[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, digits.shape[:2])
-    want = defined(form, digits, True)
-    assert turned(digits.reshape(2, 600, 16).astype(float)).min() < 0.8
-    assert np.abs(defined(form, digits, True, cap=False) - want).max() > 0.3
-    np.testing.assert_allclose(heard(form, digits), want[:, -1], atol=2e-3)
+    counts = drawn(form)
+    counts[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, counts.shape[:2])
+    want = defined(form, counts, True)
+    assert turned(counts.reshape(2, 600, 16).astype(float)).min() < 0.8
+    assert np.abs(defined(form, counts, True, limited=False) - want).max() > 0.3
+    np.testing.assert_allclose(heard(form, counts), want[:, -1], atol=2e-3)
     plain = Compact(form, 3, 0.1, norm=False, architecture=SMALL).eval()
-    weights, found, size = plain.weights(), plain.ranges(digits), want.shape[2]
+    weights, found, size = plain.weights(), plain.ranges(counts), want.shape[2]
     for ranges in (None, found):
         for tenths in (False, True):
             both, alone = (
-                graph_builder.run(graph.trunk_graph(form, 0.1, weights, shape, ranges, tenths), digits)
+                graph_builder.run(graph.trunk_graph(form, 0.1, weights, shape, ranges, tenths), counts)
                 for shape in (SMALL.cut(3, True), SMALL)
             )
             np.testing.assert_array_equal(both[..., :-size], alone)
@@ -126,30 +126,30 @@ def test_a_noisy_taxel_is_turned_down_as_for_the_trunk(dtype: str):
     ("rate_hz", "window", "deaf"), [(750.0, 1500, True), (200.0, 450, True), (750.0, 200, False), (150.0, 450, False)]
 )
 def test_the_hum_of_the_mains_changes_nothing(rate_hz: float, window: int, deaf: bool):
-    """50 Hz of any phase and any strength on each taxel, where it can be told; 60 Hz is heard everywhere."""
+    """50 Hz of any phase and any strength on each taxel, where it can be separated; 60 Hz is measured everywhere."""
     form = SweepFormat(2, 2, rate_hz, window, "float32")
-    digits, rng = drawn(form), np.random.default_rng(1)
+    counts, rng = drawn(form), np.random.default_rng(1)
     strength, phase = rng.uniform(35, 45, (2, 1, 2, 2)), rng.uniform(0, 1, (2, 1, 1, 1))
     for hz, silent in ((50.0, deaf), (60.0, False)):
         hum = strength * np.sin(2 * np.pi * (hz / rate_hz * np.arange(window)[:, None, None] + phase))
-        hummed = (digits + hum).astype(np.float32)
+        hummed = (counts + hum).astype(np.float32)
         for ask in (heard, lambda form, x: graph_builder.run(trunk(form, tenths=True), x)):
-            apart = np.abs(ask(form, hummed) - ask(form, digits)).max(-1)
+            apart = np.abs(ask(form, hummed) - ask(form, counts)).max(-1)
             assert (apart < 5e-3).all() if silent else (apart > 0.5).all()
 
 
 def test_later_frames_and_offsets_do_not_matter():
-    """Row d is of the first d + 1 tenths alone, to the bit; what is left over at the end is not looked at; a skin that
+    """Row d is of the first d + 1 tenths alone, to the bit; frames left over at the end are not used; a skin that
     is loaded more has the same spectrum."""
-    digits = drawn(ODD)
-    held, late = digits.copy(), digits.copy()
+    counts = drawn(ODD)
+    held, late = counts.copy(), counts.copy()
     held[:, 64:], late[:, 160:] = held[:, 63:64], 91
-    a, b, c, d = (graph_builder.run(trunk(ODD, tenths=True), x) for x in (digits, held, late, digits + np.int16(300)))
+    a, b, c, d = (graph_builder.run(trunk(ODD, tenths=True), x) for x in (counts, held, late, counts + np.int16(300)))
     np.testing.assert_array_equal(a[:, :4], b[:, :4])
     assert (np.abs(a[:, 4:] - b[:, 4:]).max(2) > 1e-3).all()
     np.testing.assert_array_equal(a, c)
     np.testing.assert_allclose(a, d, atol=5e-3)
-    np.testing.assert_allclose(heard(ODD, digits), heard(ODD, digits + np.int16(300)), atol=5e-3)
+    np.testing.assert_allclose(heard(ODD, counts), heard(ODD, counts + np.int16(300)), atol=5e-3)
 
 
 @pytest.mark.parametrize("name", FORMS)
