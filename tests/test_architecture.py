@@ -176,6 +176,7 @@ def test_every_test_asserts(path: Path):
     assert not [test.name for test in tests if test.name.startswith("test_") and not asserts(test)]
 
 
+@pytest.mark.slow
 def test_each_class_name_stands_once():
     """A class name says which class is meant: none stands in two modules, tests included."""
     found: dict[str, list[str]] = {}

@@ -440,6 +440,7 @@ def test_a_user_who_needs_a_password_for_sudo_is_refused(
         host.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) NOPASSWD: ALL\n")
 
 
+@pytest.mark.slow
 def test_another_system_is_refused_with_what_is_needed():
     """Not Debian, another architecture, /opt on its own file system, an old Python: a line says what is needed."""
     code = """

@@ -13,6 +13,8 @@ from tests.factories import nspawn
 from tests.factories.emulated_machines import ROOT
 from tests.factories.nspawn import CABLED, PALPATE, SIM, SITE, STREAMS, WAIT_S, Machine, Service
 
+pytestmark = pytest.mark.slow
+
 pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 

@@ -24,6 +24,8 @@ from appliance.bundle import bundle
 from tests.factories.nspawn import CABLED, PALPATE, SITE, STREAMS, Machine, Service
 from train.export.sign import sign
 
+pytestmark = pytest.mark.slow
+
 pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 CURSED = """

@@ -338,6 +338,7 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
     context.close()
 
 
+@pytest.mark.slow
 def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypatch: pytest.MonkeyPatch):
     """It accepts the request and never answers: the page does not wait for it."""
     context, ended = browser.new_context(), threading.Event()

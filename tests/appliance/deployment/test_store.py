@@ -117,6 +117,7 @@ def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
         box.store.rollback()
 
 
+@pytest.mark.slow
 def test_deploying_again_what_runs_changes_nothing(box: Delivery):
     """A committed bundle stays committed; one on trial gets three new starts."""
     one = box.committed(1)
@@ -329,6 +330,7 @@ def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
     assert os.listdir(box.store.bundles.folder) == [one]
 
 
+@pytest.mark.slow
 def test_leftovers_and_old_bundles_go_at_the_next_install(box: Delivery):
     """Incomplete folders are removed, and bundles that nothing goes back to."""
     shas = [box.committed(n) for n in range(1, 5)]

@@ -405,6 +405,7 @@ def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
     return out
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.tuples(gaps, gaps, gaps), st.integers(20, 5000))
 def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) -> None:

@@ -393,6 +393,7 @@ def test_steps_begin_with_a_new_enumeration():
     assert [int(s.frames.seq[0]) - (1 << EPOCH_BITS) for s in steps_of(bench)] == [500]
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(st.sampled_from(list(EdgeKind)), st.booleans(), st.integers(1, 3000), st.integers(0, 8)), max_size=30

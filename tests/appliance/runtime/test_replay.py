@@ -81,6 +81,7 @@ def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle: bundl
     assert outcomes == [f"sweep-{n:06d}.npy: the same" for n in range(1, SWEEPS + 1)] + ["30 sweeps: 30 the same"]
 
 
+@pytest.mark.slow
 def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundle: bundle.Bundle):
     """A single file is fused with the earlier ones beside it, and with no others."""
     folder, heard = in_service

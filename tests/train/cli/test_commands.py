@@ -16,6 +16,7 @@ from train.data import sets
 from train.models.compact.fit import Fit
 
 
+@pytest.mark.slow
 def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """What was not trained on is written as a set, recordings kept; together it is everything."""
     easy(20, pieces=2).save(tmp_path / "easy.npz")
@@ -57,6 +58,7 @@ def test_an_error_of_the_project_is_one_line(
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
     """`palpate-train methods | head -1`: exit code 1, and nothing on the error stream."""
     command = [sys.executable, "-m", "train", "methods"]

@@ -132,6 +132,7 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
         summary.describe(str(tmp_path))
 
 
+@pytest.mark.slow
 def test_what_is_known_can_be_loaded():
     """Every simulated set in the list has as many sweeps as it states (the large one: sixty for each of its scenes)."""
     stated = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
@@ -140,6 +141,7 @@ def test_what_is_known_can_be_loaded():
     assert len(sets.load("sim:T-HARD:1001-1002")) == 120
 
 
+@pytest.mark.slow
 def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """`sets` lists, `describe` describes several, `view` writes a picture and prints its path."""
     command()

@@ -101,6 +101,7 @@ def test_aeon_runs_what_was_trained(tmp_path: Path):
     assert (np.random.get_state()[1] == state).all()
 
 
+@pytest.mark.slow
 def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Both commands pack the same bundle of a method, measure it with the same function, and take size, time and memory
     from one record."""

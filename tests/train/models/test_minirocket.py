@@ -79,6 +79,7 @@ def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
     assert off.max() <= 2 / (window - 8 * ((window - 1) // 8))
 
 
+@pytest.mark.slow
 def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
     """The whole method answers as aeon's own classifier does, also for sweeps that are hard to separate."""
     aeon = pytest.importorskip("aeon.classification.convolution_based")

@@ -229,6 +229,7 @@ def test_dots_are_named_for_those_who_do_not_see_them(seen: BrowsedChart):
     assert seen.page.get_by_label("log of the error").count() == 1
 
 
+@pytest.mark.slow
 def test_the_table_is_sorted_by_what_was_chosen(seen: BrowsedChart):
     """By accuracy first, by cost when asked; the head shows which."""
     by_accuracy = sorted(DOTS, key=lambda one: (-one["accuracy"]["hard"]["mean"], one["ms_p50"]))

@@ -159,6 +159,7 @@ def test_a_page_shows_every_figure_of_its_results(name: str):
         assert page.count("<table>") == page.count('<div class="wide"><table>')
 
 
+@pytest.mark.slow
 def test_terminal_and_page_say_the_same_of_a_choice():
     """Every sentence stands in one line of the terminal, with nothing escaped; the table has a line for each model."""
     text = selection_report.text(choice_data.choice())

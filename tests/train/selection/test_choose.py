@@ -214,6 +214,7 @@ def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
     json.dumps(choice.json(asked()), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_the_nested_figure_is_not_optimistic(fakes):
     """Of sixteen that only guess the best one looks good; the choice, judged on what it has not seen, is a guess."""
     known = {f"g{i}-": Method(f"g{i}-", "guesses", "raw", partial(guess, number=i)) for i in range(16)}
@@ -342,6 +343,7 @@ def test_a_rate_that_is_needed_is_kept(fakes):
     assert [p["fine"] for p in found["rate"]["points"]] == [True, False, False]
 
 
+@pytest.mark.slow
 def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported(fakes):
     """Sixty frames are more than needed; the fake refuses fewer than four, and the curve says so."""
     found = reduced(two(), reduce=("window",))

@@ -139,6 +139,7 @@ def test_positions_are_held_out_where_there_are_several():
     assert not set(made.train.groups["position"]) & set(made.held.groups["position"])
 
 
+@pytest.mark.slow
 def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
     """Weights, sweeps and description come back; another file is refused by name."""
     fitted.save(tmp_path / "fit.npz")
