@@ -212,12 +212,12 @@ def run_align(args: argparse.Namespace, open_devices: OpenDevices) -> int:
 
     settings = load_settings(args)
     current = load_bundle(settings)
-    devices = open_devices(lambda: current.format)
+    devices, stopped = open_devices(lambda: current.format), stop_flag()  # before anybody can read the page's address
     with ExitStack() as stack:
         pages = [stack.enter_context(Page(args.web, devices.clock))] if args.web is not None else []
         screen = stack.enter_context(Screen(sys.stdout, devices.clock, *(page.address for page in pages)))
         displays: list[Display] = [screen, *pages]
-        live.run(devices.wire(settings).sensor, current, devices, displays, stop_flag())
+        live.run(devices.wire(settings).sensor, current, devices, displays, stopped)
     return 0
 
 
