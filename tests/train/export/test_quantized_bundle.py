@@ -275,10 +275,10 @@ def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path:
 def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
     """Other labels from the box than from the int8 model are refused, with how many."""
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
-    assert "held-out" in pack.training_logits(packed, fitted.held, logits, "held-out")
+    assert "held-out" in pack.judge(packed, fitted.held, logits, "held-out")
     logits[:2] = -logits[:2]
     with pytest.raises(ExportRefused, match="labels 2 of 24 held-out sweeps otherwise"):
-        pack.training_logits(packed, fitted.held, logits, "held-out")
+        pack.judge(packed, fitted.held, logits, "held-out")
 
 
 def test_a_material_never_recognised_is_refused(fitted: Fit):
