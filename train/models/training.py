@@ -152,11 +152,7 @@ def learn(
     order = torch.cat([torch.randperm(n, generator=rng) for _ in range(rounds)])[: recipe.steps * recipe.batch]
     model = model.to(device)
     optimizer = torch.optim.AdamW(model.parameters(), recipe.peak_rate, weight_decay=recipe.weight_decay)
-    schedule = (
-        lr_scheduler.OneCycleLR(optimizer, recipe.peak_rate, total_steps=recipe.steps)
-        if recipe.cycle
-        else lr_scheduler.ConstantLR(optimizer, 1.0)
-    )
+    schedule = _schedule(optimizer, recipe)
     average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
     labels = torch.from_numpy(sweeps.labels.astype(np.int64))
     picks, cost = order.split(recipe.batch), []
@@ -173,6 +169,13 @@ def learn(
     averaged = average.module
     assert isinstance(averaged, type(model))
     return averaged.cpu().fused(), cost
+
+
+def _schedule(optimizer: torch.optim.Optimizer, recipe: TrainingRecipe) -> lr_scheduler.LRScheduler:
+    """The learning rate over the steps of a recipe."""
+    if recipe.cycle:
+        return lr_scheduler.OneCycleLR(optimizer, recipe.peak_rate, total_steps=recipe.steps)
+    return lr_scheduler.ConstantLR(optimizer, 1.0)
 
 
 def backward(model: Network, x: Tensor, labels: Tensor, recipe: TrainingRecipe) -> float:
