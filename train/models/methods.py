@@ -26,6 +26,7 @@ MODULES = (
     "train.models.prior_work",
     "train.models.sthmp",
     "train.models.minirocket",
+    "train.models.filter_bank",
     "train.models.paper_cnn",
     "train.models.recurrent",
     "train.models.compact.methods",
