@@ -1,4 +1,4 @@
-"""A bank of random filters with a closed-form head, fitted in seconds without PyTorch. In: sweeps. Out: a Headed model.
+"""A bank of random filters with a closed-form head, fitted in seconds without PyTorch. In: sweeps. Out: a LinearHeadModel model.
 
 Each filter is dilated, spans a random subset of the taxels and sums to zero over time on each of them, so that no offset
 of a taxel reaches it. Its response is pooled twice: log of the mean magnitude, share of samples above a quantile.
@@ -18,8 +18,8 @@ from sklearn.preprocessing import StandardScaler
 
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from train.data.sets import LabelledSweeps
-from train.models.linear_head import Headed, headed
+from train.data.sets import Dataset
+from train.models.linear_head import LinearHeadModel, train_linear_head
 from train.models.methods import Method
 from train.onnx_tools.graph_builder import GraphBuilder, centred, run
 
@@ -61,22 +61,24 @@ def draw(form: SweepFormat, rng: np.random.Generator, count: int = FILTERS) -> B
     return Bank(weights.astype(np.float32), np.resize(np.repeat(fitting, -(-count // len(fitting))), count))
 
 
-def train(sweeps: LabelledSweeps, given: Array, seed: int) -> Headed:
+def train(sweeps: Dataset, given: Array, seed: int) -> LinearHeadModel:
     """The bank and shrinkage LDA on `given`, the raw counts [N, T, R, C] of `sweeps`.
 
     Raises FormatError where the window is shorter than a filter, every taxel of every sweep is constant, or there are
     no more sweeps than materials.
     """
+    form, rng = sweeps.require_materials().format, np.random.default_rng(seed)
     if len(sweeps) <= len(np.unique(sweeps.labels)):
         raise FormatError(f"{len(sweeps)} sweeps of as many materials are too few for filter-bank; record more")
-    form, rng = sweeps.of_several().format, np.random.default_rng(seed)
     scale = float(np.std(given - given.mean(axis=1, keepdims=True, dtype=np.float64)))
     if not scale > 0:
         raise FormatError("every taxel of every sweep is constant; check the skin, nothing can be learnt from this")
     bank = draw(form, rng)
     some = given[rng.permutation(len(given))[:THRESHOLD_SWEEPS]]
     above = rng.uniform(*QUANTILES, len(bank.weights))
-    return headed(features(form, bank, scale, thresholds(form, bank, some, above)), _lda, sweeps, given, seed)
+    return train_linear_head(
+        features(form, bank, scale, thresholds(form, bank, some, above)), _lda, sweeps, given, seed
+    )
 
 
 def thresholds(form: SweepFormat, bank: Bank, given: Array, above: Array) -> Array:
