@@ -87,7 +87,7 @@ class SweepFormat:
             raise FormatError(f"a window of {self.window} frames is empty; use at least 1")
 
     @property
-    def digits(self) -> np.dtype[Any]:
+    def numpy_type(self) -> np.dtype[Any]:
         """numpy type of one raw count, little-endian."""
         return np.dtype(self.dtype).newbyteorder("<")
 
@@ -120,7 +120,7 @@ class Frames:
     def empty(cls, fmt: SweepFormat) -> Frames:
         """No frames of this format."""
         none = np.empty(0, np.int64)
-        return cls(none, none, np.empty((0, fmt.rows, fmt.cols), fmt.digits))
+        return cls(none, none, np.empty((0, fmt.rows, fmt.cols), fmt.numpy_type))
 
     @classmethod
     def joined(cls, runs: Sequence[Frames]) -> Frames:
@@ -214,7 +214,7 @@ class Verdict:
 
 
 def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
-    return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.digits, (fmt.rows, fmt.cols))])
+    return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.numpy_type, (fmt.rows, fmt.cols))])
 
 
 def save(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})) -> None:

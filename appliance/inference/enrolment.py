@@ -66,7 +66,7 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
         sweeps.ndim != 4
         or not len(sweeps)
         or sweeps.shape[1:] != (f.window, f.rows, f.cols)
-        or sweeps.dtype != f.digits
+        or sweeps.dtype != f.numpy_type
     ):
         raise FormatError(f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}")
     run = Classifier(old, SystemClock())

@@ -96,7 +96,7 @@ class Stream:
 
     def __init__(self, fmt: SweepFormat, counters: SensorCounters) -> None:
         self._format, self._counters = fmt, counters
-        self._grid, self._dtype = (fmt.rows, fmt.cols), fmt.digits
+        self._grid, self._dtype = (fmt.rows, fmt.cols), fmt.numpy_type
         self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(
             np.int64
         )  # time of frame i of a packet after its first

@@ -167,7 +167,7 @@ class Board:
         self._first_seq = first_seq
         self._next = 0  # number of the next frame to send
         self._arrival_ns: int | None = None  # of the packet that begins with this frame, once drawn
-        self._frames = np.zeros((0, fmt.rows, fmt.cols), fmt.digits)
+        self._frames = np.zeros((0, fmt.rows, fmt.cols), fmt.numpy_type)
         self._base = 0  # number of the first frame in _frames
 
     def frame_ns(self, i: int) -> int:

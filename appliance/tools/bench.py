@@ -130,7 +130,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
 def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
     """Times of the bundle, of the same network in float and of the paper's network in int8, measured in turns."""
     rng = np.random.default_rng(seed)
-    window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.digits)
+    window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.numpy_type)
     calls: dict[str, Callable[[], object]] = {}
     calls["int8"] = partial(Classifier(bundle, SystemClock()).logits, window)
     _make_references(references)

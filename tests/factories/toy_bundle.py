@@ -28,7 +28,7 @@ def window(z1: float, z2: float, fmt: SweepFormat = FORMAT) -> np.ndarray:
     """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves."""
     level = np.array([[100 + 10 * z1, 100 + 10 * z2], [100, 100]])
     ripple = np.where(np.arange(fmt.window) % 2, 1, -1)[:, None, None]
-    return np.rint(level + ripple).astype(fmt.digits)
+    return np.rint(level + ripple).astype(fmt.numpy_type)
 
 
 def sweep(z1: float, z2: float, number: int = 1, object: int = 0, fmt: SweepFormat = FORMAT) -> Sweep:
@@ -64,7 +64,7 @@ def model(
     for name in set(outputs) - shapes.keys():
         nodes.append(node("Identity", ["logits"], [name]))
     value = onnx.helper.make_tensor_value_info
-    kind = onnx.helper.np_dtype_to_tensor_dtype(fmt.digits)
+    kind = onnx.helper.np_dtype_to_tensor_dtype(fmt.numpy_type)
     graph = onnx.helper.make_graph(
         nodes, "toy",
         [value("sweep", kind, [1, fmt.window, fmt.rows, fmt.cols])],

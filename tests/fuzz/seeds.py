@@ -89,7 +89,7 @@ def recording() -> list[bytes]:
     """Two recordings of four frames, of two skins: each its sidecar, then its records."""
     found, n = [], np.arange(4)
     for fmt in (SweepFormat(2, 2, 100.0, 4, "int16"), SweepFormat(1, 1, 35.61, 4, "uint8")):
-        taxels = np.arange(4 * fmt.rows * fmt.cols).reshape(4, fmt.rows, fmt.cols).astype(fmt.digits)
+        taxels = np.arange(4 * fmt.rows * fmt.cols).reshape(4, fmt.rows, fmt.cols).astype(fmt.numpy_type)
         sweep = Sweep(1, 0, 40_000_000, Status.OK, Frames(n, n, taxels), material="wood", session="a")
         with TemporaryDirectory() as folder:
             path = Path(folder) / "sweep.npy"

@@ -59,7 +59,7 @@ class SimulatedScene:
         """
         form, rest = skin.FORMAT, round(REST_S * skin.FORMAT.rate_hz)
         late = np.rint(np.broadcast_to(late_ms, len(self.places)) * form.rate_hz / 1000).astype(int)
-        drawn = np.empty((len(self.places), form.window, form.rows, form.cols), form.digits)
+        drawn = np.empty((len(self.places), form.window, form.rows, form.cols), form.numpy_type)
         for i, (material, at, seed) in enumerate(zip(self.materials, self.places, self.worlds, strict=True)):
             rng = np.random.default_rng([seed, i, *b"stress"])
             length_s = {"rest_s": REST_S, "slide_s": form.window / form.rate_hz, "after_s": REST_S}

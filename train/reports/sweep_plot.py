@@ -178,7 +178,7 @@ def draw(sweep: ShownSweep) -> str:
     else:
         _spectrum(add_axes(figure, LEFT, RIGHT, *_ends(SPECTRUM)), moving, sweep.format)
         text = "raw counts per √Hz over Hz: the taxels' mean power; light: their range"
-        if sweep.format.digits.kind != "f":
+        if sweep.format.numpy_type.kind != "f":
             text += "; dots: the noise of rounding to whole counts"
         if still := taxels.shape[1] - moving.shape[1]:
             text += f"; without {still} that stand still"
@@ -258,7 +258,7 @@ def _spectrum(axes: Axes, taxels: Array, form: SweepFormat) -> None:
     axes.fill_between(hz, low, high, color=ACCENT, alpha=0.15, linewidth=0)
     axes.plot(hz, mean, color=ACCENT, linewidth=1.1)
     axes.set(xscale="log", yscale="log", xlim=(hz[0], hz[-1]))
-    if form.digits.kind != "f":
+    if form.numpy_type.kind != "f":
         axes.axhline(np.sqrt(1 / 6 / form.rate_hz), color=BLACK, linewidth=0.8, linestyle=(0, (2, 2)))
     axes.grid(color=FAINT, linewidth=0.6)
     for axis, (first, last) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):

@@ -146,7 +146,7 @@ def test_streams_without_a_gap(need: Need):
         assert (np.diff(frames.seq) == 1).all()
         assert (np.diff(frames.t_ns) > 0).all()
         assert frames.taxels.shape[1:] == (u.format.rows, u.format.cols)
-        assert frames.taxels.dtype == u.format.digits
+        assert frames.taxels.dtype == u.format.numpy_type
         check_content(u, frames)
         assert reader.sensor.counters.lost_frames == reader.sensor.counters.garbage_bytes == 0
         assert reader.sensor.identity

@@ -36,7 +36,7 @@ def test_a_sweep_rests_slides_and_rests(material: str) -> None:
     """Shape and type are the format's, and only the slide makes the taxels vibrate."""
     taxels = skin.sweep(material, PLACE, rng(), only("texture", "vibration"))
     assert taxels.shape == (2700, 4, 4)
-    assert taxels.dtype == FORMAT.digits
+    assert taxels.dtype == FORMAT.numpy_type
     assert (np.diff(taxels[:225].astype(int), axis=0) == 0).all()
     assert (np.diff(taxels[2475:].astype(int), axis=0) == 0).all()
     assert (np.ptp(taxels[225:2475], axis=0) > 0).all()

@@ -28,7 +28,7 @@ ABOUT = {
 def sweep(path: Path, fmt: SweepFormat, about: dict | None = None, seq: np.ndarray | None = None, **more) -> str:
     """A recording of noise, a second after its start edge; its last taxel is silent."""
     seq = np.arange(fmt.window) if seq is None else seq
-    taxels = np.random.default_rng(0).integers(0, 99, (len(seq), fmt.rows, fmt.cols)).astype(fmt.digits)
+    taxels = np.random.default_rng(0).integers(0, 99, (len(seq), fmt.rows, fmt.cols)).astype(fmt.numpy_type)
     taxels[:, -1, -1] = 0
     t_ns = (1e9 + seq * fmt.period_ns).astype(np.int64)
     made = Sweep(7, 0, int(t_ns[-1]) + 1, Status.OK, Frames(t_ns, seq, taxels), **{"material": "cork"} | more)
