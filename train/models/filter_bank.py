@@ -1,4 +1,4 @@
-"""A bank of random filters with a closed-form head, fitted in seconds without PyTorch. In: sweeps. Out: a LinearHeadModel model.
+"""A bank of random filters with a closed-form head, fitted in seconds without PyTorch. In: sweeps. Out: a LinearHeadModel.
 
 Each filter is dilated, spans a random subset of the taxels and sums to zero over time on each of them, so that no offset
 of a taxel reaches it. Its response is pooled twice: log of the mean magnitude, share of samples above a quantile.
@@ -43,7 +43,7 @@ class Bank:
     dilations: Array
 
 
-def draw(form: SweepFormat, rng: np.random.Generator, count: int = FILTERS) -> Bank:
+def draw(form: SweepFormat, rng: np.random.Generator, count: int) -> Bank:
     """`count` filters, shared evenly among the dilations that fit into the window.
 
     Raises FormatError where the window is shorter than a filter.
@@ -73,7 +73,7 @@ def train(sweeps: Dataset, given: Array, seed: int) -> LinearHeadModel:
     scale = float(np.std(given - given.mean(axis=1, keepdims=True, dtype=np.float64)))
     if not scale > 0:
         raise FormatError("every taxel of every sweep is constant; check the skin, nothing can be learnt from this")
-    bank = draw(form, rng)
+    bank = draw(form, rng, FILTERS)
     some = given[rng.permutation(len(given))[:THRESHOLD_SWEEPS]]
     above = rng.uniform(*QUANTILES, len(bank.weights))
     return train_linear_head(

@@ -86,12 +86,12 @@ HARD, EASY = ("hard", "lopo"), ("lab", "random")
 FULL_STEPS = (
     Step(BASELINES, ALL, (1, 2, 3, 4, 5), 1),
     Step(NEIGHBOURS, ALL, (1, 2, 3), 1),
-    Step(("minirocket", "st-hmp"), HARD, (1,), 12),
+    Step(("minirocket", "filter-bank", "st-hmp"), HARD, (1,), 12),
     Step(("compact",), HARD, (1,), 32),
     Step(NETWORKS, HARD, (1,), 30),
     Step(("paper-cnn",), HARD, (1,), 170, means_removed=True),
     Step(("paper-cnn",), ("hard",), (1,), 170),
-    Step(("minirocket", "st-hmp"), EASY, (1,), 12),
+    Step(("minirocket", "filter-bank", "st-hmp"), EASY, (1,), 12),
     Step(("compact",), EASY, (1,), 32),
     Step(NETWORKS, EASY, (1,), 30),
     Step(("paper-cnn",), ("lopo",), (1,), 170),
@@ -105,7 +105,7 @@ QUICK = {
 }
 QUICK_STEPS = (
     Step(BASELINES, ALL, (1, 2), 0.3),
-    Step((*NEIGHBOURS, "minirocket", "st-hmp", "compact", *NETWORKS), ("lopo", "hard"), (1,), 1),
+    Step((*NEIGHBOURS, "minirocket", "filter-bank", "st-hmp", "compact", *NETWORKS), ("lopo", "hard"), (1,), 1),
     Step(("paper-cnn",), ("hard", "lopo"), (1,), 15, means_removed=True),
     Step(("paper-cnn",), ("hard",), (1,), 15),
 )
