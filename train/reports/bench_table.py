@@ -81,7 +81,10 @@ def _rows(figures: Json) -> Iterator[tuple[str, str]]:
         "inference of the packaged bundle (int8)",
         _times(inference["int8"]),
     )
-    yield "for comparison, inference of its network alone in float32, without novelty and early answers", _times(inference["fp32"])
+    yield (
+        "for comparison, inference of its network alone in float32, without novelty and early answers",
+        _times(inference["fp32"]),
+    )
     yield "for comparison, inference of the paper's network (CNN) in int8", _times(inference["paper_int8"])
     yield (
         "resident memory after 1,000 sweeps, with the simulated readout board in it",
