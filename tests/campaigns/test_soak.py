@@ -220,6 +220,7 @@ def test_a_broken_sentence_and_a_lost_skin_are_noted(line, what):
     assert [what in fault for _, fault in run.faults] == [True]
 
 
+@pytest.mark.slow
 def test_frames_that_nobody_counted_are_found():
     """Fifty frames that are gone without a word; the same behind for a while and then made up for is no loss."""
     box, late = FakeBox(), FakeBox()
@@ -314,6 +315,7 @@ def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
     assert box.closed == 1
 
 
+@pytest.mark.slow
 def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
     """The first run is kept as it was, a second one takes what is left with the next seed, a third has nothing to do."""
     box, lines = FakeBox(), []

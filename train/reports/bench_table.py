@@ -77,14 +77,8 @@ def _rows(figures: Json) -> Iterator[tuple[str, str]]:
         "from the STOP edge to its being in hand, with the last frame (glitch filter, rest of a USB packet)",
         _times(figures["edge_seen_ms"]),
     )
-    yield (
-        "inference of the packaged bundle (int8)",
-        _times(inference["int8"]),
-    )
-    yield (
-        "for comparison, inference of its network alone in float32, without novelty and early answers",
-        _times(inference["fp32"]),
-    )
+    yield "inference of the packaged bundle (int8)", _times(inference["int8"])
+    yield "for comparison, inference of its network alone in float32", _times(inference["fp32"])
     yield "for comparison, inference of the paper's network (CNN) in int8", _times(inference["paper_int8"])
     yield (
         "resident memory after 1,000 sweeps, with the simulated readout board in it",

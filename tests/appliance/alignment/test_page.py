@@ -169,6 +169,7 @@ def test_an_endless_head_is_not_read_on(page: Page):
         assert received_by(one) == b""
 
 
+@pytest.mark.slow
 def test_too_many_connections_are_turned_away(page: Page, monkeypatch: pytest.MonkeyPatch):
     """MOST_OPEN wait for their deadline; the next one is closed at once; when they are gone, new ones are served."""
     monkeypatch.setattr(web, "DEADLINE_NS", 700_000_000)
@@ -286,6 +287,7 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     context.close()
 
 
+@pytest.mark.slow
 def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
     """Loads as shades and numbers, points at their coordinates, the message in large letters and for screen readers."""
     context = browser.new_context(viewport={"width": 1180, "height": 820})
@@ -326,6 +328,7 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     )
 
 
+@pytest.mark.slow
 def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
     """The server still answers, but its loop hangs: after a while the page shows that instead of an old picture."""
     context = browser.new_context()

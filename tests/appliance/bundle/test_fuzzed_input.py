@@ -67,6 +67,7 @@ def check_inputs(target: str, folder: Path) -> None:
         targets.TARGETS[target](data, folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_what_was_found_still_holds(target: str, tmp_path: Path) -> None:
     """Seeds, saved corpus and former crashes keep every promise."""

@@ -109,6 +109,7 @@ def test_152_bytes_would_take_6_gigabytes():
     assert most_mb < 2
 
 
+@pytest.mark.slow
 def test_a_file_that_ends_anywhere_is_refused(default: mutated_models.Own):
     """The default bundle's model, cut off at every byte."""
     for end in range(len(default.model)):

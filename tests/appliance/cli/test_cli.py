@@ -196,6 +196,7 @@ def test_check_says_ok_part_by_part(capsys: pytest.CaptureFixture[str]):
     assert "SIM0001" in lines[2]
 
 
+@pytest.mark.slow
 def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """On a machine without devices: the bundle is fine, the devices are not, each with its own line, and exit code 1."""
     code = main(["check", "--board", "rpi5", "--set", f"serial.port={tmp_path}/none", "--set", "sensor.product_id=1"])

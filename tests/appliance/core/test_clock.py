@@ -81,6 +81,7 @@ def test_frames_that_all_come_late_were_not_taken_late(ppm: float):
     assert np.abs(errors_ms[40 * 125 :]).max() < 25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ppm", [-2000, -500, 500, 2000])
 def test_no_line_is_kept_for_ever(ppm: float):
     """A board beyond the bound whose first packets all came late: the error is that of the last 20 s and stops

@@ -256,6 +256,7 @@ def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, t
     assert (pair.written().current, pair.written().compared, pair.kept()) == ("dddddddd", 0, [])
 
 
+@pytest.mark.slow
 def test_a_candidate_that_kills_the_program_stays_away(side):
     """After three starts without an orderly end within a minute there is no fourth; an orderly end, or a minute, resets
     the count."""

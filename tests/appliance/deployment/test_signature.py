@@ -53,6 +53,7 @@ def test_a_signer_is_named(tmp_path: Path, kind: str):
     assert signature.verify(MESSAGE, signature.sign(MESSAGE, other), file) == "ben"
 
 
+@pytest.mark.slow
 def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
     """Another key, namespace or message, a cut, empty or huge signature: each is refused with its reason."""
     good = signature.sign(MESSAGE, signers.ours)

@@ -60,6 +60,7 @@ def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery,
     assert len(logged) == 1
 
 
+@pytest.mark.slow
 def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
     """A failed trial and a rollback lead to the packaged bundle, a second rollback to the installed one again."""
     one = box.installed(1)
@@ -412,6 +413,7 @@ def test_a_link_out_of_the_store_is_refused(box: Delivery):
         box.start()
 
 
+@pytest.mark.slow
 def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
     """One line a bundle: role, id, name, counter, signer, trial."""
     one, two = box.committed(1), box.store.install(box.made(2, name="tubes", version="7"))

@@ -77,6 +77,7 @@ def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
     assert box.start() == box.one
 
 
+@pytest.mark.slow
 def test_a_skin_that_is_unplugged_never_counts(box: Trying):
     """They do not count, however many there are; once the skin streams, the start counts."""
     for _ in range(3 * MOST_STARTS):

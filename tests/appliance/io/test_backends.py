@@ -552,6 +552,7 @@ def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink
     assert len(numbers) + sink.dropped == total
 
 
+@pytest.mark.slow
 def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSink]):
     """Unplugged while open: the next sentence fails and `trouble` says so; plugged in again, it is sent completely."""
     u = need("serial", "pull")

@@ -171,6 +171,7 @@ def test_a_serial_number_that_is_no_text(string: bytes, state: str):
     assert "udev" not in str(sensor.trouble) or state == "absent"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ppm", [-80, 80])
 def test_windows_over_many_offsets(ppm: float):
     """80 ppm, one packet in a hundred 50 to 200 ms late: 120 windows with edges anywhere, each within a frame of the

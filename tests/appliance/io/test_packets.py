@@ -78,6 +78,7 @@ def test_any_split_gives_the_same(cuts: list[int], data: st.DataObject):
     assert frames_of(packets) == frames_of(wire.unpack(whole).packets)
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.one_of(

@@ -37,6 +37,7 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     return verdicts, sweeps
 
 
+@pytest.mark.slow
 def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
@@ -71,6 +72,7 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
         assert (a.frames.t_ns == b.frames.t_ns).all()
 
 
+@pytest.mark.slow
 def test_commands_are_part_of_a_capture(rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path):
     """NEW and ABORT change what comes after them, so they are captured: replayed sweeps fuse and end as they did."""
     simulated = devices.build(skin.FORMAT, script.tubes(1014, 5), rig.VirtualClock(), "sim")

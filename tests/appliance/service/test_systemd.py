@@ -240,6 +240,7 @@ def test_stopping_is_sent_before_the_last_answer(rigged: Callable[..., Rigged]):
     assert turn_log.notes[-2:] == ["stopping", "aborted"]
 
 
+@pytest.mark.slow
 def test_the_command_notifies_systemd(tmp_path: Path):
     """`palpate run` under systemd: first a status, READY once, the watchdog fed while it runs, STOPPING on SIGTERM."""
     socket_end = ManagerSocket(str(tmp_path / "notify"))

@@ -379,6 +379,7 @@ def sshd(tmp_path: Path) -> list[str]:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_through_a_real_sshd(tmp_path: Path, sshd: list[str]):
     """Keys, a login shell, the real tools: all comes, twice; and a wrong key is no connection."""
     for i in range(3):

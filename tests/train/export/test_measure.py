@@ -72,6 +72,7 @@ def test_what_does_not_run_by_itself_is_named(tmp_path: Path):
         measure.memory(one.folder, sweeps().samples)
 
 
+@pytest.mark.slow
 def test_torch_runs_what_was_trained(tmp_path: Path):
     """The network as TorchScript gives its own logits."""
 

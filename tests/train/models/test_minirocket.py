@@ -145,6 +145,7 @@ def test_the_temperature_comes_from_held_out_groups():
     assert softmax(head(blind).logits(easy(20, seed=1).samples)).max(1).mean() < 0.6
 
 
+@pytest.mark.slow
 def test_a_seed_gives_one_model_and_leaves_numpy_alone(monkeypatch: pytest.MonkeyPatch):
     """The same bytes for the same seed, others for another; numpy's global stream goes on as if nothing had been."""
     pytest.importorskip("aeon")

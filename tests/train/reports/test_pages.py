@@ -188,6 +188,7 @@ def test_a_choice_that_is_not_good_enough_says_so_first():
     assert "does not need" not in page
 
 
+@pytest.mark.slow
 def test_what_a_template_prints_is_escaped(tmp_path: Path):
     """Names of others cannot become tags; a picture stays what it is; data that is missing is an error."""
     (tmp_path / "a.html.j2").write_text("<p>{{ name }} {{ picture }} {{ share | percent }}</p>")

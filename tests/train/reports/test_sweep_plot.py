@@ -172,6 +172,7 @@ def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "grey bars" not in words(whole)
 
 
+@pytest.mark.slow
 def test_texts_are_shown_as_they_are(tmp_path: Path):
     """Dollars are no formulas, signs of markup no markup, long texts end with …, what cannot be shown is a �."""
     fmt = SweepFormat(1, 1, 50.0, 9, "uint8")

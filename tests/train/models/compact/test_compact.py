@@ -67,6 +67,7 @@ def fitted() -> Fit:
     return fit.fit(easy(), 1, FitRecipe(steps=40), architecture=SMALL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "cols", "window", "dtype"),
                          [(4, 4, 1500, "uint8"), (3, 3, 150, "int16"), (1, 1, 20, "uint16"), (16, 1, 128, "float32")])  # fmt: skip
 def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str):

@@ -31,6 +31,7 @@ def fitted() -> Fit:
     return fit.fit(easy(), 1, QUICK)
 
 
+@pytest.mark.slow
 def test_stages_follow_the_window():
     """The kernels of the two windows that are known; every window gets a last stage, or a message."""
     assert [(s.kernel, s.stride) for s in DEFAULT.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
@@ -58,6 +59,7 @@ def test_compact_is_as_small_as_it_says(size: str, weights: int):
     assert sum(p.numel() for p in more.parameters()) == weights + 6 * spectrum.count(skin.FORMAT)
 
 
+@pytest.mark.slow
 def test_compact_ignores_offsets():
     """A constant on each taxel changes nothing: it is the offset, not the texture; by its kernels, not by `prepare`."""
     model = Compact(skin.FORMAT, 6, 0.1, norm=False)
