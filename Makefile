@@ -21,8 +21,8 @@ demo: $(RUNTIME) ## watch simulated sweeps being classified, live
 test: $(DESKTOP) ## run the tests (set PALPATE_DATA to the folder of real sweeps to run those as well)
 	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
-test-fast: $(DESKTOP) ## run the tests that are not marked `slow`
-	$(BIN)/python -m pytest -q -n auto --dist worksteal -m "not slow"
+test-fast: $(DESKTOP) ## run the tests that are not marked `slow`, with their files in memory: a sync to a disk takes as long as a test
+	TMPDIR=$(or $(wildcard /dev/shm),/tmp) $(BIN)/python -m pytest -q -n auto --dist worksteal -m "not slow"
 
 check: lint types test ## lint, types and tests
 
