@@ -371,6 +371,19 @@ def test_edges_and_frames_are_reckoned_from_the_first_sentences():
     assert robot.taken(begun_s + 3) == pytest.approx(2250)
 
 
+def test_a_slow_first_answer_does_not_move_the_others():
+    """Each answer is judged by its own sweep when later ones come quicker; one with a wrong number moves nothing."""
+    sweeps, begun_s = Script(1), 1000.0
+    robot = Reckoned(sweeps)
+    for k, late_s in ((1, 0.12), (2, 0.03), (3, 0.001), (4, 0.02)):
+        at_s = begun_s + sweeps[k].stop / RATE + late_s
+        robot.hear(at_s, sentence("RES", k, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode())
+        assert robot.edges(at_s)[1] == k
+    at_s = begun_s + sweeps[5].stop / RATE
+    robot.hear(at_s, sentence("RES", 7, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode())
+    assert robot.edges(at_s + 0.01)[1] == 5
+
+
 def test_the_script_tells_what_is_touched_and_what_the_network_says():
     """Labels and edges are those of the simulator's acts; the network by itself is mostly right."""
     sweeps, acts = Script(3), list(script.tubes(3, 12))

@@ -36,6 +36,9 @@ from tests.rig.soak_judge import short_answer
 
 STOP_S = 30
 """Longest wait for a box to end after SIGTERM."""
+HALF_FRAME_S = 0.5 / skin.FORMAT.rate_hz
+SLOW_ANSWER_S = 0.5
+"""By so much the first answer may be slower than a later one."""
 TICKS = os.sysconf("SC_CLK_TCK")
 SMAPS = re.compile(r"^(Rss|Pss): +(\d+) kB", re.M)
 
@@ -136,7 +139,7 @@ def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, in
 class Reckoned:
     """A robot and a board that cannot be asked: their sweeps and frames by the clock, since the script is known.
 
-    The first answer fixes where the script is, the first frames that were counted where the board is.
+    The quickest answer fixes where the script is, the first frames that were counted where the board is.
     """
 
     def __init__(self, sweeps: Script) -> None:
@@ -145,10 +148,17 @@ class Reckoned:
 
     def hear(self, at_s: float, line: str) -> None:
         """Take note of a sentence."""
-        if not self._origin_s and (answer := Answer.read(line)):
-            self._origin_s = at_s - self._sweeps[answer.sweep].stop / skin.FORMAT.rate_hz
+        if answer := Answer.read(line):
+            self._begin(at_s - self._sweeps[answer.sweep].stop / skin.FORMAT.rate_hz - HALF_FRAME_S)
         if not self._board_s and line.startswith("$PPLP,STA,") and int(frames := line.split(",")[6]):
             self._board_s = at_s - int(frames) / skin.FORMAT.rate_hz
+
+    def _begin(self, origin_s: float) -> None:
+        """The script began then or earlier. Only a little earlier than was known: a slow first answer is put right, an
+        answer with a wrong number moves nothing.
+        """
+        if not self._origin_s or 0 < self._origin_s - origin_s < SLOW_ANSWER_S:
+            self._origin_s = origin_s
 
     def edges(self, at_s: float) -> tuple[int, int]:
         """As BoxUnderTest.edges."""

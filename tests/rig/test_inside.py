@@ -16,9 +16,7 @@ PYTEST = "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider tests/app
 CODE = (
     "pyproject.toml",
     "tests/conftest.py",
-    "tests/factories/no-site.toml",
-    "tests/factories/paths.py",
-    "tests/factories/simulated_box.py",
+    "tests/factories",
     "tests/backends",
     "tests/appliance/io/test_backends.py",
 )
