@@ -34,7 +34,8 @@ def draw(material: str, seed: int = 7) -> str:
     if material not in sweeps.materials:
         raise FormatError(f"material {material!r} is not simulated; use one of {', '.join(sweeps.materials)}")
     samples = sweeps.samples[sweeps.labels == sweeps.materials.index(material)][0]
-    verdict = _verdict(samples)
+    loaded = bundle.load(bundle.DEFAULT)
+    verdict = _verdict(loaded, samples)
     figure = Figure((WIDE, HIGH))
     page = add_axes(figure, 0, 1, 1, 0)
     page.set(xlim=(0, WIDE), ylim=(0, HIGH))
@@ -47,15 +48,15 @@ def draw(material: str, seed: int = 7) -> str:
         write(page, x, HIGH - 0.3, title, BLACK, MEDIUM + 2, ha="left", weight="bold")
     _finger(page, samples)
     _signal(add_axes(figure, 0.355, 0.665, 0.80, 0.17), samples)
-    _answer(page, verdict)
+    _answer(page, verdict, loaded.manifest.labels)
     about = f"A finger slides along a tube of {material}; the signal of 16 taxels; the box answers {verdict.label}"
     return to_svg(figure, about + " (simulated)")
 
 
-def _verdict(samples: NDArray[Any]) -> Verdict:
-    """What the packaged bundle answers to raw counts [T, R, C]."""
+def _verdict(loaded: bundle.Bundle, samples: NDArray[Any]) -> Verdict:
+    """What the bundle answers to raw counts [T, R, C]."""
     number = np.arange(len(samples))
-    classifier = Classifier(bundle.load(bundle.DEFAULT), SystemClock())
+    classifier = Classifier(loaded, SystemClock())
     return classifier(Sweep(1, 0, 0, Status.OK, Frames(number, number, samples)))
 
 
@@ -105,11 +106,10 @@ def _signal(axes: Axes, samples: NDArray[Any]) -> None:
     )
 
 
-def _answer(page: Axes, verdict: Verdict) -> None:
+def _answer(page: Axes, verdict: Verdict, labels: tuple[str, ...]) -> None:
     """The label in large letters, the probability of every label as a bar."""
     left, width = 7.0, 1.35
     write(page, left, 2.62, verdict.label, ACCENT, MEDIUM + 9, ha="left", weight="bold")
-    labels = bundle.load(bundle.DEFAULT).manifest.labels
     order = sorted(zip(labels, verdict.scores, strict=True), key=lambda pair: -pair[1])
     for i, (label, probability) in enumerate(order):
         y = 2.1 - 0.27 * i
