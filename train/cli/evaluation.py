@@ -107,16 +107,22 @@ def run_methods(args: argparse.Namespace) -> None:
 
 
 def run_evaluate(args: argparse.Namespace) -> None:
-    """Print each result as it is finished, and write all of them."""
+    """Print each result as it is finished, and write all of them; name a method that cannot be used, and go on.
+
+    Raises FormatError at the end where there was one.
+    """
     sweeps = options.load(args)
     names = options.names(args)
     plan = evaluate.Plan(names, tuple(args.protocols), options.seeds(args), args.remove_means, options.effort(args))
     results: list[dict[str, Any]] = []
     refused: dict[str, str] = {}
+    log = options.Log()
     print(evaluate.HEADER)
-    for result in evaluate.evaluate(sweeps, plan, options.where(args), options.Log()):
+    for result in evaluate.evaluate(sweeps, plan, options.where(args), log):
         if result.refused:
-            refused[result.method] = result.refused
+            if result.method not in refused:
+                log.keep(f"{result.method} cannot be used here: {result.refused}; left out")
+            refused.setdefault(result.method, result.refused)
             continue
         results.append(result.json() | {"only": args.only})
         print(evaluate.line(results[-1]), flush=True)
@@ -124,7 +130,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
             results.sort(key=lambda r: (args.protocols.index(r["protocol"]), names.index(r["method"]), r["seed"]))
             _write(args.json, results)
     if refused:
-        raise FormatError("; ".join(f"{name} cannot be used here: {why}" for name, why in refused.items()))
+        raise FormatError(f"{', '.join(refused)} left out of {', '.join(names)}; the lines above say why")
 
 
 def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:

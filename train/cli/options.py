@@ -84,3 +84,8 @@ class Log:
         elif time.monotonic() - self._last > LOG_EVERY_S:
             self._last = time.monotonic()
             print(line, file=sys.stderr, flush=True)
+
+    def keep(self, line: str) -> None:
+        """Show `line` at once, and leave it there."""
+        start = "\r\033[K" if sys.stderr.isatty() else ""
+        print(f"{start}{line}", file=sys.stderr, flush=True)

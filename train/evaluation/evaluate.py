@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.core.errors import FormatError
 from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol
 from train.evaluation import parallel
@@ -141,7 +142,10 @@ class Where:
 def evaluate(
     sweeps: Dataset, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
 ) -> Iterator[Result]:
-    """Results as they are complete. Raises FormatError where a method or protocol is unknown or does not fit the set."""
+    """Results as they are complete; of a method that is refused one for each protocol and seed, at once.
+
+    Raises FormatError where a method or protocol is unknown, or a protocol does not fit the set.
+    """
     known = known_methods.find(plan.methods, plan.effort)
     sweeps = sweeps.without_means() if plan.means_removed else sweeps
     origin = {"digest": digest(sweeps)} | provenance()
@@ -155,11 +159,13 @@ def evaluate(
         }  # fmt: skip
         done: dict[Any, Fold] = {}
         for (name, protocol, seed, i), fold in folds(tasks, sweeps, origin["digest"], kind, where):
+            parts = [(name, protocol, seed, k) for k in range(len(splits[protocol, seed]))]
+            told = any(done[part].refused for part in parts if part in done)
             done[name, protocol, seed, i] = fold
             progress(f"{name}, {protocol}, seed {seed}, fold {i + 1}")
-            whole = [done.get((name, protocol, seed, k)) for k in range(len(splits[protocol, seed]))]
-            if all(whole):
-                yield Result(name, protocol, plan.means_removed, seed, sweeps, whole, origin)  # type: ignore[arg-type]
+            whole = [fold] if fold.refused else [done[part] for part in parts if part in done]
+            if not told and (fold.refused or len(whole) == len(parts)):
+                yield Result(name, protocol, plan.means_removed, seed, sweeps, whole, origin)
 
 
 def folds(
@@ -167,16 +173,28 @@ def folds(
 ) -> Iterator[tuple[Any, Fold]]:
     """Every task's Fold: those in the cache first, then the others as they finish.
 
-    data: digest of `sweeps`. kind: the input of the tasks' methods.
+    data: digest of `sweeps`. kind: the input of the tasks' methods; where it cannot be computed all are refused.
     """
     paths = {name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache}
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()
     left = [named for named in tasks.items() if named[0] not in kept and not where.kept]
-    shared = (sweeps, known_methods.model_inputs(kind, sweeps)) if left else ()
-    for (name, _), fold in parallel.results(_run, left, shared, where.jobs, where.scheduler):
+    for name, fold in _trained(left, sweeps, kind, where):
         if where.cache:
             fold.save(paths[name])
+        yield name, fold
+
+
+def _trained(
+    tasks: Sequence[tuple[Any, FoldTask]], sweeps: Dataset, kind: str, where: Where
+) -> Iterator[tuple[Any, Fold]]:
+    """The Fold of each named task as it finishes; all refused where the input `kind` cannot be computed."""
+    try:
+        shared = (sweeps, known_methods.model_inputs(kind, sweeps)) if tasks else ()
+    except FormatError as e:
+        yield from ((name, Fold.refusal(task, str(e))) for name, task in tasks)
+        return
+    for (name, _), fold in parallel.results(_run, tasks, shared, where.jobs, where.scheduler):
         yield name, fold
 
 

@@ -11,7 +11,7 @@ import io
 import json
 import time
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
@@ -30,8 +30,11 @@ from train.features import kinds
 from train.models import methods
 
 Array = NDArray[Any]
+Answer = Callable[[Array], Array]
+"""Raw counts [T, R, C] -> logits [K]."""
 TIMED_SWEEPS = 24
-"""How many test sweeps go one by one through an inference session of the box, for their time and to compare their labels."""
+"""How many test sweeps go one by one through an inference session of the box (of a method without a graph, through its
+library), for their time and to compare their labels."""
 NOT_COUNTED = (
     "train.data.readers",
     "train.data.sets",
@@ -61,7 +64,8 @@ class FoldTask:
 class Fold:
     """The result of one fold. logits: float32 [n, K] of its test sweeps; ms: median time of one sweep, features and graph.
 
-    agreement: share of the timed sweeps to which the exported graph gives the same label. ran: what was trained, where
+    agreement: share of the timed sweeps to which the exported graph, or its library where it has none, gives the same
+    label when it answers them one by one. ran: what was trained, where
     the method's name does not say it. cost: the training's cross entropy, [iterations, 2], where it has one.
     forms: logits float32 [n, K] of the same sweeps by the same model in other precisions.
     refused: why the method cannot work with this set; all else is empty then.
@@ -76,6 +80,11 @@ class Fold:
     cost: Array = field(default_factory=lambda: np.empty((0, 2)))
     refused: str = ""
     forms: dict[str, Array] = field(default_factory=dict)
+
+    @classmethod
+    def refusal(cls, task: FoldTask, why: str) -> Fold:
+        """The fold of a method that cannot work with this set."""
+        return cls(task.test, np.empty((0, 0), np.float32), 0.0, 0.0, 0.0, refused=why)
 
     def save(self, path: Path) -> None:
         """Write the fold, whole or not at all."""
@@ -103,13 +112,20 @@ PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
 
 
 def run(task: FoldTask, sweeps: Dataset, inputs: Array) -> Fold:
-    """Train on one side, answer on the other. inputs: the method's input of all `sweeps`."""
+    """Train on one side, answer on the other; a refusal where the method raises FormatError.
+
+    inputs: the method's input of all `sweeps`.
+    """
     (method,) = methods.find([task.method], task.effort)
-    start = time.perf_counter()
     try:
-        model = method.train(sweeps.take(task.train), inputs[task.train], task.seed)
+        return _completed(task, method, sweeps, inputs)
     except FormatError as e:
-        return Fold(task.test, np.empty((0, len(sweeps.materials)), np.float32), 0.0, 0.0, 0.0, refused=str(e))
+        return Fold.refusal(task, str(e))
+
+
+def _completed(task: FoldTask, method: methods.Method, sweeps: Dataset, inputs: Array) -> Fold:
+    start = time.perf_counter()
+    model = method.train(sweeps.take(task.train), inputs[task.train], task.seed)
     fit_s = time.perf_counter() - start
     models = {"": model} | dict(getattr(model, "forms", {}))
     answers = {name: np.asarray(one.logits(inputs[task.test]), np.float32) for name, one in models.items()}
@@ -117,22 +133,29 @@ def run(task: FoldTask, sweeps: Dataset, inputs: Array) -> Fold:
         raise FormatError(f"{task.method} gave a logit that is not finite; please report it with the set")
     logits = answers.pop("")
     some = task.test[np.linspace(0, len(task.test) - 1, min(TIMED_SWEEPS, len(task.test))).astype(int)]
-    ms, labels = _timed_labels(method, model, sweeps, some)
+    ms, labels = _timed_labels(_alone(method, model, sweeps.rate_hz), sweeps.samples[some])
     agreement = float(np.mean(labels == logits[np.searchsorted(task.test, some)].argmax(1)))
     cost = np.asarray(getattr(model, "cost", []), float).reshape(-1, 2)
     return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers)
 
 
-def _timed_labels(method: methods.Method, model: methods.Model, sweeps: Dataset, some: Array) -> tuple[float, Array]:
-    """Median time in ms of one sweep through features and session, and its labels [n]."""
-    graph = session(model.graph().SerializeToString())
-    name, times, labels = graph.get_inputs()[0].name, [], []
-    for counts in sweeps.samples[some]:
+def _timed_labels(answer: Answer, samples: Array) -> tuple[float, Array]:
+    """Median time in ms of one sweep of `samples`, raw counts [n, T, R, C], and the labels [n]."""
+    times, labels = [], []
+    for counts in samples:
         start = time.perf_counter()
-        x = kinds.graph_input(method.input, counts, sweeps.rate_hz)
-        labels.append(int(graph.run(None, {name: x[None]})[0][0].argmax()))
+        labels.append(int(answer(counts).argmax()))
         times.append(time.perf_counter() - start)
     return 1e3 * float(np.median(times)), np.array(labels)
+
+
+def _alone(method: methods.Method, model: methods.Model, rate_hz: float) -> Answer:
+    """What answers one sweep: features and the graph in the box's kind of session, or the library that has no graph."""
+    if method.library:
+        return lambda counts: model.logits(kinds.graph_input(method.input, counts, rate_hz)[None])[0]
+    graph = session(model.graph().SerializeToString())
+    name = graph.get_inputs()[0].name
+    return lambda counts: graph.run(None, {name: kinds.graph_input(method.input, counts, rate_hz)[None]})[0][0]
 
 
 def key(task: FoldTask, data: str) -> str:

@@ -116,18 +116,15 @@ def pack(
 def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
     """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, on which it is tested.
 
-    Raises FormatError for a method whose features the box does not compute.
+    Raises FormatError for a method that the box cannot run.
     """
     return train_content(method, sweeps, seed)[1]
 
 
 def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Content]:
     """The model that `trained` trains, and its content."""
-    if not method.runs_on_the_box:
-        raise FormatError(
-            f"method {method.name!r} looks at the features {method.input!r} of prior work, which the box does not compute; "
-            "compare it with evaluate, and pack another"
-        )
+    if why := method.why_not_on_the_box:
+        raise FormatError(f"method {method.name!r} {why}; compare it with evaluate, and pack another")
     train, held_out, held_out_by = hold_out(sweeps, seed)
     model = method.train(train, model_inputs(method.input, train), seed)
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}

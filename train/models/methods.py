@@ -65,7 +65,10 @@ class Model(Protocol):
         ...
 
     def graph(self) -> onnx.ModelProto:
-        """What the box runs: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits` float32 [1, K]."""
+        """What the box runs: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits` float32 [1, K].
+
+        Raises FormatError where the method runs in its `library` alone.
+        """
         ...
 
 
@@ -75,7 +78,8 @@ class Method:
 
     about: one line with its source. input: "raw" or a key of train.features.kinds.KINDS. train: (training sweeps, their
     model_inputs, seed) -> Model; the same arguments give the same model. extra: the optional dependency that it needs,
-    named as in train/pyproject.toml. effort: what an Effort changes in it.
+    named as in train/pyproject.toml. effort: what an Effort changes in it. library: what runs its models where they have
+    no graph; they are timed there and cannot be packed.
     """
 
     name: str
@@ -84,11 +88,21 @@ class Method:
     train: Callable[[Dataset, Array, int], Model]
     extra: str = ""
     effort: str = ""
+    library: str = ""
+
+    @property
+    def why_not_on_the_box(self) -> str:
+        """Why the box cannot run it: no graph, or features that the box does not compute; "" where it can."""
+        if self.library:
+            return f"runs in {self.library} alone and has no graph"
+        if self.input != "raw" and self.input not in features.KINDS:
+            return f"looks at the features {self.input!r} of prior work, which the box does not compute"
+        return ""
 
     @property
     def runs_on_the_box(self) -> bool:
-        """Whether the box computes the input of the graph."""
-        return self.input == "raw" or self.input in features.KINDS
+        """Whether its models have a graph, and the box computes the graph's input."""
+        return not self.why_not_on_the_box
 
 
 def model_inputs(kind: str, sweeps: Dataset) -> Array:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from appliance.core.errors import FormatError
@@ -16,6 +17,7 @@ from train.cli.main import main
 from train.data.sets import Dataset
 from train.evaluation import evaluate, fold
 from train.evaluation.evaluate import Plan, Where
+from train.export import pack
 from train.models import methods
 
 KEYS = {"method", "protocol", "means_removed", "seed", "window", "recording", "interval", "fit_s", "ms_p50"}
@@ -229,6 +231,100 @@ def test_a_method_that_cannot_work_does_not_stop_the_others(tmp_path: Path, caps
                    "--json", str(out), cache=tmp_path) == FormatError.exit_code  # fmt: skip
     assert [r["method"] for r in json.loads(out.read_text())] == ["L-gauss"]
     assert "minirocket cannot be used here: a window of 7 frames is too short" in capsys.readouterr().err
+
+
+def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Too few frames for H at this rate: named once, above the final line; kept, so that --kept can say it too."""
+    whole, out = tones(), tmp_path / "r.json"
+    fast = Dataset(whole.samples[:, :80], whole.labels, whole.materials, 1000.0, whole.groups, "fast")
+    fast.save(tmp_path / "fast.npz")
+    args = ("--set", str(tmp_path / "fast.npz"), "--protocol", "leave:session", "--method", "H-svm,L-gauss,H-knn",
+            "--seeds", "2", "--json", str(out))  # fmt: skip
+    assert command(*args, cache=tmp_path / "cache") == FormatError.exit_code
+    assert [(r["method"], r["seed"]) for r in json.loads(out.read_text())] == [("L-gauss", 1), ("L-gauss", 2)]
+    *above, last = capsys.readouterr().err.splitlines()
+    assert [line.split(": ")[0] for line in above] == ["H-svm cannot be used here", "H-knn cannot be used here"]
+    assert all("80 frames are too few" in line for line in above)
+    assert "H-svm, H-knn left out of H-svm, L-gauss, H-knn" in last
+    kept = every(fast, Where(jobs=1, cache=tmp_path / "cache", kept=True), "H-svm")
+    assert "80 frames are too few" in kept[0].refused
+
+
+@pytest.mark.parametrize("broken", ["train", "logits", "not finite"])
+def test_a_method_refused_in_one_fold_loses_no_other_result(broken: str, monkeypatch: pytest.MonkeyPatch):
+    """It is named once for a protocol and seed, at once; its other protocols and the other methods are complete."""
+    calls: list[int] = []
+    (sound,) = methods.find(["L-gauss"])
+
+    def second_fold_fails(sweeps: Dataset, inputs: np.ndarray, seed: int) -> methods.Model:
+        calls.append(1)
+        if broken == "train" and len(calls) == 2:
+            raise FormatError("too few of something")
+        model = sound.train(sweeps, inputs, seed)
+        return Spoilt(model, broken) if len(calls) == 2 else model
+
+    fragile = replace(sound, name="fragile", train=second_fold_fails)
+    monkeypatch.setattr(methods, "every", lambda effort=methods.FULL_EFFORT: {"fragile": fragile, "L-gauss": sound})
+    results = every(tones(), HERE, "fragile", "L-gauss", protocols=("leave:session", "split:session=0,1->2"))
+    found = [(r.method, r.protocol, bool(r.refused)) for r in results]
+    assert found == [
+        ("fragile", "leave:session", True),
+        ("fragile", "split:session=0,1->2", False),
+        ("L-gauss", "leave:session", False),
+        ("L-gauss", "split:session=0,1->2", False),
+    ]
+    why = "gave a logit that is not finite" if broken == "not finite" else "too few of something"
+    assert why in results[0].refused
+    assert results[2].json()["window"]["total"] == 36
+
+
+@dataclass(frozen=True)
+class Spoilt:
+    """A model that fails after training, or gives what is no number."""
+
+    model: methods.Model
+    how: str
+
+    def logits(self, inputs: np.ndarray) -> np.ndarray:
+        """Nothing that can be used."""
+        if self.how == "logits":
+            raise FormatError("too few of something")
+        return self.model.logits(inputs) * np.nan
+
+    def graph(self) -> onnx.ModelProto:
+        """That of the sound model."""
+        return self.model.graph()
+
+
+def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.MonkeyPatch):
+    """One sweep at a time, its labels compared with those of all at once; pack names the library."""
+    (sound,) = methods.find(["L-gauss"])
+    asked: list[int] = []
+
+    class Alone:
+        """Has no graph."""
+
+        def __init__(self, model: methods.Model) -> None:
+            self.model = model
+
+        def logits(self, inputs: np.ndarray) -> np.ndarray:
+            """Those of the sound model."""
+            asked.append(len(inputs))
+            return self.model.logits(inputs)
+
+    alone = replace(sound, name="alone", library="its library", train=lambda *args: Alone(sound.train(*args)))
+    monkeypatch.setattr(methods, "every", lambda effort=methods.FULL_EFFORT: {"alone": alone})
+    monkeypatch.setattr(fold, "TIMED_SWEEPS", 5)
+    (result,) = every(tones(), HERE, "alone", protocols=("split:session=0,1->2",))
+    figures = result.json()
+    assert asked == [12, 1, 1, 1, 1, 1]
+    assert figures["agreement"] == 1
+    assert figures["ms_p50"] > 0
+    assert not alone.runs_on_the_box
+    with pytest.raises(FormatError, match="method 'alone' runs in its library alone and has no graph"):
+        pack.trained(alone, tones(), 1)
 
 
 def test_trained_on_one_set_and_tested_on_another(tmp_path: Path):
