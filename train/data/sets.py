@@ -1,4 +1,4 @@
-"""Sweep sets to train and test on. In: a user's file, or the name of a simulated set. Out: a checked Dataset.
+"""Sweep sets to train and test on. In: a user's file, or the name of a simulated or published set. Out: a checked Dataset.
 
 A set knows which sweeps belong together (`groups`); it can be narrowed to some of them and split so that no recording is
 on both sides. appliance.core.sweep_set says what a file must hold; readers.py reads it.
@@ -19,7 +19,7 @@ from appliance.core import sweep_set
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
-from train.data import readers
+from train.data import published, readers
 
 SIMULATED = re.compile(r"sim:(?P<name>[^:]+)(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?")
 CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)(.*)")
@@ -149,12 +149,17 @@ class Dataset(sweep_set.SweepSet):
 
 
 def load(spec: str, seed: int = 0) -> Dataset:
-    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings, or sim:NAME[:SEED[-LAST][:SWEEPS]].
+    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings, sim:NAME[:SEED[-LAST][:SWEEPS]] or aeon:NAME.
 
     SWEEPS: per material and position. SEED-LAST: one set of several simulated scenes, each with positions of its own.
     seed: for a simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
     """
-    return _simulated(spec, seed) if spec.startswith("sim:") else readers.read(Path(spec), Dataset).require_materials()
+    if spec.startswith("sim:"):
+        return _simulated(spec, seed)
+    if spec.startswith(published.PREFIX):
+        samples, labels, materials, groups = published.load(spec.removeprefix(published.PREFIX))
+        return Dataset(samples, labels, materials, published.RATE_HZ, groups, spec)
+    return readers.read(Path(spec), Dataset).require_materials()
 
 
 def join(sets: Sequence[Dataset]) -> Dataset:

@@ -16,7 +16,7 @@ import numpy as np
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
-from train.data import readers, sets
+from train.data import published, readers, sets
 from train.data.readers import RecordedSweep
 from train.data.sets import Dataset, shortened
 
@@ -122,4 +122,9 @@ def known() -> str:
     lines.append(
         f"  sim:{'T-HARD:1-20':<12}{20 * total:>5} sweeps, twenty simulated scenes joined, for narrow intervals"
     )
+    lines.append(
+        f"{published.PREFIX}NAME              published series that aeon ships, taken to have {published.RATE_HZ:g} Hz; "
+        "--protocol 'split:split=0->1'"
+    )
+    lines += [f"  {published.PREFIX}{name:<17} {what}" for name, what in published.SETS.items()]
     return "\n".join(lines)
