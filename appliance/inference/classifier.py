@@ -19,7 +19,7 @@ from appliance.bundle.manifest import MEANS, Thresholds
 from appliance.core.errors import BundleError
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.novelty import Means
-from appliance.inference.session import run, session
+from appliance.inference.session import ModelRunner
 from appliance.signal import features
 from appliance.signal.contact import moved
 
@@ -119,12 +119,11 @@ class Classifier:
         self._scores: list[NDArray[np.float64]] = []  # of the object's sweeps so far
         f = bundle.format
         self.tare: NDArray[np.float64] = np.zeros((f.rows, f.cols))
-        self._session = session(bundle.model)
-        self._input: str = self._session.get_inputs()[0].name
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
-        # onnxruntime computes all outputs but creates arrays only for those that are requested
-        self._outputs = ["logits"] * (not bundle.enrolled) + ["embedding"] * (self._means is not None)
+        self._outputs = ("logits",) * (not bundle.enrolled) + ("embedding",) * (self._means is not None)
+        # with logits always, which the self-test needs; early heads get a session of their own
+        self._model = ModelRunner(bundle.model, *{"logits", *self._outputs})
 
     @property
     def rule(self) -> dict[str, Any]:
@@ -141,11 +140,15 @@ class Classifier:
 
         Frames that have not come yet may have any value: rows that depend on them are meaningless.
         """
-        return self._run(["early"], taxels)[0]
+        return self._run(("early",), taxels)[0]
+
+    def prepare_early(self) -> None:
+        """Open the session of the early heads now, so that the first sweep does not wait for it."""
+        self._model.prepare("early")
 
     def embedding(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Embedding float32 [r] of one window of raw counts [T, R, C]; the model must have this output."""
-        return self._run(["embedding"], taxels)[0]
+        return self._run(("embedding",), taxels)[0]
 
     def self_test(self) -> float:
         """Run the golden sweeps; returns the largest difference of a probability. Raises BundleError if a label differs
@@ -167,7 +170,7 @@ class Classifier:
         """Raises BundleError if the class means do not belong to the model: they give a golden sweep another label than
         the model's own logits."""
         for golden in self.bundle.golden:
-            logits, z = self._run(["logits", "embedding"], golden)
+            logits, z = self._run(("logits", "embedding"), golden)
             by_logits, by_means = logits.argmax(), means.logits(means.distances(z))[: len(logits)].argmax()
             if by_logits != by_means:
                 labels = self.bundle.manifest.labels
@@ -213,10 +216,10 @@ class Classifier:
         self._object, self._scores = before
         return None
 
-    def _run(self, outputs: list[str], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
+    def _run(self, outputs: tuple[str, ...], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
         """These outputs of the graph for one window, without the leading axis of length 1."""
         graph_input = features.given(self.bundle.manifest.input, taxels, self.bundle.format.rate_hz)
-        return [out[0] for out in run(self._session, outputs, {self._input: graph_input[None]})]
+        return self._model(outputs, graph_input)
 
     def _classify(self, taxels: NDArray[Any]) -> tuple[NDArray[np.float32], str]:
         """Logits [K] of one window, and its distance from known materials; "" if it is like one of them."""

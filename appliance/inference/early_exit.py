@@ -44,6 +44,7 @@ class Decider:
             )
         self._classifier, self._manifest, self._rule = classifier, manifest, manifest.early
         self.steps = len(self._rule.least)
+        classifier.prepare_early()
 
     def __call__(self, sweep: Sweep) -> Verdict | None:
         """The verdict on a sweep with share < 1, or None if the rest of it is needed; then nothing was counted.

@@ -1,13 +1,16 @@
 """Runs onnxruntime as the box does. In: the bytes of a model that onnx_check has accepted, and input arrays. Out: a
-session and its outputs. Errors of onnxruntime become BundleErrors.
+session and its outputs. Errors of onnxruntime become BundleErrors. What is not requested is not computed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import onnxruntime as ort
+from numpy.typing import NDArray
 
+from appliance.bundle.pruning import prune
 from appliance.core.errors import BundleError
 
 
@@ -29,7 +32,32 @@ def session(model: bytes) -> ort.InferenceSession:
         raise BundleError(f"onnxruntime {ort.__version__} refuses the model: {str(e).strip()[:200]}") from e
 
 
-def run(opened: ort.InferenceSession, outputs: list[str], given: dict[str, Any]) -> list[Any]:
+class ModelRunner:
+    """Runs one model, with a session for each group of outputs that are requested together; it has only the nodes that
+    these outputs need.
+
+    outputs: the group to begin with. Raises BundleError if onnxruntime refuses the model.
+    """
+
+    def __init__(self, model: bytes, *outputs: str) -> None:
+        self._model = model
+        self._sessions: dict[tuple[str, ...], ort.InferenceSession] = {}
+        self._input: str = self.prepare(*outputs).get_inputs()[0].name
+
+    def prepare(self, *outputs: str) -> ort.InferenceSession:
+        """The session for `outputs`: one that gives them already, or a new one. Raises BundleError as the class."""
+        able = (opened for group, opened in self._sessions.items() if set(group) >= set(outputs))
+        opened = next(able, None) or session(prune(self._model, set(outputs)))
+        self._sessions[outputs] = opened
+        return opened
+
+    def __call__(self, outputs: tuple[str, ...], given: NDArray[Any]) -> list[NDArray[Any]]:
+        """These outputs for one input `given`, without the leading axis of length 1. Raises BundleError as `run`."""
+        opened = self._sessions.get(outputs) or self.prepare(*outputs)
+        return [out[0] for out in run(opened, outputs, {self._input: given[None]})]
+
+
+def run(opened: ort.InferenceSession, outputs: Sequence[str], given: dict[str, Any]) -> list[Any]:
     """The graph's `outputs` for the input arrays `given` by name. Raises BundleError if they cannot be computed."""
     try:
         values: list[Any] = opened.run(outputs, given)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterator
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -72,6 +73,21 @@ def read(data: bytes) -> Message:
     return _Reader(data).message("model", 0, len(data))
 
 
+def fields(message: bytes) -> Iterator[tuple[int, slice, slice]]:
+    """The fields of a model or a graph that `read` has accepted, in their order: number, and where in `message` the field
+    and, without tag and length, its content stand."""
+    reader, at = _Reader(message), 0
+    while at < len(message):
+        begin = at
+        tag, at = reader.varint(at, len(message))
+        if tag & 7 == VARINT:
+            _, end = reader.varint(at, len(message))
+        else:
+            at, end = reader.block(tag, at, len(message))
+        yield tag >> 3, slice(begin, end), slice(at, end)
+        at = end
+
+
 @cache
 def _absent(kind: str) -> dict[str, Any]:
     """What a message has for each field that is not there."""
@@ -92,7 +108,7 @@ class _Reader:
         fields = FIELDS[kind]
         while at < end:
             begin = at
-            tag, at = self._varint(at, end)
+            tag, at = self.varint(at, end)
             name, holds = fields.get(tag >> 3, (f"field {tag >> 3}", REFUSED))
             if holds == REFUSED:
                 raise _wrong(begin, f"{kind}: {name}, which no model of a bundle may have")
@@ -111,16 +127,16 @@ class _Reader:
             value, at = self._value(holds, tag, at, end)
             return [value], at
         found = []
-        at, end = self._block(tag, at, end)
+        at, end = self.block(tag, at, end)
         while at < end:
-            number, at = self._varint(at, end)
+            number, at = self.varint(at, end)
             found.append(_signed(number))
         return found, end
 
     def _value(self, holds: str, tag: int, at: int, end: int) -> tuple[Any, int]:
         """What a field holds, and where the next one begins. tag: the field's number and wire type."""
         if holds in ("code", "signed") and tag & 7 == VARINT:
-            number, at = self._varint(at, end)
+            number, at = self.varint(at, end)
             if holds == "code" and number >> 31:  # onnxruntime would cut off what is beyond 31 bits
                 raise _wrong(at, f"{_signed(number)} is no code or version")
             return _signed(number), at
@@ -128,7 +144,7 @@ class _Reader:
             return self._four_bytes(holds == "floats", tag, at, end)
         if holds in ("code", "signed", "float"):
             raise _wrong(at, f"wire type {tag & 7} does not fit the field")
-        at, end = self._block(tag, at, end)
+        at, end = self.block(tag, at, end)
         if holds == "floats":
             if (end - at) % 4:
                 raise _wrong(at, f"{end - at} bytes are no floats")
@@ -142,11 +158,11 @@ class _Reader:
         except UnicodeDecodeError as e:
             raise _wrong(at, "a name is not UTF-8") from e
 
-    def _block(self, tag: int, at: int, end: int) -> tuple[int, int]:
+    def block(self, tag: int, at: int, end: int) -> tuple[int, int]:
         """Where a block of bytes behind its length begins and ends."""
         if tag & 7 != BYTES:
             raise _wrong(at, f"wire type {tag & 7} does not fit the field")
-        size, at = self._varint(at, end)
+        size, at = self.varint(at, end)
         if size > end - at:
             raise _wrong(at, f"{size} bytes are announced and {end - at} are there")
         return at, at + size
@@ -162,7 +178,7 @@ class _Reader:
         each = np.dtype([("tag", "u1"), ("value", "<f4")])
         return np.frombuffer(self._data, each, (stop - at + 1) // 5, at - 1)["value"], stop
 
-    def _varint(self, at: int, end: int) -> tuple[int, int]:
+    def varint(self, at: int, end: int) -> tuple[int, int]:
         """A number of up to 64 bits, seven in each byte, and where the next field begins."""
         self._left -= 1
         if self._left < 0:

@@ -14,7 +14,7 @@ import onnx
 from appliance.bundle.onnx_check.operators import OPERATORS
 from appliance.bundle.onnx_check.shapes import Call, Value
 from appliance.core.errors import BundleError
-from appliance.inference.classifier import session
+from appliance.inference.session import session
 from tests.factories.grown_models import FORM, Sprout
 
 TABLES = {"classlabels_ints": [0, 1], "vectors_per_class": [1, 1], "coefficients": [1.0] * 2, "rho": [0.0],

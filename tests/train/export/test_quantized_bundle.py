@@ -20,7 +20,8 @@ from appliance.cli.main import main as palpate
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import SweepFormat
-from appliance.inference.classifier import Classifier, session, softmax
+from appliance.inference.classifier import Classifier, softmax
+from appliance.inference.session import session
 from appliance.sim import skin
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
