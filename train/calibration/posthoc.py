@@ -24,7 +24,7 @@ from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.novelty import Embedding
 from train.models.compact.fit import COPIES, Fit, copies
 from train.models.linear_head import fit_temperature
-from train.onnx_tools.graph_builder import run
+from train.onnx_tools.graph_builder import joined, run
 
 Array = NDArray[Any]
 
@@ -66,10 +66,15 @@ class Posthoc:
         np.savez_compressed(packed, means=classes.means, bias=classes.bias, sweeps=classes.sweeps)
         return packed.getvalue()
 
-    def graph(self, trunk: onnx.ModelProto, known: bool = True) -> onnx.ModelProto:
-        """The model of a bundle; it has `early` where the trunk gives tenths and there is a rule."""
-        steps = self.steps if self.rule.early else None
-        return assemble_model(trunk, self.embedding, (self.weight, self.bias), steps, known)
+    def graph(
+        self, trunk: onnx.ModelProto, tenths: onnx.ModelProto | None = None, known: bool = True
+    ) -> onnx.ModelProto:
+        """The model of a bundle, from the trunk that gives `features`. It has `early` where there is a rule, and `tenths`,
+        the same trunk that gives these."""
+        head = self.weight, self.bias
+        if tenths is None or self.rule.early is None:
+            return assemble_model(trunk, self.embedding, head, known=known)
+        return assemble_model(joined(trunk, tenths), self.embedding, head, self.steps, known)
 
 
 @dataclass(frozen=True)
@@ -151,31 +156,29 @@ def assemble_model(
 ) -> onnx.ModelProto:
     """The model that a bundle holds: a trunk (float or int8) and what is fitted to it.
 
-    trunk: `sweep` -> `features` float32 [1, F], or `tenths` [1, D + 1, F], which `steps` need. head: weight [F, K], bias
-    [K]. Outputs: `logits` [1, K], `early` [1, D, K] where there are `steps`, `embedding` [1, r] where `known`.
+    trunk: `sweep` -> `features` float32 [1, F] and, where there are `steps`, `tenths` [1, D + 1, F]. head: weight [F, K],
+    bias [K]. Outputs: `logits` [1, K], `early` [1, D, K] where there are `steps`, `embedding` [1, r] where `known`. The
+    box leaves out what only `early` needs where it gives no early answers, so nothing else depends on the tenths.
     """
     model = onnx.ModelProto()
     model.CopyFrom(trunk)
-    features = trunk.graph.output[0]
-    dims = [d.dim_value for d in features.type.tensor_type.shape.dim]
     add = partial(_add, model.graph)
-    last = features.name
-    if len(dims) == 3:
-        last = add("Gather", features.name, np.array(dims[1] - 1), output="head.last", axis=1)
+    whole, *tenths = [output.name for output in trunk.graph.output]
     weight, bias = (np.asarray(part, np.float32) for part in head)
-    add("Gemm", last, weight - weight.mean(1, keepdims=True), bias - bias.mean(), output="logits")
+    add("Gemm", whole, weight - weight.mean(1, keepdims=True), bias - bias.mean(), output="logits")
     outputs: dict[str, list[int]] = {"logits": [1, len(bias)]}
-    if steps is not None and len(dims) == 3:
-        z = add("MatMul", features.name, embedding.projection, output="head.turned")
+    if steps is not None:
+        count = len(steps.weight)
+        z = add("MatMul", *tenths, embedding.projection, output="head.turned")
         z = add("Add", z, embedding.offset, output="head.each")
         # [1, D, r] -> [D, 1, r]: one head for each row
-        rows = add("Slice", z, np.array([0]), np.array([dims[1] - 1]), np.array([1]), output="head.first")
+        rows = add("Slice", z, np.array([0]), np.array([count]), np.array([1]), output="head.first")
         rows = add("Transpose", rows, output="head.rows", perm=[1, 0, 2])
         rows = add("MatMul", rows, steps.weight, output="head.steps")
         add("Transpose", add("Add", rows, steps.bias[:, None], output="head.said"), output="early", perm=[1, 0, 2])
-        outputs["early"] = [1, dims[1] - 1, len(bias)]
+        outputs["early"] = [1, count, len(bias)]
     if known:
-        add("Gemm", last, embedding.projection, embedding.offset, output="embedding")
+        add("Gemm", whole, embedding.projection, embedding.offset, output="embedding")
         outputs["embedding"] = [1, embedding.projection.shape[1]]
     del model.graph.output[:]
     for name, shape in outputs.items():

@@ -153,8 +153,9 @@ def with_posthoc(content: Content) -> Content:
         return content
     rule = done.rule
     early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
+    tenths = made.trunk(tenths=True) if rule.early else None
     return replace(
-        content, model=done.graph(made.trunk(tenths=bool(rule.early))), early=rule.early, known=done.known(),
+        content, model=done.graph(made.trunk(), tenths), early=rule.early, known=done.known(),
         means=done.means(), about=content.about | {"early": early},
     )  # fmt: skip
 

@@ -6,6 +6,7 @@ counts, or features; all scaling is inside.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,6 +86,61 @@ def with_head(trunk: onnx.ModelProto, weight: NDArray[Any], bias: NDArray[Any]) 
     graph.output.append(helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, len(bias)]))
     onnx.checker.check_model(model, full_check=True)
     return model
+
+
+def joined(first: onnx.ModelProto, second: onnx.ModelProto) -> onnx.ModelProto:
+    """One model with the outputs of both, which take the same input. What both compute alike is there once, as in `first`.
+
+    So each output needs the nodes that it had alone, and gives the same bits where the box leaves out the others.
+    """
+    model = onnx.ModelProto()
+    model.CopyFrom(first)
+    graph, suffix = model.graph, second.graph.output[0].name
+    there: dict[bytes, list[str]] = {}  # what a node or a constant is -> the names that it gives in `model`
+    same: dict[str, str] = {}  # names in the graph that is gone through -> the first name of this value in `model`
+    taken: set[str] = set()
+    for item in (*graph.initializer, *graph.node):
+        names = there.setdefault(_content(item, same), _given(item))
+        same |= zip(_given(item), names, strict=True)
+        taken.update(_given(item))
+    same = {}
+    for item in (*second.graph.initializer, *second.graph.node):
+        key = _content(item, same)
+        if key not in there:
+            there[key] = [f"{name}.{suffix}" if name in taken else name for name in _given(item)]
+            _append(graph, key, item, there[key])
+        same |= zip(_given(item), there[key], strict=True)
+    graph.output.extend(second.graph.output)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def _append(graph: onnx.GraphProto, content: bytes, item: onnx.NodeProto | onnx.TensorProto, names: list[str]) -> None:
+    """Add what `_content` gave for `item`, under new names."""
+    new = type(item).FromString(content)
+    new.name = names[0]
+    if isinstance(new, onnx.NodeProto):
+        new.output.extend(names)
+        graph.node.append(new)
+    else:
+        graph.initializer.append(new)
+
+
+def _given(item: onnx.NodeProto | onnx.TensorProto) -> list[str]:
+    """Names of what a node or a constant gives."""
+    return list(item.output) if isinstance(item, onnx.NodeProto) else [item.name]
+
+
+def _content(item: onnx.NodeProto | onnx.TensorProto, renamed: Mapping[str, str]) -> bytes:
+    """A node or a constant without its own names, with its inputs renamed: equal for two that give the same values."""
+    bare = type(item)()
+    bare.CopyFrom(item)
+    bare.ClearField("name")
+    if isinstance(bare, onnx.NodeProto):
+        inputs = [renamed.get(name, name) for name in bare.input]
+        del bare.input[:], bare.output[:]
+        bare.input.extend(inputs)
+    return bytes(bare.SerializeToString(deterministic=True))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Classes, Early, Manifest, Thresholds
+from appliance.bundle.pruning import prune
 from appliance.core.clock import SystemClock
 from appliance.inference import classifier, enrolment
 from appliance.inference import early_exit as box_early
@@ -150,7 +151,7 @@ def made():
     x, size = run(trunks, counts), 1
     done = posthoc.fit_posthoc(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
-    model = done.graph(trunks)
+    model = done.graph(trunk(FORM), trunks)
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: done.means()}
     manifest = Manifest("toy", "1", FORM, "raw", ("a", "b", "c"), Thresholds(1.0, 32767.0),
                         {k: bundle.file_entry(v) for k, v in files.items()}, early=done.rule.early, known=done.known())  # fmt: skip
@@ -172,16 +173,23 @@ def test_the_graph_gives_what_training_computed(made):
 
 
 def test_a_graph_without_tenths_has_no_early_heads(made):
-    """From a trunk of the whole window: logits and embedding alone; without a rule none either."""
+    """Without tenths: logits and embedding alone; without a rule none either."""
     done, x, counts, _, _ = made
     for model in (
         done.graph(trunk(FORM)),
-        replace(done, rule=early_exit.EarlyRule(None, "why")).graph(trunk(FORM, True)),
+        replace(done, rule=early_exit.EarlyRule(None, "why")).graph(trunk(FORM), trunk(FORM, True)),
     ):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
         assert np.allclose(
             classifier.softmax(run(model, counts[:2])), classifier.softmax(done.logits(x[:2, -1])), atol=1e-3
         )
+
+
+def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
+    """What is left without `early` is, byte for byte, the model that was never given tenths."""
+    done, _, _, _, whole = made
+    assert prune(whole.model, {"logits", "embedding"}) == done.graph(trunk(FORM)).SerializeToString()
+    assert len(prune(whole.model, {"early"})) < len(whole.model)
 
 
 def test_enrolment_is_judged_as_the_box_enrols(made):
