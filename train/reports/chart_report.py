@@ -43,6 +43,10 @@ FAMILIES = {
     "train.models.paper_cnn": "deep networks",
     "train.models.recurrent": "deep networks",
     "train.models.minirocket": "MiniRocket",
+    "train.models.minirocket_augmented": "MiniRocket",
+    "train.models.aeon_peers": "aeon",
+    "train.models.ds_cnn": "edge tools",
+    "train.models.edge_spectral": "edge tools",
 }
 OTHERS = "related work"
 TARGETS = {
@@ -99,7 +103,22 @@ FULL = Chart(
     },
     "sim:T-REAL:1",
     "sim:T-REAL:2:2",
-    (*COMPACT, "L-gauss", "L-knn", "L-svm", "H-knn", "H-svm", "minirocket", "tactnet2", "paper-cnn-centred"),
+    (
+        *COMPACT,
+        "L-gauss",
+        "L-knn",
+        "L-svm",
+        "H-knn",
+        "H-svm",
+        "minirocket",
+        "minirocket-augmented",
+        "multirocket-hydra",
+        "quant",
+        "ds-cnn",
+        "edge-spectral",
+        "tactnet2",
+        "paper-cnn-centred",
+    ),
     ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm", "st-hmp", "recurrent"),
 )
 QUICK = Chart(

@@ -72,7 +72,7 @@ OPERATORS: dict[tuple[str, str], Operator] = {
     ("", "Clip"): _op(shapes.clip, F, F, F),
     ("", "Concat"): _op(shapes.concat, (*F, *L, "int32"), most=1000, axis=INT),
     ("", "ConstantOfShape"): _op(shapes.filled, L, value=TENSOR),
-    ("", "Conv"): _op(shapes.conv, F, F, F, least=2, strides=INTS, pads=INTS, dilations=INTS),
+    ("", "Conv"): _op(shapes.conv, F, F, F, least=2, strides=INTS, pads=INTS, dilations=INTS, group=INT),
     ("", "DequantizeLinear"): _op(shapes.dequantize, _STEPPED, F, _STEPPED, axis=INT),
     ("", "Expand"): _op(shapes.expand, (*F, *U8), L),
     ("", "Flatten"): _op(shapes.flatten, ANY, axis=INT),

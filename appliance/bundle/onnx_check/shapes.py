@@ -322,9 +322,12 @@ def windows(call: Call, kernel: Shape) -> Shape:
 
 
 def conv(call: Call) -> Out:
-    """Conv, of one group."""
+    """Conv."""
     x, w = (value.shape for value in call.inputs[:2])
-    need(len(x) == len(w) > 2 and x[1] == w[1], f"weights of {list(w)} on {list(x)}")
+    groups = call.given.get("group", 1)
+    fit = len(x) == len(w) > 2 and x[1] == groups * w[1]
+    need(fit, f"weights of {list(w)} on {list(x)} with group = {groups}")
+    need(groups > 0 and w[0] % groups == 0, f"group = {groups} does not divide {w[0]} filters")
     need(len(call.inputs) == 2 or call.inputs[2].shape == w[:1], "one bias for each filter is wanted")
     return "float32", (x[0], w[0], *windows(call, w[2:]))
 

@@ -39,10 +39,14 @@ def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - ON_THE_BOX))
-def test_features_that_the_box_does_not_compute_are_refused(name: str):
-    """Before anything is trained, with the method and its features named."""
-    with pytest.raises(FormatError, match=f"'{name}' looks at the features '{METHODS[name].input}' of prior work"):
-        pack.trained(METHODS[name], tones(), 1)
+def test_what_the_box_cannot_run_is_refused(name: str):
+    """Before anything is trained, with the method and its features or its library named."""
+    method = METHODS[name]
+    why = f"looks at the features '{method.input}' of prior work"
+    if method.library:
+        why = f"runs in {method.library} alone and has no graph"
+    with pytest.raises(FormatError, match=f"'{name}' {why}"):
+        pack.trained(method, tones(), 1)
 
 
 def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -18,14 +18,14 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.data.sets import Dataset
 from train.evaluation import evaluate, fold
-from train.models import methods, paper_cnn, recurrent, training
+from train.models import ds_cnn, edge_spectral, methods, paper_cnn, recurrent, training
 from train.models.compact import fit, network
 from train.models.compact.fit import FitRecipe
 from train.models.linear_head import closed_form_head
 from train.models.methods import Effort, Method
 from train.onnx_tools import graph_builder
 
-NETS = ("paper-cnn", "paper-cnn-centred", "tactnet2", "recurrent")
+NETS = ("paper-cnn", "paper-cnn-centred", "tactnet2", "recurrent", "ds-cnn", "edge-spectral")
 NAMES = (*NETS, "compact")
 BRIEF = Effort(share=0.01, paper_steps=2)
 """Two to eight iterations: enough for what is not about accuracy."""
@@ -154,6 +154,8 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
         "paper-cnn-centred": paper_cnn.build_centred,
         "tactnet2": paper_cnn.build_tactnet2,
         "recurrent": recurrent.build_recurrent,
+        "ds-cnn": ds_cnn.build,
+        "edge-spectral": edge_spectral.build,
     }.get(name)
     counts = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
     with torch.random.fork_rng():
@@ -293,8 +295,9 @@ def test_bfloat16_is_used_where_it_is_asked_for_and_there():
 
 def test_effort_is_kept():
     """Names, iterations and logs follow the effort; methods can be sent to another process."""
-    assert tuple(m.name for m in (*paper_cnn.METHODS, *recurrent.METHODS)) == NETS
-    assert all(m.input == "raw" and "\n" not in m.about for m in (*paper_cnn.METHODS, *recurrent.METHODS))
+    networks = (*paper_cnn.METHODS, *recurrent.METHODS, *ds_cnn.METHODS, *edge_spectral.METHODS)
+    assert tuple(m.name for m in networks) == NETS
+    assert all(m.input == "raw" and "\n" not in m.about for m in networks)
     if not torch.cuda.is_available():
         assert f"{paper_cnn.PROCESSOR_STEPS} iterations" in paper_cnn.METHODS[0].about
     assert "17 iterations" in method("paper-cnn", Effort(paper_steps=17)).about

@@ -1,0 +1,87 @@
+"""DS-CNN, a small network as it is deployed on microcontrollers. In: an Effort. Out: the METHOD ds-cnn.
+
+A convolution, then four depthwise separable ones, each with batch norm, and a mean over time (Zhang et al. 2017, "Hello
+Edge"). Theirs sees an image of 49 x 10 speech features; here it sees the series of the taxels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import onnx
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from appliance.core.types import SweepFormat
+from train.models.methods import FULL_EFFORT, Effort, Method
+from train.models.networks import Network, layer_constants, texture_scale
+from train.models.training import Log, TrainingRecipe, network_method, no_log, scale_steps
+from train.onnx_tools.graph_builder import GraphBuilder, centred
+
+Array = NDArray[Any]
+CHANNELS, BLOCKS, TAPS = 64, 4, 9
+"""As in the small DS-CNN; a depthwise kernel of 3 x 3 becomes one of nine frames."""
+STEPS, FIRST_TAPS = 50, 10
+"""About so many steps of time are left after the first convolution, whose kernel has ten frames or two strides."""
+RECIPE = TrainingRecipe(ema=0.9, dropout=0.0)
+"""That of our own networks with a shorter average, as batch norms want it; no means are dropped."""
+INT8_NODES = ("Conv", "Relu")
+
+
+class DepthwiseSeparable(Network):
+    """DS-CNN over time; the taxels are the channels of its first convolution. Zero padding keeps sizes in the blocks."""
+
+    def __init__(self, form: SweepFormat, classes: int, scale: float) -> None:
+        super().__init__(form, scale)
+        self.stride = max(form.window // STEPS, 1)
+        kernel = min(max(FIRST_TAPS, 2 * self.stride), form.window)
+        layers = [nn.Conv1d(form.rows * form.cols, CHANNELS, kernel, self.stride)]
+        for _ in range(BLOCKS):
+            layers.append(nn.Conv1d(CHANNELS, CHANNELS, TAPS, padding=TAPS // 2, groups=CHANNELS))
+            layers.append(nn.Conv1d(CHANNELS, CHANNELS, 1))
+        self.convs = nn.ModuleList(layers)
+        self.norms = nn.ModuleList(nn.BatchNorm1d(CHANNELS) for _ in layers)
+        self.head = nn.Linear(CHANNELS, classes)
+
+    def _convolutions(self) -> Iterator[tuple[nn.Conv1d, nn.BatchNorm1d]]:
+        for conv, norm in zip(self.convs, self.norms, strict=True):
+            assert isinstance(conv, nn.Conv1d)
+            assert isinstance(norm, nn.BatchNorm1d)
+            yield conv, norm
+
+    def features(self, prepared: Tensor) -> Tensor:
+        """[B, R * C, T] -> means over time [B, CHANNELS]."""
+        x = prepared
+        for conv, norm in self._convolutions():
+            x = torch.relu(norm(conv(x)))
+        return x.mean(2)
+
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` -> `logits` float32 [1, K]; the batch norms are folded into the convolutions."""
+        g = GraphBuilder()
+        x = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
+        for conv, norm in self._convolutions():
+            one = fuse_conv_bn_eval(conv.eval(), norm.eval())
+            pads = [int(one.padding[0])] * 2
+            x = g("Conv", x, *layer_constants(g, one), strides=list(one.stride), pads=pads, group=one.groups)
+            x = g("Relu", x)
+        mean = g("ReduceMean", x, axes=[2], keepdims=0)
+        g("Gemm", mean, *layer_constants(g, self.head), transB=1, output="logits")
+        return g.model(self.form, "logits", self.head.out_features)
+
+
+def build(form: SweepFormat, classes: int, samples: Array) -> Network:
+    """The network with random weights; each taxel's mean is subtracted, as in the compact network."""
+    return DepthwiseSeparable(form, classes, texture_scale(samples))
+
+
+def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
+    """The method, trained with this effort. log: called after every iteration."""
+    about = "DS-CNN, as deployed on microcontrollers, over time (Zhang et al. 2017); also in int8"
+    return (network_method("ds-cnn", about, build, scale_steps(RECIPE, effort), log, int8=INT8_NODES),)
+
+
+METHODS = methods()
