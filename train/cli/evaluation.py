@@ -57,6 +57,8 @@ def _add_evaluate(add: Add) -> None:
     command.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
     command.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
     command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and random folds: 1 to N (1)")
+    command.add_argument("--each", type=int, default=0, metavar="N",
+                     help="train on N sweeps of each material, drawn by the seed: a point of a learning curve (all)")  # fmt: skip
     command.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
     options.add_effort(command)
     options.add_where(command)
@@ -103,7 +105,7 @@ def run_methods(args: argparse.Namespace) -> None:
     """One line for each method."""
     for method in methods.every().values():
         extra = f" (needs pip install 'palpate-train[{method.extra}]')" if method.extra else ""
-        print(f"{method.name:<16} {method.about}{extra}")
+        print(f"{method.name:<20} {method.about}{extra}")
 
 
 def run_evaluate(args: argparse.Namespace) -> None:
@@ -113,7 +115,10 @@ def run_evaluate(args: argparse.Namespace) -> None:
     """
     sweeps = options.load(args)
     names = options.names(args)
-    plan = evaluate.Plan(names, tuple(args.protocols), options.seeds(args), args.remove_means, options.effort(args))
+    if args.each < 0:
+        raise FormatError(f"--each {args.each} is no number of sweeps; use 1 or more, or leave it out for all")
+    seeds, effort = options.seeds(args), options.effort(args)
+    plan = evaluate.Plan(names, tuple(args.protocols), seeds, args.remove_means, effort, args.each)
     results: list[dict[str, Any]] = []
     refused: dict[str, str] = {}
     log = options.Log()
@@ -124,7 +129,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
                 log.keep(f"{result.method} cannot be used here: {result.refused}; left out")
             refused.setdefault(result.method, result.refused)
             continue
-        results.append(result.json() | {"only": args.only})
+        results.append(result.json() | {"only": args.only, "each": args.each})
         print(evaluate.line(results[-1]), flush=True)
         if args.json:
             results.sort(key=lambda r: (args.protocols.index(r["protocol"]), names.index(r["method"]), r["seed"]))

@@ -1,4 +1,4 @@
-"""The commands that write pages and plots: paper, chart, matrix, overview, bench-table."""
+"""The commands that write pages and plots: paper, chart, development, matrix, overview, bench-table."""
 
 from __future__ import annotations
 
@@ -12,11 +12,19 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.cli import options
 from train.cli.options import Add
-from train.reports import bench_table, chart_report, overview_plot, paper_experiment, plots
+from train.reports import (
+    bench_table,
+    chart_report,
+    development_experiment,
+    development_report,
+    overview_plot,
+    paper_experiment,
+    plots,
+)
 
 
 def register(add: Add) -> None:
-    """paper, chart, matrix, overview, bench-table."""
+    """paper, chart, development, matrix, overview, bench-table."""
     paper = add("paper", run_paper, "run the paper's experiment on the simulated skin and write a page about it")
     paper.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
     paper.add_argument(
@@ -34,7 +42,8 @@ def register(add: Add) -> None:
     chart.add_argument("--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)")
     chart.add_argument("--certainty", type=Path, action="append", default=[], metavar="FILE",
                      help="results.json of palpate-train certainty, for the touch time of its method")  # fmt: skip
-    for command in (paper, chart):
+    development = _add_development(add)
+    for command in (paper, chart, development):
         options.add_effort(command)
         options.add_where(command)
     matrix = add("matrix", run_matrix, "draw what evaluate wrote: methods by protocols")
@@ -49,6 +58,20 @@ def register(add: Add) -> None:
     table = add("bench-table", run_bench_table, "write the figures of make bench into the tables of documents")
     table.add_argument("figures", type=Path, metavar="FILE", help="of palpate bench --json")
     table.add_argument("documents", type=Path, nargs="+", metavar="FILE.md", help="each with <!-- bench --> markers")
+
+
+def _add_development(add: Add) -> argparse.ArgumentParser:
+    command = add("development", run_development, "evaluate methods on all development sets, and write a page about it")
+    command.add_argument("--out", type=Path, default=Path("docs/development"), metavar="DIR",
+                         help="where it goes (docs/development)")  # fmt: skip
+    command.add_argument("--method", metavar="NAME[,NAME...]", help="(ours, as fit trains it, and the peers)")
+    command.add_argument("--quick", action="store_true",
+                         help="small sets, hardly trained: to try everything out, not for figures")  # fmt: skip
+    command.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
+    command.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
+                         help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
+    command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)")
+    return command
 
 
 def run_paper(args: argparse.Namespace) -> None:
@@ -83,6 +106,22 @@ def run_chart(args: argparse.Namespace) -> None:
     if not dots:
         raise FormatError("no model is left to chart; see above, and run it without --kept")
     print(chart_report.write(args.out, dots, args.quick, charting.left_out))
+
+
+def run_development(args: argparse.Namespace) -> None:
+    """Evaluate, write the page to --out and print its path. Raises FormatError where no result of ours is there."""
+    quick: bool = args.quick
+    names = development_experiment.QUICK_METHODS if quick else development_experiment.usual_methods()
+    run = development_experiment.Development(
+        development_experiment.QUICK if quick else development_experiment.CASES,
+        tuple(args.method.split(",")) if args.method else names,
+        options.where(args), options.Log(), args.data,
+        development_experiment.QUICK_EFFORT if quick else options.effort(args), options.seeds(args),
+    )  # fmt: skip
+    figures = run.results()
+    for name, why in run.left_out.items():
+        print(f"left out: {name}: {why}")
+    print(development_report.write(figures, args.out, quick))
 
 
 def run_overview(args: argparse.Namespace) -> None:

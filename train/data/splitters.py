@@ -130,6 +130,16 @@ class Protocol:
         return recording if len(np.unique(recording)) < len(sweeps) else None
 
 
+def draw(train: Array, labels: Array, each: int, seed: int) -> Array:
+    """At most `each` of the sweeps `train` of every material, their numbers in order. labels: int [N], of all sweeps.
+
+    The same seed draws more of the same sweeps for a larger `each`, so that a learning curve adds to what was there.
+    """
+    rng = np.random.default_rng(seed)
+    mine = labels[train]
+    return np.sort(np.concatenate([rng.permutation(train[mine == label])[:each] for label in np.unique(mine)]))
+
+
 def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Array) -> Fold:
     """The masks as numbers. Raises FormatError where the sides share a recording or there is too little to train on."""
     if shared := set(recordings[train].tolist()) & set(recordings[test].tolist()):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset, digest
-from train.data.splitters import Protocol
+from train.data.splitters import Protocol, draw
 from train.evaluation import parallel
 from train.evaluation.fold import Fold, FoldTask, key, run
 from train.metrics.score import Score, fuse, interval, provenance
@@ -102,7 +102,7 @@ class Result:
         return self._counts(logits) | {key: round(value, 4) for key, value in figures.items()}
 
 
-HEADER = f"{'method':<16} {'protocol':<22} means  {'windows':<30} {'recordings':<30} {'fit s':>7} {'ms':>7}"
+HEADER = f"{'method':<20} {'protocol':<22} means  {'windows':<30} {'recordings':<30} {'fit s':>7} {'ms':>7}"
 
 
 def line(result: dict[str, Any]) -> str:
@@ -111,7 +111,7 @@ def line(result: dict[str, Any]) -> str:
     counts = [_count(result["window"], result["interval"])]
     counts.append(_count(result["recording"], result["recording_interval"]) if "recording" in result else "")
     times = f"{result['fit_s']:>7.2f} {result['ms_p50']:>7.3f}"
-    return f"{result['method']:<16} {result['protocol']:<22} {means:<6} {counts[0]:<30} {counts[1]:<30} {times}"
+    return f"{result['method']:<20} {result['protocol']:<22} {means:<6} {counts[0]:<30} {counts[1]:<30} {times}"
 
 
 def _count(count: dict[str, int], ends: Sequence[float]) -> str:
@@ -120,13 +120,24 @@ def _count(count: dict[str, int], ends: Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to evaluate: every method under every protocol with every seed, and with what effort."""
+    """What to evaluate: every method under every protocol with every seed, and with what effort.
+
+    each: training sweeps of each material, drawn by the seed from those of a fold; 0 for all.
+    """
 
     methods: Sequence[str]
     protocols: Sequence[str]
     seeds: Sequence[int] = (1,)
     means_removed: bool = False
     effort: Effort = FULL_EFFORT
+    each: int = 0
+
+    def folds(self, sweeps: Dataset, protocol: str, seed: int) -> list[tuple[Array, Array]]:
+        """Pairs (training, test) of sweep numbers. Raises FormatError where the protocol does not fit the set."""
+        pairs = Protocol(protocol).folds(sweeps, seed)
+        if not self.each:
+            return pairs
+        return [(draw(train, sweeps.labels, self.each, seed), test) for train, test in pairs]
 
 
 @dataclass(frozen=True)
@@ -149,7 +160,7 @@ def evaluate(
     known = known_methods.find(plan.methods, plan.effort)
     sweeps = sweeps.without_means() if plan.means_removed else sweeps
     origin = {"digest": digest(sweeps)} | provenance()
-    splits = {(p, s): Protocol(p).folds(sweeps, s) for p in plan.protocols for s in plan.seeds}
+    splits = {(p, s): plan.folds(sweeps, p, s) for p in plan.protocols for s in plan.seeds}
     progress = parallel.Progress(len(known) * sum(map(len, splits.values())), log)
     for kind in dict.fromkeys(method.input for method in known):
         same = [method.name for method in known if method.input == kind]

@@ -12,7 +12,7 @@ from sklearn.naive_bayes import GaussianNB
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset
-from train.data.splitters import Protocol
+from train.data.splitters import Protocol, draw
 
 
 def a_set(labels: list[int], **groups: list[int]) -> Dataset:
@@ -129,3 +129,16 @@ def test_clusters_are_what_was_left_out_or_recordings():
     assert Protocol("leave:position").clusters(GRID).tolist() == GRID.groups["position"].tolist()
     assert Protocol("random:3").clusters(GRID).tolist() == GRID.groups["recording"].tolist()
     assert Protocol("random:3").clusters(a_set([0, 1])) is None
+
+
+def test_a_learning_curve_adds_to_what_was_there():
+    """So many of each material, from the training side alone, the same for the same seed; all where there are fewer."""
+    labels = np.repeat([0, 1, 2], [20, 8, 3])
+    train = np.flatnonzero(np.arange(31) % 5)
+    few, more = (draw(train, labels, each, 1) for each in (2, 6))
+    assert np.bincount(labels[few]).tolist() == [2, 2, 2]
+    assert np.bincount(labels[more]).tolist() == [6, 6, 2]
+    assert set(few) <= set(more) <= set(train)
+    assert more.tolist() == sorted(more)
+    assert draw(train, labels, 6, 1).tolist() == more.tolist() != draw(train, labels, 6, 2).tolist()
+    assert draw(train, labels, 99, 1).tolist() == train.tolist()

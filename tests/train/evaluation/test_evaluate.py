@@ -327,6 +327,21 @@ def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.Mon
         pack.trained(alone, tones(), 1)
 
 
+def test_a_point_of_a_learning_curve_is_trained_on_so_many(monkeypatch: pytest.MonkeyPatch):
+    """Of each material in each fold; what is tested stays."""
+    seen: list[np.ndarray] = []
+    (sound,) = methods.find(["L-gauss"])
+
+    def watched(sweeps: Dataset, inputs: np.ndarray, seed: int) -> methods.Model:
+        seen.append(np.bincount(sweeps.labels))
+        return sound.train(sweeps, inputs, seed)
+
+    monkeypatch.setattr(methods, "every", lambda effort=methods.FULL_EFFORT: {"L-gauss": replace(sound, train=watched)})
+    (result,) = every(tones(), HERE, "L-gauss", each=5)
+    assert np.array(seen).tolist() == [[5, 5, 5]] * 3
+    assert result.json()["window"]["total"] == 36
+
+
 def test_trained_on_one_set_and_tested_on_another(tmp_path: Path):
     """Two sets make one with a group `set`: T-REAL against T-HARD."""
     out = tmp_path / "r.json"
@@ -335,7 +350,9 @@ def test_trained_on_one_set_and_tested_on_another(tmp_path: Path):
     assert json.loads(out.read_text())[0]["window"]["total"] == 6
 
 
-@pytest.mark.parametrize("args", [("--seeds", "0"), ("--method", "nobody"), ("--protocol", "loo"), ("--only", "x=1")])
+@pytest.mark.parametrize(
+    "args", [("--seeds", "0"), ("--each", "-2"), ("--method", "nobody"), ("--protocol", "loo"), ("--only", "x=1")]
+)
 def test_bad_arguments_are_one_line(args: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """With the value and what to try."""
     tones().save(tmp_path / "t.npz")

@@ -1,0 +1,206 @@
+"""The development page. In: the figures of development_experiment. Out: results.json, two pictures and a page.
+
+Nothing is computed here but means and differences of what was measured.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from train.reports import html
+from train.reports.development_experiment import EACH, OURS
+from train.reports.formatting import percent, points
+from train.reports.plot_style import (
+    ACCENT,
+    BLACK,
+    FAINT,
+    GREY,
+    SMALL,
+    WIDTH,
+    add_axes,
+    set_categories,
+    set_ticks,
+    single_axes,
+    to_svg,
+)
+
+Json = Mapping[str, Any]
+Accuracies = Mapping[str, Json]
+"""Entries of one case with all training sweeps, by method."""
+LOOKS: tuple[Mapping[str, Any], ...] = (
+    {"color": ACCENT, "linewidth": 2.0},
+    {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))},
+)
+THIN: Mapping[str, Any] = {"color": GREY, "linewidth": 0.7, "alpha": 0.7}
+
+
+def write(figures: Json, out: Path, quick: bool = False) -> Path:
+    """results.json, the pictures and the page in the folder `out`; the page's path.
+
+    Raises FormatError where there is no result of a method of ours.
+    """
+    page, pictures = render(figures, quick)
+    put(out / "results.json", (json.dumps(figures, allow_nan=False) + "\n").encode(), parents=True)
+    for name, svg in pictures.items():
+        put(out / f"{name}.svg", svg.encode(), parents=True)
+    put(out / "index.html", page.encode(), parents=True)
+    return out / "index.html"
+
+
+def render(figures: Json, quick: bool = False) -> tuple[str, dict[str, str]]:
+    """The page (HTML) and its pictures (SVG) by name."""
+    table = by_case(figures["results"])
+    ours = subject(table)
+    names = [name for name in figures["methods"] if any(name in row for row in table.values())]
+    peers = [name for name in names if name not in OURS]
+    cases = [about["case"] for about in figures["cases"] if ours in table.get(about["case"], {})]
+    pictures = {"accuracy": accuracy_picture({case: table[case] for case in cases}, ours, peers)}
+    curves = learning_curves(figures["results"])
+    if curves:
+        pictures["curves"] = curve_picture(curves, ours, _most_accurate(table, peers))
+    rows = [_row(case, table[case], ours, names, peers) for case in cases]
+    page = html.render(
+        "development.html.j2", figures=figures, quick=quick, ours=ours, names=names, rows=rows,
+        mean=mean_row(table, cases, ours, names, peers), curves=_curve_rows(curves, names),
+        pictures={name: html.picture(svg) for name, svg in pictures.items()}, each=EACH,
+        about=[[one["case"], f"{one['set']}{', '.join(['', *one['only']])}", one["protocol"], one["sweeps"],
+                one["materials"], one["digest"]] for one in figures["cases"]],
+        costs=[[name, *_costs(table, name)] for name in names],
+    )  # fmt: skip
+    return page, pictures
+
+
+def by_case(results: Iterable[Json]) -> dict[str, dict[str, Json]]:
+    """Entries with all training sweeps: {case: {method: entry}}."""
+    table: dict[str, dict[str, Json]] = {}
+    for entry in results:
+        if not entry["each"]:
+            table.setdefault(entry["case"], {})[entry["method"]] = entry
+    return table
+
+
+def subject(table: Mapping[str, Accuracies]) -> str:
+    """The first of OURS with a result. Raises FormatError where there is none."""
+    for name in OURS:
+        if any(name in row for row in table.values()):
+            return name
+    raise FormatError(f"no result of {' or '.join(OURS)}; run the command without --kept, or with one of them")
+
+
+def best(row: Accuracies, peers: Sequence[str]) -> str:
+    """The most accurate peer of a case; "" where none has a result."""
+    return max((name for name in peers if name in row), key=lambda name: float(row[name]["mean"]), default="")
+
+
+def _row(case: str, row: Accuracies, ours: str, names: Sequence[str], peers: Sequence[str]) -> Json:
+    """A line of the table. difference: ours less the best peer, in points."""
+    leader = best(row, peers)
+    difference = points(row[ours]["mean"] - row[leader]["mean"], sign=True) if leader else "–"
+    return {"case": case, "cells": [row.get(name) for name in names], "best": leader, "difference": difference}
+
+
+def mean_row(
+    table: Mapping[str, Accuracies], cases: Sequence[str], ours: str, names: Sequence[str], peers: Sequence[str]
+) -> Json:
+    """Mean accuracies over the cases that all methods have; of the best peer on that mean, and how often ours is near.
+
+    within: cases in which ours is no more than one point below the best peer, of `of` that have a peer.
+    """
+    shared = [case for case in cases if all(name in table[case] for name in names)]
+    means = {name: float(np.mean([table[case][name]["mean"] for case in shared])) for name in names if shared}
+    leader = max((name for name in peers if name in means), key=lambda name: means[name], default="")
+    gaps = [table[c][ours]["mean"] - table[c][b]["mean"] for c in cases if (b := best(table[c], peers))]
+    return {
+        "shared": len(shared), "best": leader, "cells": [percent(means[name]) if means else "–" for name in names],
+        "difference": points(means[ours] - means[leader], sign=True) if leader else "–",
+        "within": sum(gap >= -0.01 - 1e-9 for gap in gaps), "of": len(gaps),
+    }  # fmt: skip
+
+
+def learning_curves(results: Iterable[Json]) -> dict[str, dict[str, dict[int, Json]]]:
+    """{case: {method: {training sweeps of each material, 0 for all: entry}}} of cases that have more than one."""
+    curves: dict[str, dict[str, dict[int, Json]]] = {}
+    for entry in results:
+        curves.setdefault(entry["case"], {}).setdefault(entry["method"], {})[entry["each"]] = entry
+    return {case: lines for case, lines in curves.items() if any(set(line) & set(EACH) for line in lines.values())}
+
+
+def _curve_rows(curves: Mapping[str, Any], names: Sequence[str]) -> list[Json]:
+    """Lines of the table of learning curves. cells: an entry or None for each of EACH, and for all."""
+    return [
+        {"case": case, "method": name, "cells": [lines[name].get(each) for each in (*EACH, 0)]}
+        for case, lines in curves.items() for name in names if name in lines
+    ]  # fmt: skip
+
+
+def _most_accurate(table: Mapping[str, Accuracies], peers: Sequence[str]) -> str:
+    """The peer that is the best one of the most cases."""
+    wins = [best(row, peers) for row in table.values()]
+    return max(peers, key=wins.count, default="")
+
+
+def _costs(table: Mapping[str, Accuracies], name: str) -> tuple[str, str]:
+    """Times of a method over all cases: to train a fold in s, and of a sweep in ms; medians."""
+    entries = [row[name] for row in table.values() if name in row]
+    fit_s, ms = (float(np.median([entry[cost] for entry in entries])) for cost in ("fit_s", "ms_p50"))
+    return f"{fit_s:.2f}", f"{ms:.3f}"
+
+
+def accuracy_picture(table: Mapping[str, Accuracies], ours: str, peers: Sequence[str]) -> str:
+    """A line for each case: every peer a grey dot, ours in the accent colour with its interval."""
+    figure, axes = single_axes(0.29 * len(table) + 0.75, left=0.43, right=0.93, top=0.35, bottom=0.3)
+    lows = []
+    for y, (case, row) in enumerate(table.items()):
+        there = [float(row[name]["mean"]) for name in peers if name in row]
+        axes.plot(there, [y] * len(there), "o", color=GREY, markersize=4, alpha=0.6)
+        axes.plot([row[ours]["low"], row[ours]["high"]], [y, y], color=ACCENT, linewidth=1.2)
+        axes.plot(row[ours]["mean"], y, "o", color=ACCENT, markersize=6)
+        axes.annotate(case, (0, y), (-8, 0), ("axes fraction", "data"), textcoords="offset points", ha="right",
+                      va="center", color=BLACK, size=SMALL)  # fmt: skip
+        lows += [row[ours]["low"], *there]
+    axes.set_ylim(len(table) - 0.5, -0.5)
+    _shares(axes, lows)
+    axes.grid(axis="x", color=FAINT, linewidth=0.6)
+    set_ticks(axes.yaxis, [])
+    for text, x, colour in ((f"● {ours}, 95 %", 0.0, ACCENT), ("● peers", 0.55, GREY)):
+        axes.annotate(text, (x, 1), (0, 8), "axes fraction", textcoords="offset points", color=colour, size=SMALL + 0.5)
+    return to_svg(figure, f"accuracy of {ours} and its peers on each development set")
+
+
+def _shares(axes: Axes, lows: Sequence[float]) -> None:
+    """The horizontal axis, in per cent, from the next fifth below all to 1."""
+    low = np.floor(5 * min(lows, default=0) - 1e-9) / 5
+    axes.set_xlim(low, 1.005)
+    set_ticks(axes.xaxis, np.arange(low, 1.01, 0.1 if low > 0.5 else 0.2), percent=True)
+
+
+def curve_picture(curves: Mapping[str, Any], ours: str, peer: str) -> str:
+    """A plot for each case: accuracy over training sweeps of a material; ours and one peer stand out."""
+    figure, each = Figure((WIDTH, 0.3 + 2.1 * len(curves))), 2.1
+    inch = 1 / figure.get_figheight()
+    at = {n: x for x, n in enumerate((*EACH, 0))}
+    for i, (text, look) in enumerate([(f"━ {ours}", LOOKS[0]), (f"╍ {peer}", LOOKS[1]), ("thin: the others", THIN)]):
+        figure.text(0.01 + 0.33 * i, 1 - 0.18 * inch, text, color=look["color"], size=SMALL + 0.5)
+    for number, (case, lines) in enumerate(curves.items()):
+        top = 1 - inch * (0.55 + each * number)
+        axes = add_axes(figure, 0.12, 0.97, top, top - inch * 1.45)
+        for name in sorted(lines, key=lambda name: name in (ours, peer)):
+            look = LOOKS[0] if name == ours else LOOKS[1] if name == peer else THIN
+            line = sorted(lines[name].items(), key=lambda item: at[item[0]])
+            axes.plot([at[n] for n, _ in line], [entry["mean"] for _, entry in line], **look)
+        axes.set_title(case, color=BLACK, size=SMALL + 0.5, loc="left", pad=4)
+        axes.grid(axis="y", color=FAINT, linewidth=0.6)
+        axes.set_xlim(-0.1, len(EACH) + 0.1)
+        axes.set_ylim(0, 1.02)
+        set_ticks(axes.yaxis, [0, 0.25, 0.5, 0.75, 1], percent=True)
+        set_categories(axes.xaxis, range(len(EACH) + 1), [*map(str, EACH), "all"])
+    return to_svg(figure, "accuracy over training sweeps of each material")
