@@ -29,7 +29,7 @@ EACH = (5, 10, 20)
 
 
 @dataclass(frozen=True)
-class Case:
+class DevelopmentCase:
     """One set under one protocol. means_removed: each taxel's mean over the window is taken away. curve: with EACH."""
 
     name: str
@@ -41,19 +41,19 @@ class Case:
 FOUR = ("material=BeigeCotton,BrownCotton,Canvas,Linen",)
 
 
-def _fabrics(name: str, protocol: str, only: tuple[str, ...], curve: bool = False) -> Case:
-    return Case(name, ChartPart((FABRICS,), protocol, only, real=True), curve=curve)
+def _fabrics(name: str, protocol: str, only: tuple[str, ...], curve: bool = False) -> DevelopmentCase:
+    return DevelopmentCase(name, ChartPart((FABRICS,), protocol, only, real=True), curve=curve)
 
 
-def _published(name: str) -> Case:
-    return Case(f"{name}, published split", ChartPart((f"aeon:{name}",), "split:split=0->1"))
+def _published(name: str) -> DevelopmentCase:
+    return DevelopmentCase(f"{name}, published split", ChartPart((f"aeon:{name}",), "split:split=0->1"))
 
 
 REAL = ChartPart(("sim:T-REAL:1",), "leave:position")
 HARD = ChartPart(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1")
 CASES = (
-    Case("simulated tubes, a position out", REAL, means_removed=False, curve=True),
-    Case("simulated tubes, attached anew", HARD, means_removed=False),
+    DevelopmentCase("simulated tubes, a position out", REAL, means_removed=False, curve=True),
+    DevelopmentCase("simulated tubes, attached anew", HARD, means_removed=False),
     _fabrics("7 fabrics, a force out", "leave:force", SEVEN, curve=True),
     _fabrics("7 fabrics, a speed out", "leave:speed", SEVEN),
     _fabrics("7 fabrics, a repetition out", "leave:rep", SEVEN),
@@ -64,9 +64,9 @@ CASES = (
 )
 """In the order of the page; they are run from the last, which is the cheapest."""
 QUICK = (
-    Case("simulated tubes, a position out",
+    DevelopmentCase("simulated tubes, a position out",
          ChartPart(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)), means_removed=False, curve=True),
-    Case("simulated tubes, attached anew",
+    DevelopmentCase("simulated tubes, attached anew",
          ChartPart(("sim:T-REAL:1001:3", "sim:T-HARD:1001-1002:2"), "split:set=0->1", ("position<=2",)), means_removed=False),
 )  # fmt: skip
 QUICK_METHODS = ("compact", "edge-spectral", "L-gauss")
@@ -83,7 +83,7 @@ def usual_methods() -> tuple[str, ...]:
 class Development:
     """One run of the command. left_out: what is missing, and why."""
 
-    cases: Sequence[Case]
+    cases: Sequence[DevelopmentCase]
     names: Sequence[str]
     where: Where
     log: Log
@@ -109,7 +109,7 @@ class Development:
         listed = {"cases": cases[::-1], "results": found, "left_out": self.left_out}
         return known | score.provenance() | listed
 
-    def _evaluated(self, case: Case, sweeps: Dataset, each: int, what: str) -> Iterator[Json]:
+    def _evaluated(self, case: DevelopmentCase, sweeps: Dataset, each: int, what: str) -> Iterator[Json]:
         """One entry for each method that can take the set and is complete with all seeds that were found."""
         plan = Plan(self.names, (case.part.protocol,), self.seeds, case.means_removed, self.effort, each)
         by_method: dict[str, list[Json]] = {}
@@ -126,7 +126,7 @@ class Development:
             yield {"case": case.name, "each": each, "method": method} | _entry(results)
 
 
-def _about(case: Case, sweeps: Dataset) -> Json:
+def _about(case: DevelopmentCase, sweeps: Dataset) -> Json:
     """What a case was run on."""
     return {
         "case": case.name, "set": sweeps.source, "only": list(case.part.only), "protocol": case.part.protocol,

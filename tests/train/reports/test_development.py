@@ -19,7 +19,7 @@ from train.metrics.score import Score
 from train.models import methods
 from train.reports import development_experiment, development_report
 from train.reports.chart_report import ChartPart
-from train.reports.development_experiment import Case, Development
+from train.reports.development_experiment import DevelopmentCase, Development
 
 
 def entry(case: str, method: str, mean: float, each: int = 0) -> dict[str, Any]:
@@ -96,8 +96,8 @@ def experiment(folder: Path, *names: str, **given: Any) -> Development:
     tones().save(folder / "tones.npz")
     short = replace(tones(), samples=tones().samples[:, :7])
     short.save(folder / "short.npz")
-    cases = [Case("tones", ChartPart(("tones.npz",), "leave:session", real=True), curve=True),
-             Case("short", ChartPart(("short.npz",), "split:session=0,1->2", ("material=a,c",), real=True))]  # fmt: skip
+    cases = [DevelopmentCase("tones", ChartPart(("tones.npz",), "leave:session", real=True), curve=True),
+             DevelopmentCase("short", ChartPart(("short.npz",), "split:session=0,1->2", ("material=a,c",), real=True))]  # fmt: skip
     where = Where(jobs=1, cache=folder / "cache")
     settings = {"where": where, "log": lambda line: None, "data": folder} | given
     return Development(cases, names, **settings)
