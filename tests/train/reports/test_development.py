@@ -19,7 +19,7 @@ from train.metrics.score import Score
 from train.models import methods
 from train.reports import development_experiment, development_report
 from train.reports.chart_report import ChartPart
-from train.reports.development_experiment import DevelopmentCase, Development
+from train.reports.development_experiment import Development, DevelopmentCase
 
 
 def entry(case: str, method: str, mean: float, each: int = 0) -> dict[str, Any]:
