@@ -95,6 +95,8 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
 def fill_dead_taxels(load: NDArray[np.float64]) -> NDArray[np.float64]:
     """`load` [R, C] in counts (0 and less: not loaded) with dead taxels filled in: a silent one between two loaded ones
     of its row or column gets their mean. A contact has no hole, and a hole would shift its centre."""
+    if (load > 0).all():
+        return load
     padded = np.zeros((load.shape[0] + 2, load.shape[1] + 2))
     padded[1:-1, 1:-1] = load
     sides = np.stack([
