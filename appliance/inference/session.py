@@ -9,9 +9,11 @@ from typing import Any
 
 import onnxruntime as ort
 from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state
 
 from appliance.bundle.pruning import prune
 from appliance.core.errors import BundleError
+from appliance.inference.code_pages import give_back
 
 
 def session(model: bytes) -> ort.InferenceSession:
@@ -47,7 +49,10 @@ class ModelRunner:
     def prepare(self, *outputs: str) -> ort.InferenceSession:
         """The session for `outputs`: one that gives them already, or a new one. Raises BundleError as the class."""
         able = (opened for group, opened in self._sessions.items() if set(group) >= set(outputs))
-        opened = next(able, None) or session(prune(self._model, set(outputs)))
+        opened = next(able, None)
+        if opened is None:
+            opened = session(prune(self._model, set(outputs)))
+            give_back(onnxruntime_pybind11_state.__file__)
         self._sessions[outputs] = opened
         return opened
 

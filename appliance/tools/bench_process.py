@@ -1,7 +1,7 @@
 """The figures of the bench that are measured in a process of their own: memory and processor share.
 
 In: recorded sweeps and a way to build a box. Out: figures. The simulated skin is not loaded here: it is no part of the
-box.
+box. Nor is the simulated board, but it must be: it is loaded last, so that what it takes is measured.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
+import gpiod  # noqa: F401 - the box's, which the simulated lines import as well
 import numpy as np
 
-from appliance.core.clock import SystemClock
+from appliance.core.clock import Clock, SystemClock
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.runtime.loop import Box
-from appliance.sim import devices, rig
+
+if TYPE_CHECKING:
+    from appliance.sim import devices, rig
 
 MEMORY_SWEEPS, STREAM_S = 1000, 15.0
 NAMES = ("memory", "stream")
@@ -48,9 +51,17 @@ def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
 
 def measure(name: str, fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """The part `name` of NAMES, measured in this process while the acts in `path` are played again and again."""
+    return {"memory": _memory, "stream": _stream}[name](fmt, build, path)
+
+
+def _board(fmt: SweepFormat, path: Path, clock: Clock | None = None) -> devices.SimDevices:
+    """Devices that play the acts in `path`, in virtual time where there is no clock."""
+    from appliance.sim import devices, rig
+
     with np.load(path, allow_pickle=False) as z:
         acts = [rig.Act(z[key], int(key.split()[1]), int(key.split()[2]), "") for key in z]
-    return {"memory": _memory, "stream": _stream}[name](fmt, build, acts)
+    # the acts that a simulator remembers are no part of the box
+    return devices.build(fmt, cycle(acts), clock or rig.VirtualClock(), "sim", remember=False)
 
 
 def drain(far_end: int) -> None:
@@ -59,15 +70,16 @@ def drain(far_end: int) -> None:
         os.read(far_end, 65536)
 
 
-def _memory(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str, Any]:
+def _memory(fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """Resident memory (2**20 bytes, as ps and systemd count) after MEMORY_SWEEPS sweeps.
 
-    growth_last_900: since a tenth of them, with what the allocator takes at first. growth_next_900: from then on.
+    without_board: less what loading the simulated board and its acts took. What the board takes while it plays is still
+    in it. growth_last_900: since a tenth of them, with what the allocator takes at first. growth_next_900: from then on.
     """
-    n = MEMORY_SWEEPS
-    # the acts that a simulator remembers are no part of the box
-    simulated = devices.build(fmt, cycle(acts), rig.VirtualClock(), "sim", remember=False)
-    rss_mb = {}
+    n, rss_mb = MEMORY_SWEEPS, {}
+    board = -_rss_mb()
+    simulated = _board(fmt, path)
+    board += _rss_mb()
     with ExitStack() as stack:
         box, far_end = build(simulated, stack)
         while box.answered < n * 19 // 10:
@@ -75,7 +87,10 @@ def _memory(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str
                 rss_mb[box.answered] = _rss_mb()
             drain(far_end)
     first, after, later = rss_mb.values()
-    figures = {"after_1000": after, "growth_last_900": after - first, "growth_next_900": later - after}
+    figures = {
+        "after_1000": after, "without_board": after - board,
+        "growth_last_900": after - first, "growth_next_900": later - after,
+    }  # fmt: skip
     return {"rss_mb": {name: round(value, 2) for name, value in figures.items()}}
 
 
@@ -84,9 +99,9 @@ def _rss_mb() -> float:
     return pages * os.sysconf("SC_PAGESIZE") / 2**20
 
 
-def _stream(fmt: SweepFormat, build: Build, acts: Iterable[rig.Act]) -> dict[str, Any]:
+def _stream(fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """Share of one core while the skin streams in real time, without and with the simulated readout board."""
-    simulated = devices.build(fmt, cycle(acts), SystemClock(), "sim")
+    simulated = _board(fmt, path, SystemClock())
     board_ns = 0
     real_read = simulated.backend.bulk_read
 

@@ -128,6 +128,14 @@ def test_the_table_has_a_row_for_each_figure(figures: dict[str, Any]):
         assert re.search(rf"^\| [^|]*{words}[^|]* \| {value}", text, flags=re.M), words
 
 
+def test_memory_without_the_simulated_board_has_its_row(figures: dict[str, Any]):
+    """Behind the memory with it, in figures of a bench that has measured it."""
+    figures["rss_mb"] |= {"after_1000": 56.64, "without_board": 56.21}
+    rows = bench_table.table(figures).splitlines()
+    (at,) = (i for i, row in enumerate(rows) if row.startswith("| resident memory after 1,000 sweeps"))
+    assert rows[at + 1] == "| of it without the simulated readout board | 56.2 MiB |"
+
+
 @pytest.mark.parametrize("text", ["", BEGIN, f"{END}{BEGIN}", f"{BEGIN}{END}{BEGIN}{END}"])
 def test_a_document_without_one_pair_of_markers_is_named(text: str, figures: dict[str, Any]):
     """FormatError with the document's name and what to do."""
