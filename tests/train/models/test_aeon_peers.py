@@ -67,6 +67,18 @@ def test_small_windows_and_one_channel(name: str, frames: int, taxels: int):
 
 @pytest.mark.slow
 @names
+def test_silence_and_single_sweeps_are_no_trouble(name: str):
+    """A training set without any signal, a taxel without one, one sweep of each material: logits are finite."""
+    pytest.importorskip("aeon")
+    sweeps = easy(4)
+    silent = replace(sweeps, samples=np.full_like(sweeps.samples, 7))
+    dead = replace(sweeps, samples=sweeps.samples * np.array([[0, 1], [1, 1]], np.uint8))
+    for given in (silent, dead, easy(1)):
+        assert np.isfinite(train(name, given).logits(sweeps.samples)).all()
+
+
+@pytest.mark.slow
+@names
 def test_a_seed_gives_one_model_and_random_states_stay(name: str):
     """The same logits for the same seed, others for another; numpy's and PyTorch's streams go on."""
     pytest.importorskip("aeon")
