@@ -67,12 +67,20 @@ def inspect(taxels: NDArray[Any], tare: NDArray[np.float64], limits: Thresholds)
         return Finding(Status.STUCK_TAXEL, _taxels(stuck))
     if full.mean() > limits.saturated:
         return Finding(Status.SATURATED, _taxels(full > 0))
-    padded = np.ones((tare.shape[0] + 2, tare.shape[1] + 2), bool)
-    padded[1:-1, 1:-1] = loaded
-    dead = still & ~loaded & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
-    if dead.sum() > limits.dead_taxels:
-        return Finding(Status.DEAD_TAXEL, _taxels(dead))
+    silent = still & ~loaded
+    if silent.any():
+        dead = silent & _enclosed(loaded)
+        if dead.sum() > limits.dead_taxels:
+            return Finding(Status.DEAD_TAXEL, _taxels(dead))
     return Finding(Status.OK)
+
+
+def _enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether all direct neighbours of a taxel are loaded, bool [R, C]; what is beyond the skin's edge counts as loaded."""
+    padded = np.ones((loaded.shape[0] + 2, loaded.shape[1] + 2), bool)
+    padded[1:-1, 1:-1] = loaded
+    enclosed: NDArray[np.bool_] = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    return enclosed
 
 
 def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
