@@ -184,15 +184,20 @@ def folds(
 ) -> Iterator[tuple[Any, Fold]]:
     """Every task's Fold: those in the cache first, then the others as they finish.
 
-    data: digest of `sweeps`. kind: the input of the tasks' methods; where it cannot be computed all are refused.
+    On this machine an interrupted training of the paper's CNN goes on from a file beside the folds. data: digest of
+    `sweeps`. kind: the input of the tasks' methods; where it cannot be computed all are refused.
     """
     paths = {name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache}
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()
-    left = [named for named in tasks.items() if named[0] not in kept and not where.kept]
-    for name, fold in _trained(left, sweeps, kind, where):
+    left = {name: task for name, task in tasks.items() if name not in kept and not where.kept}
+    unfinished = {name: path.with_suffix(".pt") for name, path in paths.items()}
+    if where.cache and not where.scheduler:
+        left = {name: task.kept_in(unfinished[name]) for name, task in left.items()}
+    for name, fold in _trained(list(left.items()), sweeps, kind, where):
         if where.cache:
             fold.save(paths[name])
+            unfinished[name].unlink(missing_ok=True)
         yield name, fold
 
 

@@ -12,7 +12,7 @@ import json
 import time
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -58,6 +58,10 @@ class FoldTask:
     seed: int
     train: Array
     test: Array
+
+    def kept_in(self, path: Path) -> FoldTask:
+        """The same fold, whose unfinished training is kept in this file."""
+        return replace(self, effort=replace(self.effort, unfinished=path))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -43,12 +44,14 @@ class Effort:
     """How long networks are trained, for all of them.
 
     share: of each network's default iterations. paper_steps: of the paper's CNN; None for the paper's 4,000 on a GPU and
-    fewer on a processor. bfloat16: compute the paper's CNN in it, where the processor can.
+    fewer on a processor. bfloat16: compute the paper's CNN in it, where the processor can. unfinished: a file that keeps
+    the training of the paper's CNN from time to time, so that it goes on after an interruption.
     """
 
     share: float = 1.0
     paper_steps: int | None = None
     bfloat16: bool = False
+    unfinished: Path | None = None
 
 
 FULL_EFFORT = Effort()

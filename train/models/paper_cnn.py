@@ -164,9 +164,8 @@ def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ..
 
     def paper(name: str, about: str, build: Build) -> Method:
         """As printed: trained on everything, so that no temperature is found."""
-        return network_method(
-            name, about, build, recipe, log, calibrated=False, bfloat16=effort.bfloat16, int8=INT8_NODES
-        )
+        return network_method(name, about, build, recipe, log, calibrated=False, bfloat16=effort.bfloat16,
+                              int8=INT8_NODES, unfinished=effort.unfinished)  # fmt: skip
 
     return (
         paper("paper-cnn", f"the paper's CNN on raw counts (section IV), {recipe.steps} iterations", build_paper_cnn),

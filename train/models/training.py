@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,6 +25,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
 from train.data.sets import Dataset
+from train.models.checkpoint import Checkpoint, Stateful, default_generators
 from train.models.linear_head import fit_temperature, hold_out
 from train.models.methods import Effort, Method, Model
 from train.models.networks import Network
@@ -140,12 +142,14 @@ def learn(
     device: str = "cpu",
     bfloat16: bool = False,
     augment: Augment = unchanged,
+    unfinished: Path | None = None,
 ) -> tuple[Net, Cost]:
     """Train by gradient descent; gives the moving average of the weights, ready for inference on the processor, and the
     cost of each step.
 
     augment: changes sweeps [B, R * C, T], drawn anew in each step, before gain and noise. bfloat16: multiply in it.
-    Dropout is drawn from PyTorch's global generator: the caller seeds and forks it.
+    Dropout is drawn from PyTorch's global generator: the caller seeds and forks it. unfinished: a file that keeps the
+    training from time to time, and from which it goes on with the same bits.
     """
     rng, n = torch.Generator().manual_seed(seed), len(sweeps)
     rounds = -(-recipe.steps * recipe.batch // n)
@@ -155,9 +159,12 @@ def learn(
     schedule = _schedule(optimizer, recipe)
     average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
     labels = torch.from_numpy(sweeps.labels.astype(np.int64))
-    picks, cost = order.split(recipe.batch), []
+    parts: dict[str, Stateful] = {"model": model, "optimizer": optimizer, "schedule": schedule, "average": average}
+    checkpoint = Checkpoint(unfinished, parts, (rng, *default_generators(device)))
+    cost = checkpoint.load()
+    picks = order.split(recipe.batch)[len(cost) :]
     model.train().dropout = recipe.dropout
-    for step, (pick, counts) in enumerate(zip(picks, float_batches(sweeps.samples, picks), strict=True), 1):
+    for step, (pick, counts) in enumerate(zip(picks, float_batches(sweeps.samples, picks), strict=True), len(cost) + 1):
         x = perturbed(augment(model.prepare(counts), rng), recipe, rng).to(device)
         optimizer.zero_grad()
         with torch.autocast(device, torch.bfloat16, enabled=bfloat16):
@@ -165,6 +172,7 @@ def learn(
         optimizer.step()
         schedule.step()
         average.update_parameters(model)
+        checkpoint.save(cost)
         log(f"step {step}/{recipe.steps} loss {cost[-1][1]:.3f}")
     averaged = average.module
     assert isinstance(averaged, type(model))
@@ -215,19 +223,20 @@ def train_network(
     bfloat16: bool,
     log: Log,
     int8: Sequence[str] = (),
+    unfinished: Path | None = None,
 ) -> NetworkModel:
     """Train what `build` gives on the materials that occur in `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
     A material that does not occur gets a logit that no sweep can raise. calibrated: hold some groups out for the
     temperature; else all are trained on, with temperature 1. int8: kinds of nodes that the form "int8" has in int8;
-    without any there is no such form. Raises FormatError where only one material occurs.
+    without any there is no such form. unfinished: as in `learn`. Raises FormatError where only one material occurs.
     """
     known = replace(sweeps, samples=inputs).select(())
     train, held_out = hold_out_or_all(known, seed)[:2] if calibrated else (known, known)
     with deterministic_device(seed) as device:
         half = bfloat16 and (device == "cuda" or bool(torch.cpu.get_capabilities().get("avx512_bf16")))
         network = build(train.format, len(train.materials), train.samples)
-        network, cost = learn(network, train, recipe, seed, log, device, half)
+        network, cost = learn(network, train, recipe, seed, log, device, half, unfinished=unfinished)
         trained = NetworkModel(network, describe_run(recipe, device, half, bfloat16), cost)
     temperature = fit_temperature(trained.logits(held_out.samples), held_out.labels) if calibrated else 1.0
     network.expand_head(np.unique(sweeps.labels), len(sweeps.materials), temperature)
@@ -244,11 +253,13 @@ def network_method(
     calibrated: bool = True,
     bfloat16: bool = False,
     int8: Sequence[str] = (),
+    unfinished: Path | None = None,
 ) -> Method:
     """The Method of this name that trains what `build` gives; see train_network."""
     train = partial(
-        train_network, build=build, recipe=recipe, calibrated=calibrated, bfloat16=bfloat16, log=log, int8=int8
-    )
+        train_network, build=build, recipe=recipe, calibrated=calibrated, bfloat16=bfloat16, log=log, int8=int8,
+        unfinished=unfinished,
+    )  # fmt: skip
     return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations{', bfloat16' * bfloat16}")
 
 
