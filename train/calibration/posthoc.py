@@ -22,7 +22,8 @@ from appliance.inference.classifier import softmax
 from train.calibration import early_exit, novelty
 from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.novelty import Embedding
-from train.models.compact.fit import COPIES, Fit, copies
+from train.models.compact.copies import copies
+from train.models.compact.fit import COPIES, Fit
 from train.models.linear_head import fit_temperature
 from train.onnx_tools.graph_builder import joined, run
 
@@ -107,7 +108,7 @@ def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, Augmented
     tenths = run(fit.trunk(tenths=True), np.concatenate([train.samples, held.samples]))
     labels, groups = np.append(train.labels, held.labels), np.append(train.group(by), held.group(by))
     trunk = fit.trunk()
-    augmented = copies(fit.network(), train, fit.augment, fit.about["seed"])
+    augmented = copies(train, fit.augmentation, fit.about["seed"], COPIES)
     features = np.concatenate([run(trunk, copy.samples) for copy in augmented])
     copied = AugmentedCopies(features, np.tile(train.labels, COPIES), np.tile(train.group(by), COPIES))
     return tenths, labels, groups, np.arange(len(labels)) >= len(train), fit.bands, copied

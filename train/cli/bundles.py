@@ -16,6 +16,7 @@ from train.export import measure, pack, quantized_bundle, sign
 from train.models import methods
 from train.models.compact import fit
 from train.models.compact.architectures import ARCHITECTURES, DEFAULT
+from train.models.compact.augment import default_augmentation
 
 
 def register(add: Add) -> None:
@@ -109,7 +110,7 @@ def run_fit(args: argparse.Namespace) -> None:
             print(f"rest: {len(rest)} sweeps in {args.rest}")
     architecture = ARCHITECTURES.get(args.size, DEFAULT)
     changes = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
-    augmentation = replace(fit.default_augmentation(sweeps.format, architecture), **changes)
+    augmentation = replace(default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes)
     recipe = fit.FitRecipe(steps=args.steps, augmentation=augmentation, keep_means=args.keep_means)
     made = fit.fit(sweeps, args.seed, recipe, options.Log(), architecture)
     made.save(args.out)

@@ -17,7 +17,8 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from appliance.core.types import SweepFormat
 from train.models.methods import FULL_EFFORT, Effort, Method
-from train.models.networks import Network, layer_constants, texture_scale
+from train.models.networks import Network, layer_constants
+from train.models.scale import texture_scale
 from train.models.training import Log, TrainingRecipe, network_method, no_log, scale_steps
 from train.onnx_tools.graph_builder import GraphBuilder, centred
 

@@ -17,7 +17,8 @@ from torch.nn import functional
 
 from appliance.core.types import SweepFormat
 from train.models.methods import FULL_EFFORT, Effort, Method
-from train.models.networks import Network, layer_constants, texture_scale
+from train.models.networks import Network, layer_constants
+from train.models.scale import texture_scale
 from train.models.training import (
     Log,
     TrainingRecipe,

@@ -9,18 +9,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset
 from train.models import minirocket
 from train.models.compact.architectures import DEFAULT
-from train.models.compact.augment import SLOW, Augmentation, augment
+from train.models.compact.augment import SLOW, Augmentation, default_augmentation
+from train.models.compact.copies import copies
 from train.models.linear_head import LinearHeadModel
 from train.models.methods import Method
-from train.models.networks import texture_scale
-from train.models.training import batches, float_batches, one_thread
 
 Array = NDArray[Any]
 COPIES = 2
@@ -34,33 +32,16 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
     Raises FormatError as minirocket.train does.
     """
     known = replace(sweeps, samples=inputs, groups=sweeps.groups | {"recording": sweeps.group("recording")})
-    samples = np.concatenate([inputs, *(changed(known, seed + copy) for copy in range(COPIES))])
+    changed = copies(known, augmentation(known.format.window), seed, COPIES)
+    samples = np.concatenate([inputs, *(copy.samples for copy in changed)])
     several = replace(known.take(np.tile(np.arange(len(known)), COPIES + 1)), samples=samples)
     return minirocket.train(several, several.samples, seed)
-
-
-def changed(sweeps: Dataset, seed: int) -> Array:
-    """The raw counts [N, T, R, C] of `sweeps`, augmented as by default for their format; of the same data type."""
-    form, kind, scale = sweeps.format, sweeps.samples.dtype, texture_scale(sweeps.samples)
-    what = augmentation(form.window)
-    rng, found = torch.Generator().manual_seed(seed), np.empty_like(sweeps.samples)
-    picks = batches(len(sweeps))
-    with one_thread():
-        for pick, counts in zip(picks, float_batches(sweeps.samples, picks), strict=True):
-            x = counts.flatten(2).transpose(1, 2)
-            means = x.mean(2, keepdim=True)
-            x = augment((x - means) * scale, form.rows, what, rng) / scale + means
-            x = x.transpose(1, 2).unflatten(2, counts.shape[2:])
-            if kind.kind != "f":
-                x = x.round().clamp(np.iinfo(kind).min, np.iinfo(kind).max)
-            found[pick.numpy()] = x.numpy()
-    return found
 
 
 def augmentation(window: int) -> Augmentation:
     """That of our own training for a window of so many frames; of one that our networks cannot take, as for slow sensors."""
     try:
-        return Augmentation() if DEFAULT.zero_sum(window) else SLOW
+        return default_augmentation(DEFAULT.zero_sum(window))
     except FormatError:
         return SLOW
 

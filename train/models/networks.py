@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, Self
 
-import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
@@ -79,12 +78,6 @@ class Network(nn.Module, ABC):
     @abstractmethod
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K], as in inference."""
-
-
-def texture_scale(samples: Array) -> float:
-    """The factor that gives raw counts [N, T, R, C] a deviation of 1 once each taxel's mean over its sweep is subtracted."""
-    deviation = samples - samples.mean(axis=1, keepdims=True, dtype=np.float32)
-    return float(1 / max(np.sqrt(np.mean(deviation**2)), 1e-6))
 
 
 def layer_constants(g: GraphBuilder, layer: nn.Linear | nn.Conv1d | nn.Conv2d) -> tuple[str, str]:

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from appliance.core.types import SweepFormat
 from train.models.methods import FULL_EFFORT, Effort, Method
-from train.models.networks import Network, layer_constants, texture_scale
+from train.models.networks import Network, layer_constants
+from train.models.scale import texture_scale
 from train.models.training import Log, TrainingRecipe, network_method, no_log, scale_steps
 from train.onnx_tools.graph_builder import GraphBuilder, centred
 

@@ -113,7 +113,7 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: P
     run = session(model.SerializeToString())
     assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [("sweep", [1, 64, 2, 2], "tensor(uint8)")]
     assert [(o.name, o.shape, o.type) for o in run.get_outputs()] == [
-        (name, [1, size], "tensor(float)") for name, size in (("logits", 3), ("embedding", 2))
+        (name, [1, size], "tensor(float)") for name, size in (("logits", 3), ("embedding", 2 + fitted.bands))
     ]
 
 

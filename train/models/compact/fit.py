@@ -8,7 +8,7 @@ one temperature that makes probabilities honest. No random state outside is read
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import chain, product
@@ -28,12 +28,14 @@ from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from train.data.sets import Dataset
 from train.metrics.score import accuracy_figure
 from train.models import training
-from train.models.compact import augment, graph, spectrum
+from train.models.compact import graph, spectrum
 from train.models.compact.architectures import DEFAULT, Architecture
-from train.models.compact.augment import SLOW, Augmentation
+from train.models.compact.augment import Augmentation, augment, default_augmentation
+from train.models.compact.copies import copies
 from train.models.compact.network import Compact
 from train.models.linear_head import closed_form_head, hold_out
-from train.models.networks import Network, texture_scale
+from train.models.networks import Network
+from train.models.scale import texture_scale
 from train.models.training import Augment, Cost, Log, batches, float_batches, learn, no_log, one_thread
 from train.onnx_tools.graph_builder import run
 
@@ -94,9 +96,9 @@ class Fit:
         return self.architecture.spectrum * spectrum.count(self.train.format)
 
     @property
-    def augment(self) -> Augment:
-        """The augmentation of its training, for sweeps of its format."""
-        return augmenter(self.train.format, Augmentation(**self.about["recipe"]["scene"]))
+    def augmentation(self) -> Augmentation:
+        """The augmentation of its training."""
+        return Augmentation(**self.about["recipe"]["scene"])
 
     def network(self) -> Compact:
         """The network in PyTorch, ready to run."""
@@ -175,20 +177,19 @@ def fit_on(
     form, bands = train.format, spectrum.count(train.format)
     if not (architecture.channels or bands):
         raise FormatError(f"a window of {form.window} frames is too short for a spectrum; take another size")
-    recipe = replace(recipe, augmentation=recipe.augmentation or default_augmentation(form, architecture))
-    assert recipe.augmentation
-    scale, change = texture_scale(train.samples), augmenter(form, recipe.augmentation)
+    augmentation = recipe.augmentation or default_augmentation(architecture.zero_sum(form.window))
+    recipe, scale = replace(recipe, augmentation=augmentation), texture_scale(train.samples)
     with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
         model, cost = Compact(form, len(train.materials), scale, architecture=architecture), Cost()
         if architecture.channels:
             with torch.enable_grad():
-                model, cost = learn(model, train, recipe, seed, log, augment=change)
+                model, cost = learn(model, train, recipe, seed, log, augment=augmenter(form, augmentation))
         else:
             model = model.fused()
         model.keep_means, model.architecture = recipe.keep_means, replace(architecture, spectrum=bands > 0)
         ranges = model.ranges(train.samples)
-        inputs = _head_inputs(model, ranges, train, held, copies(model, train, change, seed))
+        inputs = _head_inputs(model, ranges, train, held, copies(train, augmentation, seed, COPIES))
         model, weights = _select_depth(model, inputs, np.tile(train.labels, COPIES + 1), held.labels)
         logits = features(model, held) @ weights["head.weight"].T + weights["head.bias"]
     right = int(np.sum(logits.argmax(1) == held.labels))
@@ -247,33 +248,14 @@ def _select_depth(
     return model, {k: v.numpy() for k, v in model.state_dict().items()} | head_weights
 
 
-def default_augmentation(form: SweepFormat, architecture: Architecture) -> Augmentation:
-    """The augmentation where none is given: SLOW for a sensor that is too slow for kernels that sum to zero."""
-    return Augmentation() if architecture.zero_sum(form.window) else SLOW
-
-
 def augmenter(form: SweepFormat, augmentation: Augmentation) -> Augment:
-    """augment.augment for sweeps of `form`, as the training loop calls it."""
+    """`augment` for sweeps of `form`, as the training loop calls it: in PyTorch, seeded by its generator."""
 
     def change(x: Tensor, rng: Generator) -> Tensor:
-        return augment.augment(x, form.rows, augmentation, rng)
+        seed = int(torch.randint(2**63 - 1, (), generator=rng))
+        return torch.from_numpy(augment(x.numpy(), form.rows, augmentation, np.random.default_rng(seed)))
 
     return change
-
-
-def copies(model: Compact, sweeps: Dataset, change: Augment, seed: int) -> Iterator[Dataset]:
-    """The sweeps again, COPIES times, changed: they show the head how materials vary."""
-    rng, kind = torch.Generator().manual_seed(seed), sweeps.samples.dtype
-    for _ in range(COPIES):
-        changed = np.empty_like(sweeps.samples)
-        picks = batches(len(sweeps))
-        for pick, counts in zip(picks, float_batches(sweeps.samples, picks), strict=True):
-            x = change(model.prepare(counts), rng) / model.scale
-            x = x.transpose(1, 2).unflatten(2, counts.shape[2:]) + counts.mean(1, keepdim=True)
-            if kind.kind != "f":
-                x = x.round().clamp(np.iinfo(kind).min, np.iinfo(kind).max)
-            changed[pick.numpy()] = x.numpy()
-        yield replace(sweeps, samples=changed)
 
 
 @torch.no_grad()

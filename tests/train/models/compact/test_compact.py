@@ -354,22 +354,18 @@ def test_a_fit_without_a_convolution_survives_its_file(bare: compact_methods.Com
         assert again.trunk(int8=False, tenths=tenths) == again.trunk(tenths=tenths)
 
 
-def test_copies_are_augmented_raw_counts():
-    """No augmentation: the same sweeps, twice. The default one: others, of the same type, the same for the same seed."""
-    for s in (easy(4), replace(easy(4), samples=easy(4).samples.astype(np.float32) / 7)):
-        model = Compact(s.format, 3, 0.1, architecture=SMALL)
-        still = Augmentation(shift=0, gain=0, gains=0, silent=0, damped=0, colour=0, noise=0)
-        both = [
-            [c.samples for c in fit.copies(model, s, fit.augmenter(s.format, one), 5)]
-            for one in (still, Augmentation(), Augmentation())
-        ]
-        assert len(both[0]) == fit.COPIES
-        for same, other, again in zip(*both, strict=True):
-            np.testing.assert_allclose(same, s.samples, atol=0 if same.dtype == np.uint8 else 1e-3)
-            assert other.dtype == s.samples.dtype
-            assert (other != s.samples).any(axis=(1, 2, 3)).all()
-            np.testing.assert_array_equal(other, again)
-        assert not np.array_equal(*both[1])
+@pytest.mark.parametrize("frames", [64, 1500])
+def test_training_augments_as_its_generator_says(frames: int):
+    """What PyTorch trains on: the same for the same state of its generator, which moves on; the sweeps stay as they are."""
+    form, x = SweepFormat(2, 2, 100.0, frames, "uint8"), torch.randn(6, frames, 4).transpose(1, 2)
+    before, rng, again = x.clone(), torch.Generator().manual_seed(3), torch.Generator().manual_seed(3)
+    change = fit.augmenter(form, Augmentation())
+    first, second, same = change(x, rng), change(x, rng), change(x, again)
+    assert first.shape == x.shape
+    assert first.dtype == torch.float32
+    assert torch.equal(first, same)
+    assert not torch.equal(first, second)
+    assert torch.equal(x, before)
 
 
 def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
