@@ -37,6 +37,7 @@ from appliance.bundle.manifest import (
     Early,
     Known,
     Manifest,
+    Moved,
     Thresholds,
 )
 from appliance.bundle.onnx_check import check
@@ -51,7 +52,7 @@ except ImportError:  # Python 3.11
 
 __all__ = [
     "DEFAULT", "GOLDEN", "GOLDEN_TOLERANCE", "INPUTS", "LABEL", "MANIFEST", "MEANS", "MODEL", "SIGNATURE",
-    "Bundle", "Classes", "Early", "Known", "Manifest", "Thresholds", "digest", "file_entry", "files",
+    "Bundle", "Classes", "Early", "Known", "Manifest", "Moved", "MovedClasses", "Thresholds", "digest", "file_entry", "files",
     "from_files", "identity", "load",
 ]  # fmt: skip
 DEFAULT = Path(__file__).parents[1] / "default_bundle"
@@ -63,18 +64,43 @@ GOLDEN_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True, slots=True)
+class MovedClasses:
+    """The classes as they are where the contact has moved, in the embedding turned so that moved sweeps have covariance 1.
+
+    turn: float32 [r, r], embedding @ turn is the turned one. means: float32 [K, r]; shapes: float16 [K, b, b], see
+    Classes.
+    """
+
+    turn: NDArray[np.float32]
+    means: NDArray[np.float32]
+    shapes: NDArray[np.float16]
+
+
+@dataclass(frozen=True, slots=True)
 class Classes:
     """Content of means.npz: the class means in the embedding, in the order of the labels.
 
     means: float32 [K, r]. bias: float32 [K], added to the product of mean and embedding. sweeps: int64 [K], number of
     sweeps that a label was enrolled from; 0 for a trained label. spread: float32 [K], variance of the label's sweeps
     per direction of the embedding; 1 for a trained label, and for all labels if the file has no such array.
+    shapes: float16 [K, b, b], how the label's sweeps scatter in the last b directions of the embedding: what a difference
+    from the mean is multiplied by before it is squared; 1 for an enrolled label, b = 0 if the file has no such array.
+    moved: the same for sweeps whose contact has moved, None if the manifest has no `moved`.
     """
 
     means: NDArray[np.float32]
     bias: NDArray[np.float32]
     sweeps: NDArray[np.int64]
     spread: NDArray[np.float32]
+    shapes: NDArray[np.float16]
+    moved: MovedClasses | None = None
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of means.npz by name."""
+        own = {name: getattr(self, name) for name in self.__slots__ if name != "moved"}
+        return own | (
+            {f"moved_{name}": getattr(self.moved, name) for name in self.moved.__slots__} if self.moved else {}
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,25 +245,44 @@ def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.f
 def _classes(data: bytes, manifest: Manifest) -> Classes:
     """Content of means.npz: one row per label, trained labels first."""
     n = len(manifest.labels)
-    arrays = {"spread": np.ones(n, np.float32)} | _arrays(data, MEANS, "means", "bias", "sweeps")
-    found = Classes(*(arrays[name] for name in Classes.__slots__))
-    for name, kind in (("means", "float32"), ("bias", "float32"), ("sweeps", "int64"), ("spread", "float32")):
-        values = arrays[name]
-        if values.dtype != kind or values.ndim != 1 + (name == "means") or len(values) != n or 0 in values.shape:
-            raise BundleError(
-                f"{MEANS} holds {name} {values.dtype} {values.shape} for {n} labels; {kind} is wanted, a row a label"
-            )
-        if not np.isfinite(values).all():
-            raise BundleError(f"{MEANS} holds {name} that are not finite; export the bundle again")
-    sweeps = found.sweeps
-    if not (found.spread > 0).all():
-        raise BundleError(
-            f"{MEANS} holds spread {found.spread.tolist()}, which must be above 0; export the bundle again"
-        )
+    moved = [f"moved_{name}" for name in MovedClasses.__slots__] if manifest.moved else []
+    arrays = _arrays(data, MEANS, "means", "bias", "sweeps", *moved)
+    arrays.setdefault("spread", np.ones(n, np.float32))
+    arrays.setdefault("shapes", np.zeros((n, 0, 0), np.float16))
+    _check_class_arrays(arrays, n)
+    sweeps = arrays["sweeps"]
     if sweeps[0] or (sweeps[1:] < np.sign(sweeps[:-1])).any():
         raise BundleError(f"{MEANS} holds sweeps {sweeps.tolist()}; trained labels (0) come first, enrolled ones after")
     if manifest.early and sweeps.any():
         raise BundleError(
             "manifest has `early`, whose heads do not know the enrolled labels; enrol again from the original"
         )
-    return found
+    return Classes(
+        arrays["means"], arrays["bias"], sweeps, arrays["spread"], arrays["shapes"],
+        MovedClasses(*(arrays[name] for name in moved)) if moved else None,
+    )  # fmt: skip
+
+
+def _check_class_arrays(arrays: Mapping[str, NDArray[Any]], n: int) -> None:
+    """Raises BundleError if an array of means.npz has another type or shape than `n` labels have, or a number out of
+    range."""
+    rank = arrays["means"].shape[-1] if arrays["means"].ndim else 0
+    rows = {"means": (n, rank), "bias": (n,), "sweeps": (n,), "spread": (n,), "shapes": (n, 0, 0), "moved_turn": (rank, rank),
+            "moved_means": (n, rank), "moved_shapes": (n, 0, 0)}  # fmt: skip
+    kinds = {"sweeps": "int64", "shapes": "float16", "moved_shapes": "float16"}
+    for name, wanted in rows.items():
+        if name not in arrays:
+            continue
+        values, kind, shape = arrays[name], kinds.get(name, "float32"), arrays[name].shape
+        if name.endswith("shapes") and len(shape) == 3 and shape[1] <= rank:
+            wanted = (n, shape[1], shape[1])
+        if values.dtype != kind or shape != wanted or (not name.endswith("shapes") and 0 in shape):
+            raise BundleError(
+                f"{MEANS} holds {name} {values.dtype} {shape} for {n} labels; {kind} {list(wanted)} is wanted, a row a label"
+            )
+        if not np.isfinite(values).all():
+            raise BundleError(f"{MEANS} holds {name} that are not finite; export the bundle again")
+    if not (arrays["spread"] > 0).all():
+        raise BundleError(
+            f"{MEANS} holds spread {arrays['spread'].tolist()}, which must be above 0; export the bundle again"
+        )

@@ -18,13 +18,15 @@ from appliance.core.types import SweepFormat
 from appliance.signal import features
 from appliance.signal.contact import ContactPositions
 
-SCHEMA = 3
-"""Version that is written. Versions 1 (without `early`, `known`) and 2 (without `runtime`, `counter`, `place`) are
-read."""
+SCHEMA = 4
+"""Version that is written. Versions 1 (without `early`, `known`), 2 (without `runtime`, `counter`, `place`) and 3 (without
+`moved`) are read."""
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
 LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
 """Form of a label. It is sent in sentences, so it has no comma, star or dollar sign and at most 24 characters."""
+UNSURE = 0.5
+"""Least probability for status ok where a bundle names none."""
 MOST_BYTES = 64 << 20
 """Largest file. The largest of our models, the paper's network in int8, has 16 MB; the service is limited to 128 MB."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -44,7 +46,7 @@ class Thresholds:
     full_scale: float
     saturated: float = 0.01
     dead_taxels: int = 0
-    unsure: float = 0.5
+    unsure: float = UNSURE
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +79,29 @@ class Known:
     temperature: float
 
     def __post_init__(self) -> None:
-        for name, value in (("limit", self.limit), ("temperature", self.temperature)):
-            if not _positive(value):
-                raise BundleError(f"known.{name} {value!r} must be a number above 0")
+        _check_positive(self, "known")
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """Rule for sweeps whose contact has moved, by `place`. Raises BundleError for a number out of range.
+
+    limit: as that of Known, for distances between moved sweeps. temperature: divisor of logits that are calibrated for
+    sweeps in place. unsure: least probability for status ok; above 1 no such sweep is ok by itself.
+    """
+
+    limit: float
+    temperature: float
+    unsure: float
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "moved")
+
+
+def _check_positive(rule: Known | Moved, where: str) -> None:
+    for name in rule.__slots__:
+        if not _positive(value := getattr(rule, name)):
+            raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
 
 
 def _positive(value: object) -> bool:
@@ -91,8 +113,8 @@ class Manifest:
     """The manifest of a bundle. Raises BundleError for values out of range.
 
     input: "raw" or a feature set. files: name -> sha256 and size. figures: results by evaluation protocol. made:
-    commit, seed and machine of the export. early, known, place: rules for early answers and unknown materials, and
-    contact positions of training; None if the bundle does not support them.
+    commit, seed and machine of the export. early, known, place, moved: rules for early answers and unknown materials,
+    contact positions of training, and the rule for contacts elsewhere; None if the bundle does not support them.
     runtime: least version of the box that can run it. counter: increases with each signed bundle, so that an older one
     cannot be installed unnoticed; 0 was never signed.
     """
@@ -109,6 +131,7 @@ class Manifest:
     early: Early | None = None
     known: Known | None = None
     place: ContactPositions | None = None
+    moved: Moved | None = None
     runtime: str = "0.0.0"
     counter: int = 0
     schema: int = SCHEMA
@@ -124,6 +147,8 @@ class Manifest:
         _check_files(self.files)
         if (self.known is not None) != (MEANS in self.files):
             raise BundleError(f"manifest must have both `known` and {MEANS}, or neither; export the bundle again")
+        if self.moved and not (self.known and self.place):
+            raise BundleError("manifest has `moved` without `known` and `place`; export the bundle again")
         if self.early and self.input != "raw":
             raise BundleError(
                 f"manifest has `early`, but input {self.input!r} needs the whole window; export it without"
@@ -163,6 +188,8 @@ def _check_age(m: Manifest) -> None:
         raise BundleError("manifest schema 1 has no `early` and no `known`; export the bundle again")
     if m.schema < 3 and (m.place or m.counter or m.runtime != "0.0.0"):
         raise BundleError(f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle again")
+    if m.schema < 4 and m.moved:
+        raise BundleError(f"manifest schema {m.schema} has no `moved`; export the bundle again")
 
 
 def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:

@@ -109,6 +109,8 @@ class Classifier:
     """Runs one bundle in one thread.
 
     Sweeps with the same `object` number above 0 are fused; without NEW OBJECT each sweep is answered by itself.
+    A sweep whose contact has moved is judged by the bundle's rule for it, where there is one: its own distances, limit and
+    temperature, and at least its probability.
     They are a sequential test: `unsure` asks for one more sweep of the object, until the probability is at least
     `min_probability` (ok) or `max_sweeps` were fused (undecided, the final answer). If the robot continues all the
     same, the same rule applies to all sweeps of the object, since no evidence is discarded.
@@ -132,6 +134,8 @@ class Classifier:
         self.tare: NDArray[np.float64] = np.zeros((f.rows, f.cols))
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
+        rule = bundle.manifest.moved
+        self._moved_means = Means(classes, known, bundle.manifest.labels, rule) if rule and known and classes else None
         self._outputs = ("logits",) * (not bundle.enrolled) + ("embedding",) * (self._means is not None)
         # with logits always, which the self-test needs; early heads get a session of their own
         self._model = ModelRunner(bundle.model, *{"logits", *self._outputs})
@@ -197,26 +201,28 @@ class Classifier:
             finding = inspect(sweep.frames.taxels, self.tare, self.bundle.manifest.thresholds)
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
-        logits, novelty = self._classify(sweep.frames.taxels)
+        moved, rule = self._moved(sweep), self.bundle.manifest.moved
+        logits, novelty = self._classify(sweep.frames.taxels, bool(moved))
         if novelty:
-            return self._verdict(sweep, Finding(Status.UNKNOWN, novelty))
-        return self.conclude(sweep, softmax(logits))
+            return self._verdict(sweep, Finding(Status.UNKNOWN, novelty), moved=moved)
+        return self.conclude(sweep, softmax(logits / (rule.temperature if moved and rule else 1)), moved)
 
-    def conclude(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict:
+    def conclude(self, sweep: Sweep, scores: NDArray[np.float64], moved: str | None = None) -> Verdict:
         """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with its object's other
-        sweeps."""
+        sweeps. moved: what `_moved` gave for it, computed where it is None."""
+        moved = self._moved(sweep) if moved is None else moved
         if math.isnan(scores[0]):  # all are NaN or none; float32 counts can overflow the network
-            return self._verdict(sweep, Finding(Status.UNKNOWN, "the model gives no number"))
+            return self._verdict(sweep, Finding(Status.UNKNOWN, "the model gives no number"), moved=moved)
         if sweep.object == 0 or sweep.object != self._object or self._fusion == "none":
             self._object, self._scores = sweep.object, []
         own, self._scores = scores, [*self._scores, scores]
         fused = len(self._scores)
         if fused > 1:
             scores = fuse(self._scores, self._fusion)
-        status = Status.OK
-        if scores.max() < self.min_probability:
+        status, rule = Status.OK, self.bundle.manifest.moved
+        if scores.max() < max(self.min_probability, rule.unsure if moved and rule else 0):
             status = Status.UNDECIDED if 0 < self._max_sweeps <= fused else Status.UNSURE
-        return self._verdict(sweep, Finding(status), scores, fused, own)
+        return self._verdict(sweep, Finding(status), scores, fused, own, moved)
 
     def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
         """As `conclude` if that gives ok; otherwise None, and the sweep, which is still going on, is not counted."""
@@ -232,14 +238,17 @@ class Classifier:
         graph_input = features.given(self.bundle.manifest.input, taxels, self.bundle.format.rate_hz)
         return self._model(outputs, graph_input)
 
-    def _classify(self, taxels: NDArray[Any]) -> tuple[NDArray[np.float32], str]:
-        """Logits [K] of one window, and its distance from known materials; "" if it is like one of them."""
+    def _classify(self, taxels: NDArray[Any], moved: bool = False) -> tuple[NDArray[np.float32], str]:
+        """Logits [K] of one window, and its distance from known materials; "" if it is like one of them.
+
+        moved: whether its contact has moved; what that changes then does not make a material unknown.
+        """
         values = self._run(self._outputs, taxels)
-        if self._means is None:
+        means = self._moved_means if moved and self._moved_means else self._means
+        if means is None:
             return values[0], ""
-        distances = self._means.distances(values[-1])
-        logits = self._means.logits(distances) if len(self._outputs) == 1 else values[0]
-        return logits, self._means.novelty(distances)
+        logits = means.logits(means.distances(values[-1])) if len(self._outputs) == 1 else values[0]
+        return logits, means.novelty(values[-1])
 
     def _moved(self, sweep: Sweep) -> str:
         """Distance of the contact from its positions in training, "" if it is at one of them."""
@@ -248,10 +257,9 @@ class Classifier:
 
     def _verdict(
         self, sweep: Sweep, finding: Finding, scores: NDArray[np.float64] = _NONE, fused: int = 0,
-        own: NDArray[np.float64] = _NONE,
+        own: NDArray[np.float64] = _NONE, moved: str = "",
     ) -> Verdict:  # fmt: skip
         label, best, second = "", 0.0, 0.0
-        moved = self._moved(sweep) if len(own) or finding.status is Status.UNKNOWN else ""
         if len(scores):
             order = np.argsort(-scores, kind="stable")  # of equal ones the first, as argmax
             label, best, second = self.bundle.manifest.labels[order[0]], scores[order[0]], scores[order[1]]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle, Classes, Manifest
+from appliance.bundle.bundle import Bundle, Classes, Manifest, MovedClasses
 from appliance.core import storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError, BundleError, FormatError
@@ -98,17 +98,30 @@ def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
     Its mean m is that of the sweeps. Its bias is -|m|^2 / 2 + r / (2 n), since |m|^2 of a mean of n sweeps is on
     average larger than that of the true mean, by r / n. Its spread is computed from the sweeps and one assumed sweep at
     squared distance r, the average of trained labels, and is at least 1, that of trained labels: the embedding of
-    materials that were not in training scatters more.
+    materials that were not in training scatters more. Its shape is that of all materials together. A moved skin is
+    assumed to change its mean as it changes those of the trained labels on average.
     """
     n, r = z.shape
-    mean = z.mean(axis=0)
+    mean, moved = z.mean(axis=0), classes.moved
     spread = max(1.0, (r + ((z - mean) ** 2).sum()) / (r * n))
+    if moved:
+        trained = classes.sweeps == 0
+        change = (moved.means - classes.means.astype(np.float64) @ moved.turn)[trained].mean(axis=0)
+        means = np.vstack([moved.means, mean @ moved.turn + change]).astype(np.float32)
+        moved = MovedClasses(moved.turn, means, _one_more(moved.shapes))
     return Classes(
         np.vstack([classes.means, mean]).astype(np.float32),
         np.append(classes.bias, -(mean @ mean) / 2 + r / (2 * n)).astype(np.float32),
         np.append(classes.sweeps, n),
         np.append(classes.spread, spread).astype(np.float32),
+        _one_more(classes.shapes),
+        moved,
     )
+
+
+def _one_more(shapes: NDArray[np.float16]) -> NDArray[np.float16]:
+    """`shapes` [K, b, b] with that of all materials together as the last one [K + 1, b, b]."""
+    return np.concatenate([shapes, np.eye(shapes.shape[1], dtype=np.float16)[None]])
 
 
 def _median(scores: NDArray[np.float64]) -> int:
@@ -127,7 +140,7 @@ def _packed(new: Bundle, warnings: tuple[str, ...]) -> Enrolment:
     files = {
         bundle.MODEL: new.model,
         bundle.GOLDEN: _npz(samples=new.golden, logits=new.golden_logits),
-        bundle.MEANS: _npz(**{name: getattr(new.classes, name) for name in Classes.__slots__}),
+        bundle.MEANS: _npz(**new.classes.arrays()),
     }
     manifest: Manifest = replace(new.manifest, files={k: bundle.file_entry(v) for k, v in files.items()})
     files[bundle.MANIFEST] = manifest.json()

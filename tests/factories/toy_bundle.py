@@ -14,12 +14,17 @@ import numpy as np
 import pytest
 
 from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle, Early, Known, Manifest, Thresholds
+from appliance.bundle.bundle import Bundle, Early, Known, Manifest, Moved, Thresholds
 from appliance.core.types import Frames, Status, Sweep, SweepFormat
+from appliance.signal.contact import ContactPositions
 
 FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
 MEANS = np.array([[0, 0], [6, 0], [0, 6]], np.float32)
 KNOWN = Known(limit=9.0, temperature=2.0)
+MOVED = Moved(limit=4.0, temperature=3.0, unsure=0.75)
+"""Rule for moved sweeps, with the arrays of `moved_arrays`."""
+IN_PLACE = ContactPositions(1.0, (0.5,), (0.5,), 0.25)
+"""The contact of a sweep with a small embedding is in the middle; a larger one draws it aside by up to this limit."""
 LIMITS = Thresholds(contact=10, full_scale=32767, unsure=0.5)
 OUTPUTS = ("logits", "embedding")
 
@@ -95,9 +100,20 @@ def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
     return {"means": MEANS, "bias": bias, "sweeps": np.zeros(3, np.int64), "spread": np.ones(3, np.float32)} | changes
 
 
+def moved_arrays() -> dict[str, np.ndarray]:
+    """More arrays of means.npz: in place "a" scatters twice as far in the second direction; moved sweeps scatter ten times
+    as far in the first, and lie a tenth further in it."""
+    shapes = np.stack([np.eye(1)] * 3).astype(np.float16)
+    turn = np.diag([0.1, 1]).astype(np.float32)
+    at = (MEANS @ turn + [0.1, 0]).astype(np.float32)
+    return {"shapes": shapes * np.float16([0.5, 1, 1])[:, None, None], "moved_turn": turn, "moved_means": at,
+            "moved_shapes": shapes}  # fmt: skip
+
+
 def files(
     *, known: Known | None = KNOWN, early: Early | None = None, outputs: Sequence[str] = OUTPUTS,
-    fmt: SweepFormat = FORMAT, arrays: dict[str, np.ndarray] | None = None, **graph: float,
+    fmt: SweepFormat = FORMAT, arrays: dict[str, np.ndarray] | None = None, moved: Moved | None = None,
+    place: ContactPositions | None = None, **graph: float,
 ) -> dict[str, bytes]:  # fmt: skip
     """The files of a toy bundle by name."""
     arrays = means() if arrays is None else arrays
@@ -111,7 +127,7 @@ def files(
     manifest = Manifest(
         "toy", "1", fmt, "raw", tuple("abcdef"[: logits.shape[1]]), LIMITS,
         {k: bundle.file_entry(v) for k, v in content.items()}, figures={"LOPO": {"accuracy": 1.0}}, made={"seed": 1},
-        early=early, known=known,
+        early=early, known=known, moved=moved, place=place,
     )  # fmt: skip
     return content | {bundle.MANIFEST: manifest.json()}
 

@@ -39,7 +39,7 @@ MIDDLE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 @pytest.fixture
 def model(default_bundle: Bundle) -> Bundle:
     """The default bundle, with trained positions."""
-    return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE, schema=3))
+    return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE))
 
 
 def views_of(simulated: devices.SimDevices, model: Bundle) -> Callable[[float], list[View]]:
@@ -243,7 +243,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in bundle.load(bundle.DEFAULT).manifest.files:
         (target / name).write_bytes((bundle.DEFAULT / name).read_bytes())
     manifest = Manifest.parse((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
-    (target / bundle.MANIFEST).write_bytes(replace(manifest, place=MIDDLE, schema=3).json())
+    (target / bundle.MANIFEST).write_bytes(replace(manifest, place=MIDDLE).json())
     return target
 
 

@@ -286,6 +286,8 @@ def test_a_model_that_is_none(default_bundle: Bundle):
 
 EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
 KNOWN = {"limit": 9.0, "temperature": 2.0}
+MOVED = {"limit": 4.0, "temperature": 3.0, "unsure": 0.75}
+PLACE = {"pitch_mm": 1.0, "rows_mm": [0.5], "cols_mm": [0.5], "limit_mm": 0.1}
 
 
 def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **changes) -> Path:
@@ -305,7 +307,7 @@ def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bund
     old = json.loads((folder / bundle.MANIFEST).read_text())
     (folder / bundle.MANIFEST).write_text(
         json.dumps(
-            {k: v for k, v in old.items() if k not in ("early", "known", "place", "runtime", "counter")}
+            {k: v for k, v in old.items() if k not in ("early", "known", "place", "moved", "runtime", "counter")}
             | {"schema": 1, "files": {k: v for k, v in old["files"].items() if k != bundle.MEANS}}
         )
     )
@@ -349,6 +351,13 @@ def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bund
         ({"known": {"limit": 9.0}}, "temperature"),
         ({"known": None}, "both `known` and means.npz"),
         ({"schema": 1}, "schema 1 has no"),
+        ({"moved": MOVED}, "`moved` without `known` and `place`"),
+        ({"moved": MOVED | {"limit": 0}, "place": PLACE}, "moved.limit 0 must"),
+        ({"moved": MOVED | {"temperature": -1}, "place": PLACE}, "moved.temperature -1 must"),
+        ({"moved": MOVED | {"unsure": "0.5"}, "place": PLACE}, "unsure"),
+        ({"moved": {"limit": 4.0}, "place": PLACE}, "temperature"),
+        ({"moved": MOVED, "place": PLACE, "schema": 3}, "schema 3 has no `moved`"),
+        ({"moved": MOVED, "place": PLACE}, "means.npz cannot be read"),
     ],
 )
 def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: str):
@@ -370,6 +379,19 @@ def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: s
         (toy_bundle.means(spread=np.ones(3)), "spread float64"),
         (toy_bundle.means(spread=np.float32([1, 1])), "spread float32 "),
         (toy_bundle.means(spread=np.float32([1, 1, 0])), "spread .* must be above 0"),
+        (toy_bundle.means(shapes=np.ones((3, 1, 1))), "shapes float64"),
+        (toy_bundle.means(shapes=np.ones((2, 1, 1), np.float16)), "shapes float16 .2, 1, 1."),
+        (toy_bundle.means(shapes=np.ones((3, 1, 2), np.float16)), "shapes float16 .3, 1, 2."),
+        (toy_bundle.means(shapes=np.ones((3, 3, 3), np.float16)), "shapes float16 .3, 3, 3."),
+        (toy_bundle.means(shapes=np.full((3, 1, 1), np.inf, np.float16)), "shapes that are not finite"),
+        (
+            toy_bundle.means(**toy_bundle.moved_arrays() | {"moved_turn": np.eye(3, dtype=np.float32)}),
+            "moved_turn float32 .3",
+        ),
+        (
+            toy_bundle.means(**toy_bundle.moved_arrays() | {"moved_means": toy_bundle.MEANS[:2]}),
+            "moved_means float32 .2",
+        ),
         (toy_bundle.means(sweeps=np.zeros(3, np.int32)), "sweeps int32"),
         (toy_bundle.means(sweeps=np.array([0, 0, -1])), "trained labels .0. come first"),
         (toy_bundle.means(sweeps=np.array([0, 5, 0])), "trained labels .0. come first"),

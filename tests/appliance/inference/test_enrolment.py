@@ -128,11 +128,27 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
     for _ in range(100):
         mean = rng.normal(size=(n, 2)).mean(axis=0)
         classes = bundle.Classes(
-            np.vstack([toy_bundle.MEANS + 100, mean]), np.zeros(4), np.array([0, 0, 0, n]), np.ones(4)
-        )
+            np.vstack([toy_bundle.MEANS + 100, mean]), np.zeros(4), np.array([0, 0, 0, n]), np.ones(4),
+            np.zeros((4, 0, 0), np.float16),
+        )  # fmt: skip
         means = Means(classes, known, ("a", "b", "c", "felt"))
-        kept += [not means.novelty(means.distances(z)) for z in rng.normal(size=(40, 2))]
+        kept += [not means.novelty(z) for z in rng.normal(size=(40, 2))]
     assert np.mean(kept) == pytest.approx(1 - np.exp(-2), abs=0.025)
+
+
+def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path: Path):
+    """Its shape is 1; where the skin has moved, its mean is turned and shifted as the trained labels' means are."""
+    arrays = toy_bundle.means(**toy_bundle.moved_arrays())
+    old = toy_bundle.load(tmp_path / "old", arrays=arrays, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE)
+    new = enrolment.enrol(old, "felt", counts(*FELT))
+    (folder := tmp_path / "new").mkdir()
+    classes = bundle.load(toy_bundle.put(folder, new.files)).classes
+    assert classes is not None
+    assert classes.moved is not None
+    assert classes.shapes.ravel().tolist() == [0.5, 1, 1, 1]
+    assert classes.moved.shapes.ravel().tolist() == [1, 1, 1, 1]
+    assert classes.moved.means[3] == pytest.approx([0.7 + 0.1, 8], abs=1e-5)
+    assert classes.moved.means[:3].tolist() == arrays["moved_means"].tolist()
 
 
 def test_early_answers_end_with_an_enrolment(tmp_path: Path):

@@ -47,7 +47,7 @@ def test_a_place_that_makes_no_sense_is_refused(wrong: dict[str, Any], message: 
 
 def test_a_place_goes_through_the_manifest(default_bundle: Bundle):
     """Written as JSON and read again it is the same."""
-    manifest = replace(default_bundle.manifest, place=MIDDLE, schema=3)
+    manifest = replace(default_bundle.manifest, place=MIDDLE)
     assert Manifest.parse(manifest.json()).place == MIDDLE
 
 
