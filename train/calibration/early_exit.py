@@ -15,7 +15,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from appliance.bundle.bundle import Early
 from train.calibration.novelty import embed_present, parts
-from train.models.linear_head import fit_temperature
+from train.calibration.temperature import fit_temperature
 
 Array = NDArray[Any]
 LEVELS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.97, 0.95, 0.92, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)
@@ -109,9 +109,9 @@ def cross_fitted_logits(
     return np.concatenate(logits), np.concatenate(numbers)
 
 
-def fit_temperatures(logits: Array, labels: Array) -> Array:
+def fit_temperatures(logits: Array, labels: Array, groups: Array) -> Array:
     """One for each step and the whole: logits [n, D + 1, K] of sweeps that the heads did not see -> [D + 1]."""
-    return np.array([fit_temperature(step, labels) for step in logits.swapaxes(0, 1)])
+    return np.array([fit_temperature(step, labels, groups) for step in logits.swapaxes(0, 1)])
 
 
 def decide(probabilities: Array, early: Early) -> tuple[Array, Array]:

@@ -17,11 +17,12 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from appliance.bundle.bundle import Classes
 from appliance.core.errors import FormatError
+from appliance.inference.novelty import shaped_distances
 
 Array = NDArray[Any]
-KEPT = 0.97
-"""Share of known sweeps that the limit keeps: the others are lost to the robot, whatever the network gave. At .99 half of
-the unknown materials would pass for known (docs/decisions/0006)."""
+KEPT = 0.985
+"""Share of known sweeps that the limit keeps: the others are lost to the robot, whatever the network gave
+(docs/decisions/0006)."""
 PARTS = 10
 """Into how many parts groups are divided at most; each part is judged by what was fitted to the others."""
 FLAT = 1e-9
@@ -32,12 +33,14 @@ FLAT = 1e-9
 class Embedding:
     """z = features @ projection + offset. projection: float32 [F, r], offset [r]; means: float32 [K, r], of each label.
 
-    Every material's sweeps have the identity as covariance in z (Mahalanobis distance; Lee et al. 2018).
+    The sweeps of all materials have the identity as covariance in z (Mahalanobis distance; Lee et al. 2018). shapes:
+    float16 [K, b, b], how each material's own sweeps scatter in the last b directions; see the box's shaped_distances.
     """
 
     projection: Array
     offset: Array
     means: Array
+    shapes: Array
 
     def __call__(self, features: Array) -> Array:
         """Features [..., F] -> z, float64 [..., r]."""
@@ -53,11 +56,13 @@ class Embedding:
     def classes(self) -> Classes:
         """The means as a bundle holds them, each counted as trained."""
         bias, k = -(self.means.astype(np.float64) ** 2).sum(1) / 2, len(self.means)
-        return Classes(self.means, bias.astype(np.float32), np.zeros(k, np.int64), np.ones(k, np.float32))
+        return Classes(self.means, bias.astype(np.float32), np.zeros(k, np.int64), np.ones(k, np.float32), self.shapes)
 
     def novelty(self, features: Array) -> Array:
-        """Squared distance [...] of features [..., F] to the nearest mean: what the limit is compared with."""
-        nearest: Array = self.distances(self(features)).min(axis=-1)
+        """Squared distance [...] of features [..., F] to the nearest mean, each material's scatter being its own: what the
+        limit is compared with."""
+        away = self(features)[..., None, :] - self.means.astype(np.float64)
+        nearest: Array = shaped_distances(away, self.shapes.astype(np.float64)).min(axis=-1)
         return nearest
 
     def logits(self, features: Array, temperature: float = 1.0) -> Array:
@@ -72,7 +77,7 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
 
     The covariance is Ledoit and Wolf's, as in linear_head.closed_form_head. The first K - 1 directions hold everything
     that LDA uses; more are added until the last `fixed` features, which were not trained (see spectrum.py), are in it
-    completely: trained materials do not differ there, but an unknown one may.
+    completely: trained materials do not differ there, but an unknown one may. There each material has its own shape.
     Raises FormatError where there is one material, a label is missing, or each material has only one sweep.
     """
     labels = np.asarray(labels)
@@ -89,7 +94,23 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     axes = np.linalg.svd((means - means.mean(axis=0)) @ white)[2][: classes - 1].T
     axes = np.linalg.qr(np.hstack([axes, coloured[:, size - fixed :]]))[0]
     projection = (white @ axes).astype(np.float32)
-    return Embedding(projection, (-middle @ projection).astype(np.float32), (means @ projection).astype(np.float32))
+    means = (means @ projection).astype(np.float32)
+    own = min(fixed, projection.shape[1])
+    away = ((x - middle) @ projection - means[labels])[:, projection.shape[1] - own :]
+    shapes = np.stack([_shape(away[labels == k]) for k in range(classes)])
+    return Embedding(projection, (-middle @ projection).astype(np.float32), means, shapes)
+
+
+def _shape(away: Array) -> Array:
+    """W float16 [b, b], so that |away @ W|^2 is the Mahalanobis distance of differences `away` [n, b] from a class mean.
+
+    The covariance is that of the class's own sweeps, pulled towards 1, that of all classes, as if b more sweeps had it
+    (regularized discriminant analysis; Friedman 1989).
+    """
+    n, b = away.shape
+    covariance = (away.T @ away + b * np.eye(b)) / (n + b) if b else np.eye(0)
+    shape: Array = np.linalg.cholesky(np.linalg.inv(covariance)).astype(np.float16)
+    return shape
 
 
 def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embedding, Array]:
@@ -123,24 +144,26 @@ def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Arr
 
 
 def cross_fitted_distances(features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0) -> Array:
-    """Novelty [n] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups (int [N]).
+    """Novelty [N] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups (int [N]); NaN of the others.
 
     Sweeps of a material that occurs in no other part are left out. Raises FormatError as `parts` and `embed`.
     """
-    distances = [np.empty(0)]
+    distances = np.full(len(labels), np.nan)
     for fit, numbers in parts(groups, judged):
         embedding, present = embed_present(features[fit], labels[fit], fixed)
-        distances.append(embedding.novelty(features[numbers[np.isin(labels[numbers], present)]]))
-    return np.concatenate(distances)
+        numbers = numbers[np.isin(labels[numbers], present)]
+        distances[numbers] = embedding.novelty(features[numbers])
+    return distances
 
 
 def limit(novelty: Array, kept: float = KEPT) -> float:
-    """The limit that keeps `kept` of sweeps like those with this `novelty` [n], which were not trained on.
+    """The limit that keeps `kept` of sweeps like those with this `novelty` [n], which were not trained on; NaN is left out.
 
     The ceil((n + 1) * kept)-th smallest, as split conformal prediction takes it, so that a new sweep is kept with at
     least that probability (Vovk et al. 2005); the largest where n is too small for it.
     Raises FormatError where there is none.
     """
+    novelty = novelty[~np.isnan(novelty)]
     if not (n := len(novelty)):
         raise FormatError("no known sweep is left to find the limit with; record each material in several positions")
     rank = min(int(np.ceil((n + 1) * kept)), n) - 1

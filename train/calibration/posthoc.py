@@ -16,18 +16,36 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from appliance.bundle.bundle import Known
+from appliance.bundle.bundle import Known, Moved
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
 from train.calibration import early_exit, novelty
 from train.calibration.early_exit import EarlyRule, Heads
+from train.calibration.moved import AugmentedCopies, MovedFit, fit_moved
 from train.calibration.novelty import Embedding
+from train.calibration.temperature import fit_temperature
 from train.models.compact.copies import copies
 from train.models.compact.fit import COPIES, Fit
-from train.models.linear_head import fit_temperature
 from train.onnx_tools.graph_builder import joined, run
 
 Array = NDArray[Any]
+
+
+HELD_COPIES_SEED = 1
+"""Added to a fit's seed for the copies of its held-out sweeps."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Answers to the sweeps that judge, each by heads, embedding and temperature as they are fitted without its group.
+
+    numbers: of the sweeps [n]. probabilities: [n, K], of the network. known: bool [n], whether the novelty check lets
+    them pass.
+    """
+
+    numbers: Array
+    probabilities: Array
+    known: Array
 
 
 @dataclass(frozen=True)
@@ -35,7 +53,8 @@ class Posthoc:
     """What is fitted to a trunk. weight [F, K], bias [K]: the head that names the material, divided by `temperature`.
 
     warmth: temperature of logits from class means. steps: heads of the tenths, with their temperatures. limit: see
-    novelty.
+    novelty. moved: for sweeps of a moved skin, None where there were no copies to fit it to. held: what it answers to
+    held-out sweeps.
     """
 
     embedding: Embedding
@@ -46,6 +65,8 @@ class Posthoc:
     steps: Heads
     rule: EarlyRule
     limit: float
+    moved: MovedFit | None
+    held: HeldOut
 
     def logits(self, features: Array) -> Array:
         """Features [..., F] of whole sweeps -> logits [..., K] whose softmax is calibrated."""
@@ -61,10 +82,15 @@ class Posthoc:
         """The entry `known` of a manifest."""
         return Known(self.limit, self.warmth)
 
+    def moved_rule(self) -> Moved | None:
+        """The entry `moved` of a manifest."""
+        return self.moved.rule if self.moved else None
+
     def means(self) -> bytes:
         """The file means.npz of a bundle."""
         packed, classes = io.BytesIO(), self.embedding.classes()
-        np.savez_compressed(packed, means=classes.means, bias=classes.bias, sweeps=classes.sweeps)
+        classes = self.moved.classes(classes) if self.moved else classes
+        np.savez_compressed(packed, allow_pickle=False, **classes.arrays())
         return packed.getvalue()
 
     def graph(
@@ -78,19 +104,6 @@ class Posthoc:
         return assemble_model(joined(trunk, tenths), self.embedding, head, self.steps, known)
 
 
-@dataclass(frozen=True)
-class AugmentedCopies:
-    """The training sweeps again, augmented: features [M, F], labels [M], groups [M].
-
-    They show the head that names the material how materials vary. The embedding does not see them: with them an unknown
-    material would lie among the known ones.
-    """
-
-    features: Array
-    labels: Array
-    groups: Array
-
-
 def calibrate(fit: Fit) -> Posthoc:
     """Fit everything to the int8 trunk of `fit`. Raises FormatError as `posthoc_inputs` and `fit_posthoc`."""
     return fit_posthoc(*posthoc_inputs(fit))
@@ -98,7 +111,7 @@ def calibrate(fit: Fit) -> Posthoc:
 
 def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies]:
     """The arguments of `fit_posthoc`: what the int8 trunk gives for the sweeps that were trained on and held out, in this
-    order, and for the copies that its head was fitted to.
+    order, and for augmented copies of both; those of the training sweeps are the ones that its head was fitted to.
 
     Raises FormatError where none was held out: nothing could judge.
     """
@@ -107,10 +120,13 @@ def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, Augmented
         raise FormatError(f"{train.source}: too few groups to hold some out; record more positions")
     tenths = run(fit.trunk(tenths=True), np.concatenate([train.samples, held.samples]))
     labels, groups = np.append(train.labels, held.labels), np.append(train.group(by), held.group(by))
-    trunk = fit.trunk()
-    augmented = copies(train, fit.augmentation, fit.about["seed"], COPIES)
-    features = np.concatenate([run(trunk, copy.samples) for copy in augmented])
-    copied = AugmentedCopies(features, np.tile(train.labels, COPIES), np.tile(train.group(by), COPIES))
+    trunk, features, seed = fit.trunk(), [], fit.about["seed"]
+    for sweeps, drawn in ((train, seed), (held, seed + HELD_COPIES_SEED)):
+        features += [run(trunk, copy.samples) for copy in copies(sweeps, fit.augmentation, drawn, COPIES)]
+    sides = [np.tile(train.labels, COPIES), np.tile(held.labels, COPIES)]
+    copied_groups = np.append(np.tile(train.group(by), COPIES), np.tile(held.group(by), COPIES))
+    is_held = np.repeat([False, True], [len(side) for side in sides])
+    copied = AugmentedCopies(np.concatenate(features), np.concatenate(sides), copied_groups, is_held)
     return tenths, labels, groups, np.arange(len(labels)) >= len(train), fit.bands, copied
 
 
@@ -119,33 +135,42 @@ def fit_posthoc(
 ) -> Posthoc:
     """Fit all of it to features [N, D + 1, F] of sweeps with labels [N] from 0 to K - 1, of groups [N].
 
-    judged: bool [N], sweeps that the trunk did not see. Only these find temperatures, rule and limit, each with heads
-    that did not see its group. fixed: so many features, the last ones, were not trained; see novelty.embed.
+    judged: bool [N], sweeps that the trunk did not see. Only these find temperatures and rule, each with heads that did
+    not see its group. fixed: so many features, the last ones, were not trained; see novelty.embed. Where there are some,
+    most of a distance is in them, and all sweeps find its limit: of more positions, so that it is less a matter of chance.
     Raises FormatError as novelty.embed, and where there is only one group or nothing to judge by.
     """
-    whole, classes = tenths[:, -1], int(labels.max()) + 1
-    more = copied or AugmentedCopies(whole[:0], labels[:0], groups[:0])
+    whole, classes, every = tenths[:, -1], int(labels.max()) + 1, np.ones(len(labels), bool)
+    more = copied or AugmentedCopies(whole[:0], labels[:0], groups[:0], every[:0])
 
     def naming_head(fit: Array) -> tuple[Array, Array]:
         """The head fitted to the groups in `fit`, bool [N]."""
-        also = np.isin(more.groups, groups[fit])
-        x, y = np.concatenate([whole[fit], more.features[also]]), np.concatenate([labels[fit], more.labels[also]])
-        return early_exit.lda(x, y, classes)
+        also = more.take(np.isin(more.groups, groups[fit]) & ~more.held)
+        return early_exit.lda(
+            np.concatenate([whole[fit], also.features]), np.concatenate([labels[fit], also.labels]), classes
+        )
 
     logits, numbers = early_exit.cross_fitted_logits(tenths, labels, groups, judged, fixed)
-    warmth = fit_temperature(logits[:, -1], labels[numbers])
+    warmth = fit_temperature(logits[:, -1], labels[numbers], groups[numbers])
     row_of = {number: row for row, number in enumerate(numbers)}
     for fit, judges in novelty.parts(groups, judged):
         weight, bias = naming_head(fit)
         present = [number for number in judges if number in row_of]
         logits[[row_of[number] for number in present], -1] = whole[present] @ weight + bias
-    temperatures = early_exit.fit_temperatures(logits, labels[numbers])
-    rule = early_exit.find_rule(softmax(logits / temperatures[:, None]), labels[numbers])
-    embedding, (weight, bias) = novelty.embed(whole, labels, fixed), naming_head(np.ones(len(labels), bool))
+    temperatures = early_exit.fit_temperatures(logits, labels[numbers], groups[numbers])
+    p = softmax(logits / temperatures[:, None])
+    rule = early_exit.find_rule(p, labels[numbers])
+    embedding, last = novelty.embed(whole, labels, fixed), float(temperatures[-1])
     steps = early_exit.heads(embedding(tenths), labels, classes).cooled(temperatures[:-1])
-    limit = novelty.limit(novelty.cross_fitted_distances(whole, labels, groups, judged, fixed))
-    last = temperatures[-1]
-    return Posthoc(embedding, weight / last, bias / last, float(last), warmth, steps, rule, limit)
+    distances = novelty.cross_fitted_distances(whole, labels, groups, judged | (fixed > 0), fixed)
+    limit = novelty.limit(distances)
+    held = HeldOut(numbers, p[:, -1], distances[numbers] <= limit)
+    moved = None
+    if more.held.any():
+        weight, bias = naming_head(~np.isin(groups, groups[judged]))
+        moved = fit_moved(whole, labels, judged, fixed, more, (more.features[more.held] @ weight + bias) / last)
+    weight, bias = naming_head(every)
+    return Posthoc(embedding, weight / last, bias / last, last, warmth, steps, rule, limit, moved, held)
 
 
 def assemble_model(

@@ -39,6 +39,8 @@ MOST_SWEEPS = 5
 """After so many sweeps of an object the answer is final."""
 ENROLLED = (1, 2, 3, 5, 7, 10)
 """Numbers of sweeps from which a material is enrolled."""
+LIMITS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0)
+"""Multiples of the novelty limit at which what it keeps and what it lets through is reported."""
 DRAWS, ORDERS = 500, 20
 """Draws of the bootstrap; random orders of the sweeps of one object, or of one enrolment."""
 Trained = tuple[Case, Posthoc]
@@ -184,9 +186,11 @@ def early(full: Sequence[Trained]) -> Json:
 
 def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
     """Leave one material out: AUROC of known test sweeps against those of the material, by several scores; the share of
-    known sweeps that the limit found in training keeps, and of unknown ones that it lets through as known."""
+    known sweeps that the limit found in training keeps, and of unknown ones that it lets through as known; the same at
+    multiples of the limit, and where a second sweep at the same place must pass too."""
     materials_of: dict[str, Json] = {}
     every: dict[str, list[float]] = {}
+    passed: list[Array] = []
     for k in sorted({case.left_out for case, _ in without}):
         held = [one for one in without if one[0].left_out == k]
         known, places = np.concatenate([case.known() for case, _ in held]), _places(held)
@@ -200,12 +204,30 @@ def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
             "false_known_at_95": round(float(np.mean(ours[~known] <= at)), 4),
             "known": int(known.sum()), "unknown": int((~known).sum()),
         }  # fmt: skip
+        labels = _joined(held, "labels")
+        passed.append(
+            np.array([[_passed(ours, known, places, labels, factor, n) for n in (1, 2)] for factor in LIMITS])
+        )
         for name, row in scores.items():
             every.setdefault(name, []).append(auroc(row[known], row[~known]))
     mean = {name: round(float(np.mean([row[name] for row in materials_of.values()])), 4)
             for name in ("auroc", "kept", "false_known", "false_known_at_95")}  # fmt: skip
     means = {name: round(float(np.mean(values)), 4) for name, values in every.items()}
-    return {"materials": materials_of, "mean": mean, "scores": means}
+    limits = [{"factor": factor, "kept": one[0], "false_known": one[1], "kept_twice": two[0], "false_known_twice": two[1]}
+              for factor, (one, two) in zip(LIMITS, np.mean(passed, axis=0).round(4).tolist(), strict=True)]  # fmt: skip
+    return {"materials": materials_of, "mean": mean, "scores": means, "limits": limits}
+
+
+def _passed(scores: Array, known: Array, places: Array, labels: Array, factor: float, n: int) -> tuple[float, float]:
+    """Shares of known and of unknown sweeps that pass `factor` times the limit, each together with the n - 1 sweeps of its
+    material that follow at its place; the last sweeps of a place have too few and are left out."""
+    order = np.lexsort((labels, places))
+    here, fits = np.stack([places, labels])[:, order], (scores <= factor)[order]
+    size = len(order) - n + 1
+    whole = (here[:, :size] == here[:, n - 1 :]).all(axis=0)
+    all_fit = np.logical_and.reduce([fits[i : i + size] for i in range(n)])[whole]
+    is_known = known[order][:size][whole]
+    return float(all_fit[is_known].mean()), float(all_fit[~is_known].mean())
 
 
 def _auroc_of(scores: Array, known: Array, some: Array) -> float:

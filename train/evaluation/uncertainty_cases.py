@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.calibration.posthoc import AugmentedCopies, Posthoc, fit_posthoc, posthoc_inputs
+from train.calibration.moved import AugmentedCopies
+from train.calibration.posthoc import Posthoc, fit_posthoc, posthoc_inputs
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
 from train.evaluation.evaluate import Where
@@ -54,8 +55,8 @@ class Case:
 
     seen: features [N, 10, F] of the tenths of the training sweeps, whose materials are numbered `seen_labels` [N] from
     0 on without the one left out; seen_groups [N]: positions or recordings; judged: bool [N], those that the trunk did
-    not see, which may judge. copied: features [M, F] of augmented copies of the others, of copied_labels and
-    copied_groups [M].
+    not see, which may judge. copied: features [M, F] of augmented copies, of copied_labels, copied_groups and
+    copied_held [M]; see AugmentedCopies.
     new, labels, places: features of test sweeps, the set's labels, and where the skin sat.
     """
 
@@ -69,6 +70,7 @@ class Case:
     copied: Array
     copied_labels: Array
     copied_groups: Array
+    copied_held: Array
     new: Array
     labels: Array
     places: Array
@@ -80,7 +82,7 @@ class Case:
 
     def posthoc(self) -> Posthoc:
         """What is fitted on the trunk of this training."""
-        copies = AugmentedCopies(self.copied, self.copied_labels, self.copied_groups)
+        copies = AugmentedCopies(self.copied, self.copied_labels, self.copied_groups, self.copied_held)
         return fit_posthoc(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies)
 
     def numbered(self) -> Array:
@@ -108,7 +110,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
         task.left_out, task.fold, fixed, seen, seen_labels, seen_groups, judged, copies.features, copies.labels, copies.groups,
-        run_graph(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
+        copies.held, run_graph(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
     )  # fmt: skip
 
 

@@ -18,8 +18,9 @@ from train.reports import formatting, html
 from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, SMALL, set_ticks, single_axes, to_svg
 
 Json = Mapping[str, Any]
-TARGETS = {"unknown": 0.95, "enrolment": 0.90, "early": 0.5, "lost": 0.005}
-"""AUROC; share of the fully trained accuracy from five sweeps; share of the sweep; of the accuracy."""
+TARGETS = {"unknown": 0.97, "kept": 0.97, "false_known": 0.10, "enrolment": 0.90, "early": 0.5, "lost": 0.005}
+"""AUROC; shares of known sweeps that the limit keeps and of unknown ones that it lets through; share of the fully trained
+accuracy from five sweeps; share of the sweep; of the accuracy."""
 LINE: dict[str, Any] = {"color": ACCENT, "linewidth": 2.0, "marker": "o", "markersize": 3.5}
 OTHER: dict[str, Any] = {
     "color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5)), "marker": "o", "markersize": 2.5,
@@ -62,10 +63,17 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
 
 def _targets(figures: Json) -> Iterator[Json]:
     """Each target with what was reached."""
+    before, after = (figures["calibration"][when]["error"] for when in ("before", "after"))
+    yield {"what": "calibration error after temperature scaling", "target": f"≤ {formatting.percent(before)}, that before",
+           "here": formatting.percent(after), "met": after <= before}  # fmt: skip
     if "unknown" in figures:
-        auroc = figures["unknown"]["mean"]["auroc"]
-        yield {"what": "unknown material, AUROC, mean of those left out", "target": "≥ 95 %",
-               "here": formatting.percent(auroc), "met": auroc >= TARGETS["unknown"]}  # fmt: skip
+        mean = figures["unknown"]["mean"]
+        yield {"what": "unknown material, AUROC, mean of those left out", "target": "≥ 97 %",
+               "here": formatting.percent(mean["auroc"]), "met": mean["auroc"] >= TARGETS["unknown"]}  # fmt: skip
+        yield {"what": "known sweeps kept by the limit", "target": "≥ 97 %",
+               "here": formatting.percent(mean["kept"]), "met": mean["kept"] >= TARGETS["kept"]}  # fmt: skip
+        yield {"what": "unknown sweeps that the limit lets through", "target": "≤ 10 %",
+               "here": formatting.percent(mean["false_known"]), "met": mean["false_known"] <= TARGETS["false_known"]}  # fmt: skip
         for point in figures["enrolment"]["points"]:
             if point["sweeps"] == 5:
                 yield {"what": f"enrolment from five sweeps, {point['where']}, share of fully trained accuracy",

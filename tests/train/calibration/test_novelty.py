@@ -41,6 +41,20 @@ def test_untrained_features_are_kept_completely():
     assert novelty.embed(x, y, 1).novelty(unknown)[0] > 300
 
 
+def test_each_material_has_its_own_shape_in_untrained_features():
+    """Of a material whose sweeps hardly vary, one that others' sweeps reach is unlike it; of few sweeps the shape is common."""
+    x, y = gaussians(400, [[0, 0, 0], [60, 0, 0]])
+    x[y == 0, 2] *= 0.1
+    one = novelty.embed(x, y, 1)
+    narrow, wide = one.novelty(np.array([[0, 0, 2.0], [60, 0, 2.0]]))
+    assert narrow > 20 * wide
+    assert np.allclose(np.abs(one.shapes[1]), 1 / np.sqrt(2), rtol=0.2)  # its variance is twice the common one
+    few = novelty.embed(*gaussians(2, [[0, 0, 0], [60, 0, 0]]), 3)
+    assert np.isfinite(few.shapes).all()
+    assert (np.linalg.eigvalsh(few.shapes.astype(float) @ few.shapes.astype(float).swapaxes(1, 2)) < 2).all()
+    assert novelty.embed(x, y).shapes.shape == (2, 0, 0)
+
+
 def test_two_sweeps_of_a_material_and_silent_channels_are_finite():
     """K = 2, one class of two sweeps, a feature that never changes: no NaN."""
     x, y = gaussians(2, [[0, 0, 0], [5, 0, 0]])
@@ -94,7 +108,7 @@ def test_the_limit_knows_positions_that_were_not_seen():
     kept = [np.mean(narrow.novelty(new) <= at_most) for at_most in (itself, others)]
     assert kept[0] < 0.9 < kept[1]
     few = np.isin(at, (0, 1))
-    assert len(novelty.cross_fitted_distances(x, y, at, few)) == few.sum()
+    assert (np.isfinite(novelty.cross_fitted_distances(x, y, at, few)) == few).all()
     with pytest.raises(FormatError, match="one group"):
         novelty.cross_fitted_distances(x, y, 0 * at, every)
 

@@ -1,0 +1,87 @@
+"""Sweeps of a moved skin. In: features of augmented copies of sweeps. Out: their distances, and the rule for them.
+
+A skin that was put back elsewhere changes a known material more than another material would. Where the contact shows that
+it has moved, distances are therefore measured as augmented copies of the training sweeps scatter, and certainty as copies
+of held-out sweeps are named rightly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.bundle.bundle import Classes, Moved, MovedClasses
+from appliance.inference.classifier import softmax
+from train.calibration.novelty import Embedding, embed, limit
+from train.calibration.temperature import fit_temperature
+
+Array = NDArray[Any]
+MOST_WRONG = 0.03
+"""Share of held-out copies that may be named wrongly with status ok; an attachment that is farther away than the copies
+has about two points more."""
+UNSURE = np.arange(50, 100) / 100
+"""Least probabilities that a moved sweep may need."""
+NEVER = 1.01
+"""A least probability that no sweep reaches."""
+
+
+@dataclass(frozen=True)
+class AugmentedCopies:
+    """The sweeps again, augmented: features [M, F], labels [M], groups [M].
+
+    They show the head that names the material how materials vary. The embedding does not see them: with them an unknown
+    material would lie among the known ones. held: bool [M], those of sweeps that the trunk did not see; no head is fitted
+    to them, they judge.
+    """
+
+    features: Array
+    labels: Array
+    groups: Array
+    held: Array
+
+    def take(self, index: Array) -> AugmentedCopies:
+        """Those that `index` (bool [M]) names."""
+        return AugmentedCopies(self.features[index], self.labels[index], self.groups[index], self.held[index])
+
+
+@dataclass(frozen=True)
+class MovedFit:
+    """turned: the Embedding of an embedding z, fitted to copies. rule: for the manifest."""
+
+    turned: Embedding
+    rule: Moved
+
+    def classes(self, classes: Classes) -> Classes:
+        """`classes` of the embedding z, with those of moved sweeps."""
+        turned = self.turned
+        return replace(classes, moved=MovedClasses(turned.projection, turned.means - turned.offset, turned.shapes))
+
+
+def fit_moved(
+    whole: Array, labels: Array, judged: Array, fixed: int, copied: AugmentedCopies, logits: Array
+) -> MovedFit | None:
+    """The rule for moved sweeps; None where there are no copies to fit it or to judge by.
+
+    whole, labels, judged: features [N, F], labels [N] and bool [N] as for posthoc.fit_posthoc. logits: [m, K] of the
+    copies that are held out, calibrated for sweeps in place, by a head that saw none of their groups.
+    """
+    fitted, judging = copied.take(~copied.held), copied.take(copied.held)
+    if not len(judging.labels) or min(len(np.unique(of)) for of in (fitted.labels, labels[~judged])) <= labels.max():
+        return None
+
+    def turn(fit: Array) -> tuple[Embedding, Embedding]:
+        """An embedding fitted to the sweeps `fit`, bool [N], and that of what it makes of the copies."""
+        z = embed(whole[fit], labels[fit], fixed)
+        return z, embed(z(fitted.features), fitted.labels, z.shapes.shape[1])
+
+    across, judge = turn(~judged)
+    novelty = judge.novelty(across(judging.features))
+    beyond = limit(novelty)
+    temperature = fit_temperature(logits, judging.labels, judging.groups)
+    p = softmax(logits / temperature)
+    wrong = (p.argmax(1) != judging.labels) & (novelty <= beyond)
+    enough = [float(level) for level in UNSURE if np.mean(wrong & (p.max(1) >= level)) <= MOST_WRONG]
+    return MovedFit(turn(np.ones(len(labels), bool))[1], Moved(beyond, temperature, enough[0] if enough else NEVER))
