@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from appliance.bundle import bundle
 from appliance.bundle.manifest import Manifest
 from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
+from train.calibration.posthoc import calibrate
 from train.cli import options
 from train.cli.options import Add
 from train.export import measure, pack, quantized_bundle, sign
@@ -114,8 +117,12 @@ def run_fit(args: argparse.Namespace) -> None:
     recipe = fit.FitRecipe(steps=args.steps, augmentation=augmentation, keep_means=args.keep_means)
     made = fit.fit(sweeps, args.seed, recipe, options.Log(), architecture)
     made.save(args.out)
-    print(f"fit: {len(made.train)} sweeps, {made.train.format}; held-out {made.about['held_out_by']}: "
-          f"{_text(made.about['validation'])}; {args.out}")  # fmt: skip
+    print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
+    by = f"held-out {made.about['held_out_by']}"
+    try:
+        _print_figures(pack.held_out_figures(calibrate(made).held, made, by))
+    except FormatError as e:  # too few sweeps to judge by
+        print(f"{by}, network alone: {_text(made.about['validation'])}; nothing judges the box's answers: {e}")
 
 
 def run_export(args: argparse.Namespace) -> None:
@@ -144,11 +151,19 @@ def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | Non
 
 def _print(manifest: Manifest, out: Path) -> None:
     """The figures of a bundle, and its size."""
-    for protocol, figure in manifest.figures.items():
-        if "accuracy" in figure:
-            print(f"{protocol}: {_text(figure)}")
+    _print_figures(manifest.figures)
     size = measure.sizes(out)[1]
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
+
+
+def _print_figures(figures: Mapping[str, dict[str, Any]]) -> None:
+    """Each accuracy on a line: as the box answers, with what it does not name, and of the network alone."""
+    for protocol, figure in figures.items():
+        if "wrong" in figure:
+            others = ", ".join(f"{figure[name]} {name}" for name in ("wrong", "unsure", "unknown", "refused"))
+            print(f"{protocol}, as the box answers: {_text(figure)}; {others}")
+        elif "accuracy" in figure:
+            print(f"{protocol}: {_text(figure)}")
 
 
 def run_references(args: argparse.Namespace) -> None:

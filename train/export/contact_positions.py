@@ -106,21 +106,30 @@ def _shifted(placement: skin.Placement, name: str, mm: float) -> skin.Placement:
 def _point(
     box: Classifier, test: EvaluationSweeps, where: Callable[[skin.Placement], skin.Placement] = lambda p: p
 ) -> Json:
-    """The box's answers to the test sweeps, with the skin moved. Sweeps of one attachment form a cluster."""
+    """The box's answers to the test sweeps, with the skin moved. Sweeps of one attachment form a cluster.
+
+    accuracy, wrong: named with status ok, rightly and wrongly; unsure, unknown: the other answers; network: named rightly
+    by the network alone, whose most probable label counts whatever the box makes of it.
+    """
     assert test.scene
     sweeps, place, limits = test.sweeps, box.bundle.manifest.place, box.bundle.manifest.thresholds
     assert place
-    right, moved, wrong, distance_mm = (np.zeros(len(sweeps)) for _ in range(4))
+    right, moved, wrong, unsure, unknown, network, distance_mm = (np.zeros(len(sweeps)) for _ in range(7))
     for i, window in enumerate(test.scene.draw(where)):
         n = np.arange(len(window))
-        verdict = box(Sweep(i, 0, 0, Status.OK, Frames(n, n, window)))
-        right[i] = verdict.label == sweeps.materials[sweeps.labels[i]]
-        wrong[i], moved[i] = bool(verdict.label) and not right[i], bool(verdict.moved)
+        verdict, truth = box(Sweep(i, 0, 0, Status.OK, Frames(n, n, window))), sweeps.materials[sweeps.labels[i]]
+        named = verdict.status is Status.OK
+        right[i], wrong[i] = named and verdict.label == truth, named and verdict.label != truth
+        unsure[i], unknown[i] = bool(verdict.label) and not named, verdict.status is Status.UNKNOWN
+        moved[i] = bool(verdict.moved)
+        network[i] = box.bundle.manifest.labels[int(box.logits(window).argmax())] == truth
         found = centre(window, box.tare, limits.contact)
         distance_mm[i] = np.hypot(*place.offset(found)) if found else np.nan
     attachment = sweeps.group("position")
     return {
         "n": len(sweeps), "attachments": len(np.unique(attachment)), "accuracy": _share(right, attachment),
+        "network": _share(network, attachment), "wrong_share": _share(wrong, attachment),
+        "unsure": int(unsure.sum()), "unknown": int(unknown.sum()),
         "moved": _share(moved, attachment), "wrong": int(wrong.sum()), "wrong_unflagged": int((wrong * (1 - moved)).sum()),
         "told_mm": round(float(np.nanmedian(distance_mm)), 2) if np.isfinite(distance_mm).any() else None,
     }  # fmt: skip
@@ -148,11 +157,15 @@ def _loss(points: Sequence[Json]) -> Json:
 
 
 def lines(result: Json) -> Iterator[str]:
-    """For the terminal: accuracy and share of flagged sweeps, with intervals, at each displacement."""
+    """For the terminal: accuracy as the box answers and of the network alone, and share of flagged sweeps, with intervals,
+    at each displacement."""
     yield f"bundle {result['bundle']}, {result['positions']} positions, limit {result['limit_mm']} mm"
     named = {k: v for k, v in result.items() if isinstance(v, dict) and "attachments" in v}
     rows = [(name, point) for name, point in named.items()]
     rows += [(f"{direction} {p['mm']:+.1f} mm", p) for direction, points in result["moved"].items() for p in points]
     for name, point in rows:
-        right, moved = ("{:.3f} [{:.3f}, {:.3f}]".format(*point[key]) for key in ("accuracy", "moved"))
-        yield f"{name:<32} n {point['n']:>4}  right {right}  moved {moved}  distance {point['told_mm']} mm"
+        right, wrong, network, moved = (
+            "{:.3f} [{:.3f}, {:.3f}]".format(*point[key]) for key in ("accuracy", "wrong_share", "network", "moved")
+        )
+        yield (f"{name:<32} n {point['n']:>4}  right {right}  wrong {wrong}  unsure {point['unsure']:>3}  unknown "
+               f"{point['unknown']:>3}  network alone {network}  moved {moved}  distance {point['told_mm']} mm")  # fmt: skip

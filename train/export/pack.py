@@ -21,15 +21,16 @@ import torch
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle
+from appliance.bundle.manifest import UNSURE as LEAST_SURE
 from appliance.core import provenance, storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Frames, Status, Sweep
-from appliance.inference.classifier import Classifier, softmax
-from train.calibration.posthoc import calibrate
+from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, softmax
+from train.calibration.posthoc import HeldOut, calibrate
 from train.data.sets import Dataset
 from train.export.contact_positions import place_of
-from train.metrics.score import accuracy_figure
+from train.metrics.score import accuracy_figure, fuse
 from train.models.compact.fit import Fit
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
@@ -43,6 +44,8 @@ RUNTIME = "0.2.0"
 """The first version of the box that reads such a manifest."""
 REFUSED, UNKNOWN = -1, -2
 """What `score` returns instead of a label."""
+NETWORK = "network alone"
+"""Ends the name of the figure of the labels that the network gives, whatever the box makes of them."""
 
 
 class ExportRefused(BundleError):
@@ -55,9 +58,9 @@ class Content:
     input: as in the manifest.
 
     train, held_out: the sweeps it was trained on and the others, split by the group `held_out_by`. about: how it was
-    made; figures: its results, both for the manifest. early, known: for the manifest; means: the file means.npz, where
-    there is `known`. reference: the float form of a model in int8. made: the fit of a network of the compact family,
-    to which `pack` adds early answers and novelty.
+    made; figures: its results, both for the manifest. early, known, moved: for the manifest; means: the file means.npz,
+    where there is `known`. reference: the float form of a model in int8. made: the fit of a network of the compact
+    family, to which `pack` adds early answers and novelty.
     """
 
     model: onnx.ModelProto
@@ -69,6 +72,7 @@ class Content:
     figures: dict[str, Any] = field(default_factory=dict)
     early: bundle.Early | None = None
     known: bundle.Known | None = None
+    moved: bundle.Moved | None = None
     means: bytes = b""
     reference: onnx.ModelProto | None = None
     made: Fit | None = None
@@ -84,16 +88,18 @@ def pack(
     type. pitch_mm: from taxel to taxel; without it the box cannot say how far a skin has moved.
     Raises ExportRefused where a check fails, and BundleError where a label or the target cannot be used.
     """
-    content = with_posthoc(content)
     train, held_out = content.train, content.held_out
+    limits = thresholds(train, full_scale)
+    place = place_of(train, limits.contact, pitch_mm)
+    content = with_posthoc(content, place is not None)
     logits = run(content.model, model_inputs(content.input, train))
     golden = golden_sweeps(train, logits, logits_of_means(content, train) if content.known else logits)
     files = {bundle.MODEL: content.model.SerializeToString(), bundle.GOLDEN: golden}
     files |= {bundle.MEANS: content.means} if content.known else {}
-    limits = thresholds(train, full_scale)
     manifest = bundle.Manifest(
         name=name, version=version, format=train.format, input=content.input, labels=train.materials,
-        thresholds=limits, place=place_of(train, limits.contact, pitch_mm), runtime=RUNTIME, early=content.early, known=content.known, files={k: bundle.file_entry(v) for k, v in files.items()},
+        thresholds=limits, place=place, runtime=RUNTIME, early=content.early, known=content.known, moved=content.moved,
+        files={k: bundle.file_entry(v) for k, v in files.items()},
         made={"commit": commit, "set": train.source, "machine": platform.machine(), "cpus": os.cpu_count(),
               "torch": torch.__version__, "onnxruntime": onnxruntime.__version__} | content.about,
     )  # fmt: skip
@@ -141,9 +147,13 @@ def pack_to_measure(content: Content, target: Path, full_scale: float | None = N
     return pack(content, target, content.about["method"], "1", provenance.commit(), full_scale)
 
 
-def with_posthoc(content: Content) -> Content:
+def with_posthoc(content: Content, located: bool = True) -> Content:
     """`content` with what is fitted on the trunk of the fit `made`: early answers, where its sweeps support them, and
-    novelty. Unchanged where nothing was held out, or not all its materials were trained."""
+    novelty. Unchanged where nothing was held out, or not all its materials were trained.
+
+    located: whether the box can say that a contact has moved. Where the held-out sweeps are the fit's own, figures of them
+    are added: of heads that did not see them, which those in the bundle did.
+    """
     made = content.made
     if made is None or made.train.materials != content.train.materials:
         return content
@@ -151,13 +161,32 @@ def with_posthoc(content: Content) -> Content:
         done = calibrate(made)
     except FormatError:  # too few groups to hold some out, on which it could be fitted
         return content
-    rule = done.rule
+    done = done if located else replace(done, moved=None)
+    rule, own = done.rule, {}
+    if content.held_out is made.held:
+        own = held_out_figures(done.held, made, f"held-out {content.held_out_by}")
     early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
     tenths = made.trunk(tenths=True) if rule.early else None
     return replace(
-        content, model=done.graph(made.trunk(), tenths), early=rule.early, known=done.known(),
-        means=done.means(), about=content.about | {"early": early},
+        content, model=done.graph(made.trunk(), tenths), early=rule.early, known=done.known(), moved=done.moved_rule(),
+        means=done.means(), about=content.about | {"early": early}, figures=content.figures | own,
     )  # fmt: skip
+
+
+def held_out_figures(held: HeldOut, made: Fit, protocol: str) -> dict[str, Any]:
+    """Figures of a fit's held-out sweeps, as `figures` gives them, by heads that did not see these sweeps."""
+    sweeps = made.held.take(held.numbers - len(made.train))
+    named = held.probabilities.argmax(1)
+    sure = held.probabilities.max(1) >= LEAST_SURE
+    answers = np.where(held.known, named, UNKNOWN)
+    recording, known = sweeps.group("recording"), np.flatnonzero(held.known)
+    fused = np.full(len(sweeps), UNKNOWN)
+    if len(known):
+        scores, first = fuse(np.log(np.maximum(held.probabilities, LEAST_PROBABILITY))[known], recording[known])
+        decided = np.where(softmax(scores).max(1) >= LEAST_SURE, scores.argmax(1), UNKNOWN)
+        by_recording = dict(zip(recording[known][first], decided, strict=True))
+        fused = np.array([by_recording.get(number, UNKNOWN) for number in recording])
+    return _figures(answers, sure, fused, named, sweeps, protocol)
 
 
 def logits_of_means(content: Content, sweeps: Dataset) -> Array:
@@ -203,33 +232,45 @@ def thresholds(sweeps: Dataset, full_scale: float | None) -> bundle.Thresholds:
     return bundle.Thresholds(contact=contact, full_scale=float(top if full_scale is None else full_scale))
 
 
-def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> Array:
-    """The box's labels, int64 [N] into the bundle's, or REFUSED or UNKNOWN.
+def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> tuple[Array, Array]:
+    """The box's labels, int64 [N] into the bundle's, or REFUSED or UNKNOWN; and bool [N], whether it is sure of them.
 
     fused: each sweep gets the box's answer after all sweeps of its recording.
     """
     form, labels = sweeps.format, classifier.bundle.manifest.labels
     t_ns, seq = (np.arange(form.window) * form.period_ns).astype(np.int64), np.arange(form.window)
     recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
-    answers = np.full(len(sweeps), REFUSED)
+    answers, sure = np.full(len(sweeps), REFUSED), np.zeros(len(sweeps), bool)
     for i in np.argsort(recording, kind="stable"):
         frames = Frames(t_ns, seq, sweeps.samples[i])
         verdict = classifier(Sweep(int(i), 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1)))
         if verdict.label:
-            answers[recording == recording[i] if fused else i] = labels.index(verdict.label)
+            answered = recording == recording[i] if fused else i
+            answers[answered], sure[answered] = labels.index(verdict.label), verdict.status is Status.OK
         elif verdict.status is Status.UNKNOWN and not fused:
             answers[i] = UNKNOWN
-    return answers
+    return answers, sure
 
 
-def figures(classifier: Classifier, sweeps: Dataset, protocol: str) -> dict[str, Any]:
-    """Accuracy by sweep, and by recording where one holds several; a refused or unknown sweep counts as wrong."""
-    right = score(classifier, sweeps) == sweeps.labels
-    result = {protocol: accuracy_figure(int(right.sum()), len(sweeps))}
+def figures(classifier: Classifier, sweeps: Dataset, protocol: str, logits: Array) -> dict[str, Any]:
+    """Accuracy as the box answers, by sweep and, where one holds several, by recording: what is refused, unknown or unsure
+    is not right. Beside it that of the network alone, whose logits [N, K] name every sweep."""
+    fused, decided = score(classifier, sweeps, fused=True)
+    fused[~decided] = UNKNOWN
+    return _figures(*score(classifier, sweeps), fused, logits.argmax(1), sweeps, protocol)
+
+
+def _figures(answers: Array, sure: Array, fused: Array, named: Array, sweeps: Dataset, protocol: str) -> dict[str, Any]:
+    """The figures of answers to sweeps, as `score` gives them, to their recordings, and of the labels `named` [N]."""
+    right = (answers == sweeps.labels) & sure
+    counts = {"wrong": int(((answers >= 0) & sure & ~right).sum()), "unsure": int(((answers >= 0) & ~sure).sum()),
+              "unknown": int((answers == UNKNOWN).sum()), "refused": int((answers == REFUSED).sum())}  # fmt: skip
+    result = {protocol: accuracy_figure(int(right.sum()), len(sweeps)) | counts}
+    result[f"{protocol}, {NETWORK}"] = accuracy_figure(int((named == sweeps.labels).sum()), len(sweeps))
     first = np.unique(sweeps.group("recording"), return_index=True)[1]
     if len(first) < len(sweeps):
-        right = (score(classifier, sweeps, fused=True) == sweeps.labels)[first]
-        result[f"{protocol}, by recording"] = accuracy_figure(int(right.sum()), len(first))
+        by_recording = (fused == sweeps.labels)[first]
+        result[f"{protocol}, by recording"] = accuracy_figure(int(by_recording.sum()), len(first))
     return result
 
 
@@ -240,7 +281,7 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
     """
     box = Classifier(bundle.load(folder), SystemClock())
     box.self_test()
-    answers = score(box, held_out)
+    answers = score(box, held_out)[0]
     refused, unknown = answers == REFUSED, answers == UNKNOWN
     if other := int(np.sum((answers != logits.argmax(1)) & (answers >= 0))):
         raise ExportRefused(f"the box labels {other} of {len(held_out)} held-out sweeps otherwise than export did")
@@ -254,7 +295,7 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
             f"the box would call {unknown.sum()} of {len(held_out)} held-out sweeps unknown (limit {MOST_UNKNOWN:.0%}, "
             f"squared distance {box.bundle.manifest.known}); record more positions, so that it learns how sweeps vary"
         )
-    return figures(box, held_out, protocol)
+    return figures(box, held_out, protocol, logits)
 
 
 @contextlib.contextmanager

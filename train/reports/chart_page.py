@@ -20,8 +20,15 @@ from train.reports.scatter import label
 SCRIPT = pages.TEMPLATES / "chart.js"
 
 
-def html(dots: Sequence[Dot], picture: str, quick: bool = False, left_out: Mapping[str, str] | None = None) -> str:
-    """The whole file. picture: SVG. quick: the figures mean nothing. left_out: what is missing, and why."""
+def html(
+    dots: Sequence[Dot],
+    picture: str,
+    quick: bool = False,
+    left_out: Mapping[str, str] | None = None,
+    box_on_hard: Mapping[str, Any] | None = None,
+) -> str:
+    """The whole file. picture: SVG. quick: the figures mean nothing. left_out: what is missing, and why. box_on_hard: what
+    the box answers to T-HARD's sweeps, see chart_report.box_on_hard."""
     accuracies = {key: axis for key, axis in ACCURACIES.items() if any(key in dot["accuracy"] for dot in dots)}
     named = [dict(dot) | {"name": name(dot), "label": label(dot)} for dot in dots]
     data = json.dumps({"dots": named, "costs": _plain(COSTS), "accuracies": _plain(accuracies)}, allow_nan=False)
@@ -36,6 +43,7 @@ def html(dots: Sequence[Dot], picture: str, quick: bool = False, left_out: Mappi
         origin={key: " and ".join(sorted({str(dot[key]) for dot in dots})) for key in ("commit", "machine", "set")},
         seeds=", ".join(map(str, sorted({seed for dot in dots for seed in dot["seeds"]}))),
         left_out=left_out or {},
+        box_on_hard=box_on_hard,
         data=Markup(data.replace("<", "\\u003c")),  # no name of a model can end the script
         script=Markup(SCRIPT.read_text()),
     )

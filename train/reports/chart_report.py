@@ -36,6 +36,8 @@ Log = Callable[[str], None]
 Accuracy = dict[tuple[str, str], dict[str, Json]]
 """By method and form, then by protocol: mean, low, high, n, seeds."""
 FABRICS = "fabricslide/fabricslide.npz"
+BOX_ON_HARD = "alignment/place.json"
+"""Beside the chart's folder: what the box answers to T-HARD's sweeps."""
 SEVEN = ("direction=0", "force<=180")
 FAMILIES = {
     "train.models.compact.methods": "Palpate",
@@ -275,11 +277,21 @@ def touch_shares(paths: Sequence[Path]) -> dict[str, float]:
     return shares
 
 
+def box_on_hard(file: Path) -> Json | None:
+    """What the packaged bundle answers to T-HARD's sweeps, as `palpate-train alignment` wrote it; None where it did not."""
+    try:
+        point: Json = json.loads(file.read_bytes())["T-HARD"]
+    except (OSError, ValueError, KeyError):
+        return None
+    return point if {"accuracy", "wrong_share", "network"} <= point.keys() else None
+
+
 def write(out: Path, found: Sequence[Json], quick: bool = False, left_out: dict[str, str] | None = None) -> Path:
     """chart.json, chart.svg and index.html in the folder `out`; the page's path."""
     lines = ",\n".join(json.dumps(dot, allow_nan=False) for dot in found)
     put(out / "chart.json", f"[\n{lines}\n]\n".encode(), parents=True)
     picture = scatter.chart(found)
     put(out / "chart.svg", picture.encode(), parents=True)
-    put(out / "index.html", chart_page.html(found, picture, quick, left_out or {}).encode(), parents=True)
+    page = chart_page.html(found, picture, quick, left_out or {}, box_on_hard(out.parent / BOX_ON_HARD))
+    put(out / "index.html", page.encode(), parents=True)
     return out / "index.html"

@@ -35,7 +35,9 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
     whole = easy(20, pieces=2).select(["speed<=2"])
     assert sum(map(len, parts)) == len(set.union(*parts)) == len(np.unique(whole.groups["recording"]))
     assert len(made.train) + len(made.held) + len(rest) == len(whole)
-    assert "held-out recording" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "held-out recording, as the box answers: " in out
+    assert "held-out recording, network alone: " in out
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from train.reports import contact_plot
 @pytest.fixture
 def model(default_bundle: Bundle) -> Bundle:
     """The default bundle, with trained positions."""
-    return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE, schema=3))
+    return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE))
 
 
 def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> Dataset:
@@ -91,8 +91,15 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     assert ahead["accuracy"][0] < home["accuracy"][0] > 0.8
     assert figures["rows, forwards"]["lost_at_mm"] == 5
     assert ahead["told_mm"] > 1.2 > home["told_mm"]
+    for point in (home, ahead):
+        assert point["accuracy"][0] * 12 + point["wrong"] + point["unsure"] + point["unknown"] == pytest.approx(
+            12, abs=0.01
+        )
+        assert point["wrong_share"][0] == pytest.approx(point["wrong"] / 12, abs=1e-3)
+        assert point["network"][0] >= point["accuracy"][0]
     text = "\n".join(contact_positions.lines(figures))
     assert "rows +5.0 mm" in text
+    assert "network alone" in text
     assert "flagged" in contact_plot.draw(figures)
     with pytest.raises(FormatError, match="no positions"):
         contact_positions.measure(

@@ -25,6 +25,7 @@ from appliance.inference.session import session
 from appliance.sim import skin
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
+from train.calibration.posthoc import calibrate
 from train.cli.main import main
 from train.data import sets
 from train.export import pack, quantized_bundle
@@ -133,7 +134,11 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     assert it.bundle.golden_logits.argmax(1).tolist() == [0, 2]
     held = manifest.figures["held-out recording"]
     assert held["n"] == len(fitted.held)
-    assert held["accuracy"] == pytest.approx(np.mean(pack.score(it, fitted.held) == fitted.held.labels), abs=1e-4)
+    assert held["accuracy"] + (held["wrong"] + held["unsure"] + held["unknown"]) / held["n"] == pytest.approx(
+        1, abs=1e-4
+    )
+    assert held["refused"] == 0
+    assert manifest.figures["held-out recording, network alone"]["accuracy"] >= held["accuracy"]
     assert manifest.figures["held-out recording, by recording"]["n"] == len(fitted.held) / 2
     result = manifest.figures["parity"]
     assert result["agreement"] >= quantized_bundle.LEAST_AGREEMENT
@@ -147,7 +152,32 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
         "0123abcd",
         1,
     )
-    assert np.mean(pack.score(it, easy(seed=5)) == easy(seed=5).labels) > 0.9
+    assert np.mean(pack.score(it, easy(seed=5))[0] == easy(seed=5).labels) > 0.9
+
+
+def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_path: Path):
+    """With the distance of the taxels the bundle says where the contact was, and how moved sweeps are judged; without it the
+    box could not tell, and the file has no arrays for it."""
+    quantized_bundle.export(fitted, tmp_path / "placed", "easy", "1", "0123abcd", pitch_mm=4.0)
+    placed, plain = bundle.load(tmp_path / "placed"), bundle.load(packed)
+    assert placed.manifest.place
+    assert placed.manifest.moved
+    assert placed.classes
+    assert placed.classes.moved
+    assert plain.manifest.moved is None
+    with np.load(packed / bundle.MEANS) as arrays:
+        assert not [name for name in arrays if name.startswith("moved")]
+
+
+def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
+    """Held-out sweeps with other labels than they have: heads fitted to them would name these, heads of the others do not."""
+    wrong = replace(fitted.held, labels=(fitted.held.labels + 1) % 3)
+    spoilt = replace(fitted, held=wrong)
+    honest, misled = (
+        pack.held_out_figures(calibrate(one).held, one, "x")["x, network alone"]["accuracy"] for one in (fitted, spoilt)
+    )
+    assert honest > 0.9
+    assert misled < 0.1
 
 
 def test_the_same_fit_gives_the_same_bytes(fitted: Fit, packed: Path, tmp_path: Path):
@@ -163,7 +193,7 @@ def test_scores_are_fused_by_recording(packed: Path):
     it, s = box(packed), easy(10, pieces=5, seed=7)
     s.samples[3] = 0
     s.samples[9] = s.samples[29]
-    alone, fused = pack.score(it, s), pack.score(it, s, fused=True)
+    alone, fused = pack.score(it, s)[0], pack.score(it, s, fused=True)[0]
     assert np.flatnonzero(alone == pack.REFUSED).tolist() == [3]
     assert alone[9] != fused[9]
     p = softmax(np.stack([it.logits(x) for x in s.samples]))
@@ -331,7 +361,7 @@ def test_the_default_bundle_is_what_the_box_needs():
     assert (it.bundle.format, it.bundle.manifest.labels) == (skin.FORMAT, skin.MATERIALS)
     assert sum(f.stat().st_size for f in bundle.DEFAULT.iterdir()) < 96 * 1024
     unseen = sets.load("sim:T-REAL:1900:3")
-    assert np.mean(pack.score(it, unseen) == unseen.labels) > 0.9
+    assert np.mean(pack.score(it, unseen)[0] == unseen.labels) > 0.9
     assert json.loads(it.bundle.manifest.json())["figures"]["held-out position"]["low"] > 0.9
 
 
@@ -357,7 +387,8 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
     assert main(["export", str(tmp_path / "fit.npz"), *args]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == [
-        "held-out recording",
+        "held-out recording, as the box answers",
+        "held-out recording, network alone",
         "held-out recording, by recording",
         "bundle",
     ]

@@ -196,6 +196,28 @@ def test_the_files(tmp_path: Path):
     assert "{{" not in text
 
 
+def test_what_the_box_answers_stands_beside_what_networks_name(tmp_path: Path):
+    """The page takes it from the alignment's figures beside its folder; without them, or of an older form, it says nothing."""
+    share = [0.88, 0.85, 0.91]
+    point = {
+        "n": 432,
+        "attachments": 36,
+        "accuracy": share,
+        "wrong_share": [0.04, 0.02, 0.07],
+        "network": [0.93, 0.9, 0.95],
+    }
+    file = tmp_path / chart_report.BOX_ON_HARD
+    assert "the box also answers" not in chart_report.write(tmp_path / "chart", DOTS).read_text().lower()
+    file.parent.mkdir()
+    for text in ("{", json.dumps({"T-HARD": {"accuracy": share}}), json.dumps({"rows": point})):
+        file.write_text(text)
+        assert chart_report.box_on_hard(file) is None
+    file.write_text(json.dumps({"T-HARD": point}))
+    page = " ".join(chart_report.write(tmp_path / "chart", DOTS).read_text().split())
+    for told in ("432 sweeps of T-HARD at 36 attachments", "88.0", "4.0", "93.0"):
+        assert told in page
+
+
 def test_no_name_can_break_out_of_the_data():
     """A label that looks like the end of a script stays text."""
     odd = [dot("</script><b>", "float", 1.0, 0.5)]
