@@ -1,4 +1,4 @@
-"""The commands that judge methods: methods, evaluate, stress, certainty, calibrate, alignment."""
+"""The commands that judge methods: methods, evaluate, stress, certainty, calibrate, cnn-curve, alignment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from appliance.inference.classifier import Classifier
 from train.cli import options
 from train.cli.options import Add
 from train.data import sets
-from train.evaluation import evaluate, robustness, sim_calibration, uncertainty
+from train.evaluation import cnn_curve, evaluate, robustness, sim_calibration, uncertainty
 from train.evaluation.corruptions import EvaluationSweeps
 from train.export import contact_positions
 from train.metrics import score
@@ -25,7 +25,7 @@ from train.reports import contact_plot, plots, uncertainty_report
 
 
 def register(add: Add) -> None:
-    """methods, evaluate, stress, certainty, calibrate, alignment."""
+    """methods, evaluate, stress, certainty, calibrate, cnn-curve, alignment."""
     add("methods", run_methods, "list the methods that evaluate knows")
     _add_evaluate(add)
     _add_stress(add)
@@ -37,6 +37,14 @@ def register(add: Add) -> None:
     calibrate.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
     calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     calibrate.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
+    follow = add("cnn-curve", run_cnn_curve, "follow the paper's CNN while it learns the simulated skin")
+    follow.add_argument("--size", choices=cnn_curve.SIZES, default="small",
+                       help="small (a stand-in of a minute) or whole (an hour of one core)")  # fmt: skip
+    follow.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulated world and the training (1)")
+    follow.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
+    follow.add_argument("--steps", type=int, metavar="N", help="iterations (those of the size)")
+    follow.add_argument("--out", type=Path, required=True, metavar="FILE",
+                       help="where the curve goes; an interrupted training goes on from there")  # fmt: skip
     alignment = add(
         "alignment",
         run_alignment,
@@ -190,6 +198,16 @@ def run_calibrate(args: argparse.Namespace) -> None:
     if args.json:
         put(args.json, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     print(sim_calibration.table(result))
+
+
+def run_cnn_curve(args: argparse.Namespace) -> None:
+    """Train, write the curve, print it."""
+    if args.steps is not None and args.steps < 1:
+        raise FormatError(f"--steps {args.steps} is none; use 1 or more")
+    log = options.Log()
+    print(cnn_curve.table(cnn_curve.follow(
+        args.out, args.size, args.seed, args.remove_means, steps=args.steps, log=log
+    )))  # fmt: skip
 
 
 def run_alignment(args: argparse.Namespace) -> None:

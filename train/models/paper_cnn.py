@@ -125,19 +125,19 @@ class ImageNetwork(Network):
         return g.model(form, "logits", classes)
 
 
-def build_paper_cnn(form: SweepFormat, classes: int, samples: Array) -> Network:
+def build_paper_cnn(form: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER) -> Network:
     """The paper's CNN; raw counts are scaled by one mean and one deviation of all `samples`, since no scale is printed.
 
     15,891,910 parameters for 1500 x 4 x 4 and six materials.
     """
     mean = float(samples.mean(dtype=np.float64))
     scale = float(1 / max(samples.std(dtype=np.float64), 1e-6))
-    return ImageNetwork(form, classes, scale, mean, PAPER)
+    return ImageNetwork(form, classes, scale, mean, layers)
 
 
-def build_centred(form: SweepFormat, classes: int, samples: Array) -> Network:
+def build_centred(form: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER) -> Network:
     """The paper's CNN behind a layer that subtracts each taxel's mean, as in the compact network."""
-    return ImageNetwork(form, classes, texture_scale(samples), None, PAPER)
+    return ImageNetwork(form, classes, texture_scale(samples), None, layers)
 
 
 def build_tactnet2(form: SweepFormat, classes: int, samples: Array) -> Network:

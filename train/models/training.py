@@ -39,6 +39,8 @@ Cost = list[tuple[int, float]]
 Net = TypeVar("Net", bound=Network)
 Recipe = TypeVar("Recipe", bound="TrainingRecipe")
 Augment = Callable[[Tensor, Generator], Tensor]
+Watch = Callable[[int, Network], None]
+"""Called after each step with its number and the network, which it leaves as it was; so it draws no random numbers."""
 Build = Callable[[SweepFormat, int, Array], Network]
 """(format, number of materials, training samples [N, T, R, C]) -> an untrained network."""
 MIN_STEPS = 2
@@ -143,6 +145,7 @@ def learn(
     bfloat16: bool = False,
     augment: Augment = unchanged,
     unfinished: Path | None = None,
+    watch: Watch = lambda step, network: None,
 ) -> tuple[Net, Cost]:
     """Train by gradient descent; gives the moving average of the weights, ready for inference on the processor, and the
     cost of each step.
@@ -172,6 +175,7 @@ def learn(
         optimizer.step()
         schedule.step()
         average.update_parameters(model)
+        watch(step, model)
         checkpoint.save(cost)
         log(f"step {step}/{recipe.steps} loss {cost[-1][1]:.3f}")
     averaged = average.module

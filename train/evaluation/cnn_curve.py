@@ -1,0 +1,172 @@
+"""The paper's CNN followed while it learns: accuracy over iterations at new positions and a row off. In: a size, a seed.
+
+Out: a Curve in a file, beside the two accuracies that the paper prints. Trained whole it takes an hour of one core, so there
+is a small one to compare simulated worlds with: a quarter of the filters and neurons, one second of each sweep, 600
+iterations at ten times the rate. An interrupted training goes on from the file and a checkpoint beside it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from appliance.core.storage import put
+from appliance.sim import skin
+from train.data import sets
+from train.data.sets import Dataset
+from train.metrics import score
+from train.models import paper_cnn
+from train.models.networks import Network
+from train.models.paper_cnn import PAPER_RECIPE, ImageLayers
+from train.models.training import TrainingRecipe, batches, deterministic_device, float_batches, learn
+
+Array = NDArray[Any]
+PRINTED = {"new": 0.923, "hard": 0.917}
+"""Figs. 5, 7 and 10: leave one position out, and T-HARD."""
+APART = 1000
+"""T-REAL of the seed + APART stands for positions that were left out: as the ninth, but more of them."""
+ATTACHMENTS = 20
+FIRST_MARK = 25
+EACH = {"train": 10, "new": 3, "hard": 3}
+"""Sweeps of each material at each position."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """A form of the paper's CNN. window: frames of each sweep that it sees."""
+
+    layers: ImageLayers
+    window: int
+    recipe: TrainingRecipe
+
+
+SIZES = {
+    "small": Size(
+        replace(paper_cnn.PAPER, channels=(8, 16), dense=256), 750, replace(PAPER_RECIPE, steps=600, peak_rate=1e-3)
+    ),
+    "whole": Size(paper_cnn.PAPER, 1500, replace(PAPER_RECIPE, steps=paper_cnn.PAPER_STEPS)),
+}
+
+
+def draw(seed: int, world: skin.World, window: int, each: dict[str, int]) -> dict[str, Dataset]:
+    """The sets "train", "new" and "hard" of a simulated world, the first `window` frames of each sweep."""
+    hard = range(ATTACHMENTS * (seed - 1) + 1, ATTACHMENTS * seed + 1)
+    named: dict[str, list[tuple[skin.SetName, int]]] = {
+        "train": [("T-REAL", seed)],
+        "new": [("T-REAL", seed + APART)],
+        "hard": [("T-HARD", number) for number in hard],
+    }
+    drawn = {}
+    for key, those in named.items():
+        parts = []
+        for name, number in those:
+            samples, labels, position = skin.sweep_set(name, number, each[key], world)
+            groups = {"position": position}
+            parts.append(Dataset(samples[:, :window], labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, name))
+        drawn[key] = sets.join(parts)
+    return drawn
+
+
+def follow(
+    out: Path,
+    size: str,
+    seed: int,
+    centred: bool = False,
+    world: skin.World = skin.WORLD,
+    steps: int | None = None,
+    log: Callable[[str], None] = lambda line: None,
+    each: dict[str, int] | None = None,
+) -> dict[str, Any]:
+    """Train, and write a point of the curve into `out` at each of `marks`; what the file then holds.
+
+    centred: behind a layer that subtracts each taxel's mean. steps: None for those of the size. Computed in bfloat16 where
+    the processor can. Raises OSError where `out` cannot be written.
+    """
+    form, each = SIZES[size], each or EACH
+    about = [size, seed, centred, repr(world), steps, each]
+    recipe = replace(form.recipe, steps=form.recipe.steps if steps is None else steps)
+    unfinished, result = out.with_suffix(".pt"), _kept(out, about)
+    if result is None:
+        unfinished.unlink(missing_ok=True)  # of another training
+        result = {"about": about, "printed": PRINTED, "points": []}
+        _write(out, result)
+    if any(point["step"] == recipe.steps for point in result["points"]):
+        return result
+    given, at = draw(seed, world, form.window, each), set(marks(recipe.steps))
+
+    def watch(step: int, network: Network) -> None:
+        if step in at:
+            answers = {name: _answers(network, sweeps.samples) for name, sweeps in given.items()}
+            earlier = [point for point in result["points"] if point["step"] < step]
+            result["points"] = [*earlier, {"step": step} | _point(answers, given)]
+            _write(out, result)
+
+    with deterministic_device(seed) as device:
+        half = device == "cuda" or bool(torch.cpu.get_capabilities().get("avx512_bf16"))
+        build, train = paper_cnn.build_centred if centred else paper_cnn.build_paper_cnn, given["train"]
+        network = build(train.format, len(train.materials), train.samples, form.layers)
+        learn(network, train, recipe, seed, log, device, half, unfinished=unfinished, watch=watch)
+    unfinished.unlink(missing_ok=True)
+    return result
+
+
+def marks(steps: int) -> list[int]:
+    """Iterations at which the accuracy is measured: FIRST_MARK, twice, four times as many and so on, and the last."""
+    doubled = [FIRST_MARK * 2**i for i in range(20)]
+    return [*(mark for mark in doubled if mark < steps), steps]
+
+
+def _kept(out: Path, about: Sequence[Any]) -> dict[str, Any] | None:
+    """What an earlier run of the same training wrote; None where there is nothing, or of another one."""
+    try:
+        kept: dict[str, Any] = json.loads(out.read_text())
+    except (OSError, ValueError):
+        return None
+    return kept if kept.get("about") == json.loads(json.dumps(about)) else None
+
+
+def _write(out: Path, result: dict[str, Any]) -> None:
+    put(out, (json.dumps(result) + "\n").encode(), parents=True)
+
+
+@torch.no_grad()
+def _answers(network: Network, samples: Array) -> Array:
+    """Labels int64 [n]; the network trains on afterwards."""
+    device = next(network.parameters()).device
+    network.eval()
+    numbers = batches(len(samples), 32)
+    labels = [network(x.to(device)).argmax(1).cpu().numpy() for x in float_batches(samples, numbers)]
+    network.train()
+    return np.concatenate(labels)
+
+
+def _point(answers: dict[str, Array], given: dict[str, Dataset]) -> dict[str, Any]:
+    """Of each set the share of right answers and its 95 % interval over positions; the confusion of all but training."""
+    point: dict[str, Any] = {}
+    for name, sweeps in given.items():
+        right = answers[name] == sweeps.labels
+        ends = score.interval(right, sweeps.group("position"))
+        point[name] = [round(float(value), 4) for value in (right.mean(), *ends)]
+        if name != "train":
+            confusion = np.zeros((len(sweeps.materials),) * 2, int)
+            np.add.at(confusion, (sweeps.labels, answers[name]), 1)
+            point[f"{name} confusion"] = confusion.tolist()
+    return point
+
+
+def table(result: dict[str, Any]) -> str:
+    """A line for each point, for a person."""
+    size, seed, centred = result["about"][:3]
+    lines = [f"{size}{', means removed' * centred}, seed {seed}; printed {PRINTED['new']} and {PRINTED['hard']}",
+             f"{'iteration':>9}  {'training':<9} {'new positions':<24} T-HARD"]  # fmt: skip
+    for point in result["points"]:
+        new, hard = ("{:.3f} [{:.3f}, {:.3f}]".format(*point[name]) for name in ("new", "hard"))
+        lines.append(f"{point['step']:>9}  {point['train'][0]:<9.3f} {new:<24} {hard}")
+    return "\n".join(lines)
