@@ -18,7 +18,7 @@ from train.models import checkpoint, paper_cnn
 FEW = {"train": 1, "new": 1, "hard": 1}
 
 
-class Interrupted(Exception):
+class CurveInterrupted(Exception):
     """Stands for a loss of power."""
 
 
@@ -39,7 +39,7 @@ def follow(out: Path, seed: int = 1, stop_at: int = 0, **options: Any) -> dict[s
 
     def log(line: str) -> None:
         if line.startswith(f"step {stop_at}/"):
-            raise Interrupted
+            raise CurveInterrupted
 
     return cnn_curve.follow(out, "small", seed, log=log, **options)
 
@@ -84,7 +84,7 @@ def test_a_curve_has_all_its_points(tmp_path: Path) -> None:
 @pytest.mark.parametrize("centred", [False, True])
 def test_an_interrupted_curve_goes_on(centred: bool, tmp_path: Path) -> None:
     """It becomes what it would have been."""
-    with pytest.raises(Interrupted):
+    with pytest.raises(CurveInterrupted):
         follow(tmp_path / "a.json", stop_at=5, centred=centred)
     assert [p["step"] for p in json.loads((tmp_path / "a.json").read_text())["points"]] == [2, 4]
     resumed, whole = (follow(tmp_path / name, centred=centred)["points"] for name in ("a.json", "b.json"))
@@ -96,7 +96,7 @@ def test_an_interrupted_curve_goes_on(centred: bool, tmp_path: Path) -> None:
 def test_another_training_in_the_file_is_replaced(kept: str | None, tmp_path: Path) -> None:
     """With its checkpoint, which would be of other weights; a file that cannot be read likewise."""
     out = tmp_path / "a.json"
-    with pytest.raises(Interrupted):
+    with pytest.raises(CurveInterrupted):
         follow(out, seed=2, stop_at=5)
     if kept is not None:
         out.write_text(kept)
