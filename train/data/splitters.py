@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -150,3 +151,44 @@ def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Ar
     if len(np.unique(labels[train])) < 2:
         raise FormatError(f"{what}: {train.sum()} sweeps of less than two materials are left to train on")
     return np.flatnonzero(train), np.flatnonzero(test)
+
+
+OF_THE_SET = ("recording", "set", "split", "world")
+"""Groups that say where a sweep is from, and no condition that a user would vary."""
+RANDOM_PARTS = 5
+
+
+@dataclass(frozen=True)
+class InnerPart:
+    """Sweeps of a training set that judge what was fitted to the others. group: what their values belong to. out: [N]."""
+
+    group: str
+    out: Array
+
+
+def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
+    """Each group that can be left out, in `most` parts at most; recordings, materials spread evenly, where there is none.
+
+    The first part of every group comes first, then the second ones.
+
+    A group can be left out where it does not cut recordings in two, and where every material that is tested remains.
+    Raises FormatError where nothing can be left out.
+    """
+    of_all = [_parts_of(sweeps, name, most) for name in sorted(sweeps.groups) if name not in OF_THE_SET]
+    if any(of_all):
+        return [part for turn in zip_longest(*of_all) for part in turn if part]
+    fewest = min(len(np.unique(sweeps.group("recording")[sweeps.labels == k])) for k in np.unique(sweeps.labels))
+    if fewest < 2:
+        raise FormatError(f"{sweeps.source}: a material has one recording; two of each are needed to choose a model by")
+    drawn = Protocol(f"random:{min(RANDOM_PARTS, fewest)}").folds(sweeps, 1)
+    return [InnerPart("recording", np.isin(np.arange(len(sweeps)), test)) for _, test in drawn]
+
+
+def _parts_of(sweeps: Dataset, name: str, most: int) -> list[InnerPart]:
+    values, recording = sweeps.group(name), sweeps.group("recording")
+    shuffled = np.random.default_rng(0).permutation(np.unique(values))
+    if len(shuffled) < 2 or len(np.unique(np.stack([recording, values]), axis=1).T) > len(np.unique(recording)):
+        return []
+    parts = [np.isin(values, some) for some in np.array_split(shuffled, min(most, len(shuffled)))]
+    labels = sweeps.labels
+    return [InnerPart(name, out) for out in parts if set(labels[out]) <= set(labels[~out])]

@@ -16,19 +16,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from appliance.core.types import SweepFormat
-from train.models.methods import FULL_EFFORT, Effort, Method
+from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from train.models.networks import Network, layer_constants
 from train.models.scale import texture_scale
-from train.models.training import (
-    Log,
-    TrainingRecipe,
-    batches,
-    float_batches,
-    network_method,
-    no_log,
-    one_thread,
-    scale_steps,
-)
+from train.models.training import TrainingRecipe, batches, float_batches, network_method, one_thread, scale_steps
 from train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]

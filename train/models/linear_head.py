@@ -63,6 +63,17 @@ def hold_out(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
     return _split(sweeps, "recording", seed)
 
 
+def hold_out_or_all(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
+    """As linear_head.hold_out; too small a set is used whole on both sides, by "nothing".
+
+    Then only Platt's correction bounds the temperature.
+    """
+    try:
+        return hold_out(sweeps, seed)
+    except FormatError:
+        return sweeps, sweeps, "nothing"
+
+
 def _split(sweeps: Dataset, by: str, seed: int) -> tuple[Dataset, Dataset, str]:
     train, held_out = sweeps.split(by, 1 - HELD_OUT, seed)
     counts = np.bincount(train.labels, minlength=len(sweeps.materials))
@@ -140,3 +151,10 @@ def _centred(coefficients: Array, intercepts: Array) -> tuple[Array, Array]:
     if len(coefficients) == 1:  # of two labels scikit-learn gives the second one's margin
         coefficients, intercepts = np.vstack([-coefficients, coefficients]), np.append(-intercepts, intercepts)
     return coefficients - coefficients.mean(0), intercepts - intercepts.mean()
+
+
+def expanded_head(weight: Array, bias: Array, present: Array, classes: int) -> tuple[Array, Array]:
+    """A head for all `classes`, of which `present` were trained; as Network.expand_head."""
+    all_weight, all_bias = np.zeros((classes, weight.shape[1]), np.float32), np.full(classes, ABSENT, np.float32)
+    all_weight[present], all_bias[present] = weight - weight.mean(axis=0), bias - bias.mean()
+    return all_weight, all_bias

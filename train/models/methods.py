@@ -22,6 +22,10 @@ from train.data.sets import Dataset
 from train.features import kinds
 
 Array = NDArray[Any]
+Log = Callable[[str], None]
+"""Shows a line of progress."""
+Cost = list[tuple[int, float]]
+"""(iteration, cross entropy of its batch), eq. 11: what the paper's Fig. 9 shows."""
 MODULES = (
     "train.models.baselines",
     "train.models.prior_work",
@@ -31,7 +35,7 @@ MODULES = (
     "train.models.aeon_peers",
     "train.models.ds_cnn",
     "train.models.edge_spectral",
-    "train.models.filter_bank",
+    "train.models.compact.default",
     "train.models.paper_cnn",
     "train.models.recurrent",
     "train.models.compact.methods",
@@ -110,6 +114,10 @@ class Method:
     def runs_on_the_box(self) -> bool:
         """Whether its models have a graph, and the box computes the graph's input."""
         return not self.why_not_on_the_box
+
+
+def no_log(line: str) -> None:
+    """A log that drops every line."""
 
 
 def model_inputs(kind: str, sweeps: Dataset) -> Array:

@@ -22,20 +22,16 @@ from torch.nn import functional
 from torch.optim import lr_scheduler
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
 from train.data.sets import Dataset
 from train.models.checkpoint import Checkpoint, Stateful, default_generators
-from train.models.linear_head import fit_temperature, hold_out
-from train.models.methods import Effort, Method, Model
+from train.models.linear_head import fit_temperature, hold_out_or_all
+from train.models.methods import Cost, Effort, Log, Method, Model, no_log
 from train.models.networks import Network
 from train.onnx_tools.graph_builder import GraphModel
 from train.onnx_tools.quantize import quantize
 
 Array = NDArray[Any]
-Log = Callable[[str], None]
-Cost = list[tuple[int, float]]
-"""(iteration, cross entropy of its batch), eq. 11: what the paper's Fig. 9 shows."""
 Net = TypeVar("Net", bound=Network)
 Recipe = TypeVar("Recipe", bound="TrainingRecipe")
 Augment = Callable[[Tensor, Generator], Tensor]
@@ -91,10 +87,6 @@ class NetworkModel:
     def graph(self) -> onnx.ModelProto:
         """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
         return self.network.graph()
-
-
-def no_log(line: str) -> None:
-    """A log that drops every line."""
 
 
 def unchanged(x: Tensor, rng: Generator) -> Tensor:
@@ -265,17 +257,6 @@ def network_method(
         unfinished=unfinished,
     )  # fmt: skip
     return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations{', bfloat16' * bfloat16}")
-
-
-def hold_out_or_all(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
-    """As linear_head.hold_out; too small a set is used whole on both sides, by "nothing".
-
-    Then only Platt's correction bounds the temperature.
-    """
-    try:
-        return hold_out(sweeps, seed)
-    except FormatError:
-        return sweeps, sweeps, "nothing"
 
 
 def describe_run(recipe: TrainingRecipe, device: str, half: bool, wanted: bool) -> str:

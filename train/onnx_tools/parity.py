@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnx import numpy_helper
+from onnx import helper, numpy_helper
 
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
@@ -274,12 +274,32 @@ def _weights(model: onnx.ModelProto, node: onnx.NodeProto) -> tuple[Array, Array
     """Integer weights of `node` less their zero point, float64, and the step of each channel, shaped to fit; None where
     they are float."""
     maker, constants = _maker(model, node.input[1]), _constants(model)
-    if maker is None or maker.op_type != "DequantizeLinear" or maker.input[0] not in constants:
+    if maker is None or maker.op_type != "DequantizeLinear":
         return None
-    taps, steps = constants[maker.input[0]].astype(np.float64), constants[maker.input[1]]
+    stored = constants.get(maker.input[0])
+    if stored is None and not _depends_on_input(model, maker.input[0]):
+        stored = outputs(model, [maker.input[0]], _nothing(model))[0]
+    if stored is None:
+        return None
+    taps, steps = stored.astype(np.float64), constants[maker.input[1]]
     if len(maker.input) > 2:
         taps -= constants[maker.input[2]].reshape(-1, *[1] * (taps.ndim - 1) * (steps.ndim > 0))
     return taps, steps.reshape(-1, *[1] * (taps.ndim - 1))
+
+
+def _depends_on_input(model: onnx.ModelProto, tensor: str) -> bool:
+    """Whether `tensor` is, or is computed from, the model's input: else onnxruntime computes it when it loads the model."""
+    if tensor == model.graph.input[0].name:
+        return True
+    maker = _maker(model, tensor)
+    return maker is not None and any(_depends_on_input(model, name) for name in maker.input)
+
+
+def _nothing(model: onnx.ModelProto) -> Array:
+    """One input of zeros [1, ...] of the model's type."""
+    given = model.graph.input[0].type.tensor_type
+    shape = [d.dim_value for d in given.shape.dim][1:]
+    return np.zeros((1, *shape), helper.tensor_dtype_to_np_dtype(given.elem_type))
 
 
 def _percentiles(values: Array) -> tuple[float, ...]:

@@ -56,7 +56,7 @@ def work(name: str, call: Call, out: Shape) -> tuple[int, int]:
 
 
 _ONE, _TWO = _op(shapes.same, F), _op(shapes.spread, F, F)
-_COMPARED = _op(shapes.compare, (*F, *L, "int32"), (*F, *L, "int32"))
+_COMPARED = _op(shapes.compare, (*F, *L, *U8, "int32"), (*F, *L, *U8, "int32"))
 _REDUCED = _op(shapes.reduce, F, L, least=1, axes=INTS, keepdims=INT)
 _STEPPED = ("uint8", "int8", "int32")
 _MACHINE = {"classlabels_ints": INTS, "vectors_per_class": INTS, "kernel_type": TEXT, "post_transform": TEXT,
@@ -69,7 +69,7 @@ OPERATORS: dict[tuple[str, str], Operator] = {
     ("", "And"): _op(shapes.compare, B, B),
     ("", "ArgMax"): _op(shapes.highest, F, axis=INT, keepdims=INT),
     ("", "Cast"): _op(shapes.cast, ANY, to=INT),
-    ("", "Clip"): _op(shapes.clip, F, F, F),
+    ("", "Clip"): _op(shapes.clip, (*F, *U8), (*F, *U8), (*F, *U8)),
     ("", "Concat"): _op(shapes.concat, (*F, *L, "int32"), most=1000, axis=INT),
     ("", "ConstantOfShape"): _op(shapes.filled, L, value=TENSOR),
     ("", "Conv"): _op(shapes.conv, F, F, F, least=2, strides=INTS, pads=INTS, dilations=INTS, group=INT),

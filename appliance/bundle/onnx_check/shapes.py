@@ -132,7 +132,7 @@ def rest(call: Call) -> Out:
 def cast(call: Call) -> Out:
     """Cast."""
     to = call.given.get("to", 0)
-    need(to in (1, 2, 7), f"type {to} is none to cast to")
+    need(to in (1, 2, 3, 7), f"type {to} is none to cast to")
     return KINDS[to], call.inputs[0].shape
 
 

@@ -17,6 +17,8 @@ from train.data.sets import Dataset
 from train.models.compact.augment import Augmentation, augment
 from train.models.scale import texture_scale
 
+COPIES = 2
+"""Of the training sweeps, that a head in closed form sees beside them."""
 BATCH = 128
 """Sweeps that are changed at a time: so few need little memory."""
 

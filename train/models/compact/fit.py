@@ -7,22 +7,18 @@ one temperature that makes probabilities honest. No random state outside is read
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from appliance.core.errors import FormatError
-from appliance.core.sweep_set import read
 from appliance.core.types import SweepFormat
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from train.data.sets import Dataset
@@ -31,19 +27,20 @@ from train.models import training
 from train.models.compact import graph, spectrum
 from train.models.compact.architectures import DEFAULT, Architecture
 from train.models.compact.augment import Augmentation, augment, default_augmentation
-from train.models.compact.copies import copies
+from train.models.compact.copies import COPIES, copies
+from train.models.compact.fitted import Fit
+from train.models.compact.heads import HeadPart, HeadPlan
 from train.models.compact.network import Compact
 from train.models.linear_head import closed_form_head, hold_out
+from train.models.methods import Cost, Log, no_log
 from train.models.networks import Network
 from train.models.scale import texture_scale
-from train.models.training import Augment, Cost, Log, batches, float_batches, learn, no_log, one_thread
+from train.models.training import Augment, batches, float_batches, learn, one_thread
 from train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
 HeadInputs = tuple[tuple[Array, Array], ...]
 """(features of the training sweeps and their copies, features of the held-out sweeps) of the float and the int8 trunk."""
-COPIES = 2
-"""Of the training sweeps, augmented as in training, that the closed-form head sees beside them."""
 
 
 @dataclass(frozen=True)
@@ -64,99 +61,6 @@ class FitRecipe(training.TrainingRecipe):
         """What a fit and its bundle's manifest record."""
         fields = asdict(self)
         return fields | {"scene": fields.pop("augmentation")}
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A trained network. weights: the state of a fused Compact with its LDA head, the temperature folded in, and a second
-    head, `int8.weight` [K, F] and `int8.bias` [K], fitted to what the int8 trunk gives.
-
-    architecture: cut to what the heads see. ranges: of its int8 form. train, held: the sweeps that were trained on and
-    those that were held out. about: JSON of how it was made and validated. cost: (step, cross entropy) of the training;
-    the file does not keep it.
-    """
-
-    weights: dict[str, Array]
-    scale: float
-    architecture: Architecture
-    ranges: graph.Ranges
-    train: Dataset
-    held: Dataset
-    about: dict[str, Any]
-    cost: Cost = field(default_factory=list)
-
-    @property
-    def keep_means(self) -> bool:
-        """Whether the head sees the means of the taxels."""
-        return bool(self.about["recipe"]["keep_means"])
-
-    @property
-    def bands(self) -> int:
-        """How many of the features, the last ones, are of the spectrum and were not learned."""
-        return self.architecture.spectrum * spectrum.count(self.train.format)
-
-    @property
-    def augmentation(self) -> Augmentation:
-        """The augmentation of its training."""
-        return Augmentation(**self.about["recipe"]["scene"])
-
-    def network(self) -> Compact:
-        """The network in PyTorch, ready to run."""
-        with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and overwritten
-            form, classes = self.train.format, len(self.train.materials)
-            model = Compact(form, classes, self.scale, False, self.keep_means, self.architecture)
-        state = {k: torch.from_numpy(v) for k, v in self.weights.items() if not k.startswith("int8.")}
-        model.load_state_dict(state)
-        return model.eval()
-
-    def trunk(self, int8: bool = True, tenths: bool = False) -> onnx.ModelProto:
-        """`sweep` -> `features` float32 [1, F], or `tenths` float32 [1, 10, F]; see graph.trunk_graph."""
-        ranges, form = self.ranges if int8 else None, self.train.format
-        return graph.trunk_graph(form, self.scale, self.weights, self.architecture, ranges, tenths, self.keep_means)
-
-    def int8_head(self) -> tuple[Array, Array]:
-        """Weight [K, F] and bias [K] of the int8 trunk's head, the temperature folded in."""
-        return self.weights["int8.weight"], self.weights["int8.bias"]
-
-    def save(self, path: Path) -> None:
-        """Write the fit as one .npz without pickle; training and held-out sweeps are one set, the first of them trained on."""
-        sets = {
-            f"set_{k}": np.concatenate([getattr(self.train, k), getattr(self.held, k)]) for k in ("samples", "labels")
-        }
-        arrays = {f"weight_{k}": v for k, v in self.weights.items()} | sets
-        for name in self.train.groups:
-            arrays[f"group_{name}"] = np.concatenate([self.train.groups[name], self.held.groups[name]])
-        meta = {"scale": self.scale, "shape": asdict(self.architecture), "reach": asdict(self.ranges),
-                "materials": self.train.materials, "rate_hz": self.train.rate_hz,
-                "source": self.train.source, "trained_on": len(self.train), "about": self.about}  # fmt: skip
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as f:
-            np.savez_compressed(f, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
-
-    @classmethod
-    def load(cls, path: Path) -> Fit:
-        """Read what `save` wrote. Raises FormatError where it is something else."""
-        what = "a fit (made by palpate-train fit)"
-        arrays = read(path, what)
-        try:
-            meta = json.loads(str(arrays["meta"]))
-            weights, groups = (
-                {k.removeprefix(p): v for k, v in arrays.items() if k.startswith(p)} for p in ("weight_", "group_")
-            )
-            samples, labels, materials = arrays["set_samples"], arrays["set_labels"], tuple(meta["materials"])
-            sweeps = Dataset(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
-            first = np.arange(len(sweeps)) < meta["trained_on"]
-            architecture = Architecture(**meta["shape"] | {"channels": tuple(meta["shape"]["channels"])})
-            ranges = graph.Ranges(meta["reach"]["digits"], tuple(meta["reach"]["responses"]))
-            train, held = sweeps.take(first), sweeps.take(~first)
-            fit = cls(weights, meta["scale"], architecture, ranges, train, held, meta["about"])
-        except (KeyError, ValueError, TypeError) as e:
-            raise FormatError(f"{path.name}: not {what}, or of another version; fit again: {e}") from e
-        try:
-            fit.network()
-        except RuntimeError as e:
-            raise FormatError(f"{path.name}: its weights are not those of its {architecture}; fit again") from e
-        return fit
 
 
 def fit(sweeps: Dataset, seed: int, recipe: FitRecipe, log: Log = no_log, architecture: Architecture = DEFAULT) -> Fit:
@@ -195,7 +99,22 @@ def fit_on(
     right = int(np.sum(logits.argmax(1) == held.labels))
     about = {"seed": seed, "recipe": recipe.json(), "held_out_by": by, "validation": accuracy_figure(right, len(held))}
     ranges = replace(ranges, responses=ranges.responses[: len(model.convs)])
-    return Fit(weights, scale, model.architecture, ranges, train, held, about, cost)
+    plan = HeadPlan((HeadPart(tuple(range(weights["head.weight"].shape[1])), copies=True),))
+    return Fit(weights, scale, model.architecture, ranges, train, held, about, plan, cost)
+
+
+def train_stages(
+    sweeps: Dataset, seed: int, recipe: FitRecipe, log: Log, architecture: Architecture
+) -> tuple[dict[str, Array], float, graph.Ranges]:
+    """Stages trained on all of `sweeps`: their weights as graph.trunk_graph takes them, the scale, and ranges for int8."""
+    assert recipe.augmentation
+    with one_thread(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        scale, change = texture_scale(sweeps.samples), augmenter(sweeps.format, recipe.augmentation)
+        model = Compact(sweeps.format, len(sweeps.materials), scale, architecture=architecture)
+        model, _ = learn(model, sweeps, recipe, seed, log, augment=change)
+        weights = {name: values for name, values in model.weights().items() if name.startswith("convs.")}
+        return weights, scale, model.ranges(sweeps.samples)
 
 
 def _head_inputs(

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from train.data.sets import Dataset
 from train.models.compact.architectures import ARCHITECTURES, DEFAULT, Architecture
-from train.models.compact.fit import Fit, FitRecipe, fit_on
-from train.models.linear_head import ABSENT
-from train.models.methods import FULL_EFFORT, Effort, Method, Model
-from train.models.training import Cost, Log, NetworkModel, describe_run, hold_out_or_all, no_log, scale_steps
+from train.models.compact.fit import FitRecipe, fit_on
+from train.models.compact.fitted import Fit
+from train.models.linear_head import expanded_head, hold_out_or_all
+from train.models.methods import FULL_EFFORT, Cost, Effort, Log, Method, Model, no_log
+from train.models.training import NetworkModel, describe_run, scale_steps
 from train.onnx_tools.graph_builder import run, with_head
 
 Array = NDArray[Any]
@@ -66,15 +67,8 @@ def train_compact(
     fit = fit_on(*hold_out_or_all(known, seed), seed, recipe, log, architecture)
     network, present, ran = fit.network(), np.unique(sweeps.labels), describe_run(recipe, "cpu", False, False)
     network.expand_head(present, len(sweeps.materials), 1.0)
-    head = _expanded(*fit.int8_head(), present, len(sweeps.materials))
+    head = expanded_head(*fit.int8_head(), present, len(sweeps.materials))
     return CompactModel(fit, *head, ran, fit.cost, {"float": NetworkModel(network, ran, fit.cost)})
-
-
-def _expanded(weight: Array, bias: Array, present: Array, classes: int) -> tuple[Array, Array]:
-    """A head for all `classes`, of which `present` were trained; as Network.expand_head."""
-    all_weight, all_bias = np.zeros((classes, weight.shape[1]), np.float32), np.full(classes, ABSENT, np.float32)
-    all_weight[present], all_bias[present] = weight - weight.mean(axis=0), bias - bias.mean()
-    return all_weight, all_bias
 
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
@@ -91,8 +85,8 @@ def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ..
         method(f"compact-{size}", convolutions.format(size[:-1]) if one.channels else bands, one)
         for size, one in ARCHITECTURES.items()
     )
-    default = "the box's default: as compact-20k, or smaller where held-out sweeps need less"
-    return (*sizes, method("compact", default, DEFAULT))
+    usual = "as compact-20k, or smaller where held-out sweeps need less"
+    return (*sizes, method("compact", usual, DEFAULT))
 
 
 METHODS = methods()

@@ -58,6 +58,14 @@ def limit_noise(x: Tensor) -> Tensor:
     return torch.where((noise > limit) & (limit > 0), x * (limit / noise), x)
 
 
+def band_powers(x: Tensor, form: SweepFormat) -> Tensor:
+    """Scaled taxels [B, R * C, T] -> log band powers [B, count(form)]."""
+    length = form.window // spectrum.SEGMENTS
+    waves, averaging = (torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(form)))
+    cut = x.mean(1)[:, : length * spectrum.SEGMENTS].unflatten(1, (spectrum.SEGMENTS, length))
+    return torch.log(((cut @ waves).square() @ averaging).mean(1) + spectrum.QUIET)
+
+
 class Compact(Network):
     """Strided convolutions over time with the taxels as channels; the head sees the logarithm of every mean response.
 
@@ -111,7 +119,7 @@ class Compact(Network):
         if self.keep_means:
             parts.append(counts.flatten(2).float().mean(1) * self.scale)
         if self.architecture.spectrum:
-            parts.append(spectrum.bands(limit_noise(prepared), self.form))
+            parts.append(band_powers(limit_noise(prepared), self.form))
         return torch.cat(parts, 1)
 
     def fused(self) -> Compact:

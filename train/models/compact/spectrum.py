@@ -12,10 +12,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from onnx import TensorProto
-from torch import Tensor
 
 from appliance.core.types import SweepFormat
 from train.models.compact.architectures import MAINS_HZ
@@ -38,14 +36,6 @@ def count(form: SweepFormat) -> int:
     return len(_edges(length)) - 1 if length >= MIN_SEGMENT else 0
 
 
-def bands(x: Tensor, form: SweepFormat) -> Tensor:
-    """Scaled taxels [B, R * C, T] -> log band powers [B, count(form)]."""
-    length = form.window // SEGMENTS
-    waves, averaging = (torch.from_numpy(m) for m in _matrices(length, _mains(form)))
-    cut = x.mean(1)[:, : length * SEGMENTS].unflatten(1, (SEGMENTS, length))
-    return torch.log(((cut @ waves).square() @ averaging).mean(1) + QUIET)
-
-
 def nodes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale: float, tenths: bool) -> str:
     """Raw counts [1, T, R * C] and the factor of each taxel [1, 1, R * C] -> log band powers [1, rows, bands].
 
@@ -56,7 +46,7 @@ def nodes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale:
     x = g("MatMul", g("Cast", raw, to=TensorProto.FLOAT), share)
     if form.window % SEGMENTS:
         x = g("Slice", x, *(g.constant([n], "int64") for n in (0, length * SEGMENTS, 1)))
-    x = g("MatMul", g("Reshape", x, g.constant([SEGMENTS, length], "int64")), _wave_nodes(g, length, _mains(form)))
+    x = g("MatMul", g("Reshape", x, g.constant([SEGMENTS, length], "int64")), _wave_nodes(g, length, mains(form)))
     power = g("MatMul", g("Mul", x, x), _averaging_nodes(g, _edges(length)))
     if tenths:
         power = g("MatMul", g.constant(np.tri(SEGMENTS) / np.arange(1, SEGMENTS + 1)[:, None]), power)
@@ -74,7 +64,7 @@ def _edges(length: int) -> Array:
     return np.unique(np.rint(np.geomspace(2, length + 1, BANDS + 1)).astype(int))
 
 
-def _mains(form: SweepFormat) -> float:
+def mains(form: SweepFormat) -> float:
     """Periods of the mains per frame; 0 where a segment holds less than two, or the hum is too fast to be told apart."""
     periods = MAINS_HZ / form.rate_hz
     return periods if periods * (form.window // SEGMENTS) >= 2 and periods <= 0.25 else 0.0
@@ -96,7 +86,7 @@ def _window(length: int) -> Array:
 
 
 @cache
-def _matrices(length: int, mains: float) -> tuple[Array, Array]:
+def matrices(length: int, mains: float) -> tuple[Array, Array]:
     """Waves [length, 2 * half bins], and the matrix that averages their squares over each band, float32."""
     k = np.arange(2, length + 1)
     phase = np.pi / length * (np.arange(length)[:, None] * k % (2 * length))

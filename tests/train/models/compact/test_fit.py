@@ -19,7 +19,8 @@ from train.data import sets
 from train.models import linear_head
 from train.models.compact import architectures, fit, spectrum
 from train.models.compact.architectures import ARCHITECTURES, DEFAULT
-from train.models.compact.fit import Fit, FitRecipe
+from train.models.compact.fit import FitRecipe
+from train.models.compact.fitted import Fit
 from train.models.compact.network import Compact
 
 QUICK = FitRecipe(steps=40)

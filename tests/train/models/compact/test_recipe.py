@@ -1,0 +1,153 @@
+"""The default recipe: what it chooses, that its forms agree, that it needs no PyTorch, and what it cannot be fitted to."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from tests.factories.sweep_sets import easy
+from train.data.sets import Dataset
+from train.data.splitters import inner_parts
+from train.models.compact import default, recipe
+from train.models.compact.bank import Bank
+from train.models.compact.fitted import Fit
+from train.models.compact.recipe import Settings
+from train.onnx_tools.graph_builder import run, with_head
+
+CLOSED = Settings(steps=0)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    """A fit on the easy set, without stages."""
+    return recipe.fit(easy(), 1, CLOSED)
+
+
+def test_an_easy_set_is_named_rightly(fitted: Fit):
+    """By heads that did not see the part; what was chosen is told."""
+    assert fitted.about["validation"]["accuracy"] > 0.9
+    assert "filters" in fitted.about["chosen"] or "spectrum" in fitted.about["chosen"]
+    assert len(fitted.train) + len(fitted.held) == len(easy())
+
+
+def test_the_trunk_holds_what_the_heads_see_and_no_more(fitted: Fit):
+    """Each feature is in a discriminant, and the heads fit the trunk."""
+    columns = fitted.plan.columns()
+    size = fitted.weights["int8.weight"].shape[1]
+    assert columns.tolist() == list(range(size))
+    assert run(fitted.trunk(), easy().samples[:2]).shape == (2, size)
+    usual = recipe.fit(easy(), 1, replace(CLOSED, choose=False))
+    assert usual.architecture.pools == 2
+    assert not usual.architecture.spectrum
+    assert not Bank.of(usual.weights).free.any()
+
+
+def test_int8_and_float_agree(fitted: Fit):
+    """Each with a head of its own."""
+    forms = [with_head(fitted.trunk(int8), *(fitted.weights[f"{name}.{part}"] for part in ("weight", "bias")))
+             for int8, name in ((True, "int8"), (False, "head"))]  # fmt: skip
+    rounded, precise = (run(form, easy().samples).argmax(axis=1) for form in forms)
+    assert np.mean(rounded == precise) > 0.98
+
+
+def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
+    """The same answers, the same plan; a fit whose bank is missing is refused by name."""
+    fitted.save(tmp_path / "fit.npz")
+    again = Fit.load(tmp_path / "fit.npz")
+    assert again.plan == fitted.plan
+    x = easy().samples[:4]
+    np.testing.assert_array_equal(run(again.trunk(), x), run(fitted.trunk(), x))
+    gone = {name: values for name, values in fitted.weights.items() if name not in ("bank.along", "int8.weight")}
+    replace(fitted, weights=gone).save(tmp_path / "fit.npz")
+    with pytest.raises(FormatError, match=r"fit\.npz.*fit again"):
+        Fit.load(tmp_path / "fit.npz")
+
+
+def test_the_same_seed_gives_the_same_fit(fitted: Fit):
+    """And another one other filters."""
+    again, other = (recipe.fit(easy(), seed, CLOSED) for seed in (1, 2))
+    for name, values in fitted.weights.items():
+        np.testing.assert_array_equal(again.weights[name], values)
+    assert other.plan != fitted.plan or not np.array_equal(other.weights["int8.weight"], fitted.weights["int8.weight"])
+
+
+@pytest.mark.slow
+def test_stages_join_in_where_they_help(monkeypatch: pytest.MonkeyPatch):
+    """Where the court lets them: their features come first, and a fifth of the sweeps is held out from them."""
+    monkeypatch.setattr(recipe.Court, "loss", lambda court, judged: -len(judged.plan.parts))
+    monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
+    fit = recipe.fit(easy(), 1, Settings(steps=20))
+    assert fit.architecture.channels == recipe.STAGES.channels
+    stages = sum(recipe.STAGES.channels)
+    assert fit.plan.parts[0].columns == tuple(range(stages))
+    assert len(fit.plan.parts) > 1
+    logits = run(with_head(fit.trunk(), *fit.int8_head()), easy().samples)
+    assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
+
+
+def test_filters_need_no_pytorch(tmp_path: Path):
+    """A process in which PyTorch cannot be imported fits and exports; the command says what it chose."""
+    easy().save(tmp_path / "easy.npz")
+    script = (
+        "import sys\n"
+        "import builtins, importlib.util as util\n"
+        "found, loaded = util.find_spec, builtins.__import__\n"
+        "def gone(name, *args, **kwargs):\n"
+        "    if name.partition('.')[0] == 'torch': raise ModuleNotFoundError(name)\n"
+        "    return loaded(name, *args, **kwargs)\n"
+        "util.find_spec = lambda name, *args: None if name == 'torch' else found(name, *args)\n"
+        "builtins.__import__ = gone\n"
+        "from train.cli.main import main\n"
+        f"code = main(['fit', '--set', {str(tmp_path / 'easy.npz')!r}, '--seed', '1', '--steps', '0', '--out', {str(tmp_path / 'f.npz')!r}])\n"
+        f"sys.exit(code or main(['export', {str(tmp_path / 'f.npz')!r}, '--out', {str(tmp_path / 'b')!r}, '--name', 'b', '--version', '1']))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "chosen: " in done.stdout
+    assert (tmp_path / "b" / "manifest.json").is_file()
+
+
+def test_the_method_names_materials_that_it_never_saw_last():
+    """A material without a training sweep gets a logit below all others; labels keep their numbers."""
+    sweeps = easy()
+    part = sweeps.take(sweeps.labels != 1)
+    model = default.train(part, part.samples, 1, settings=CLOSED)
+    logits = model.logits(sweeps.samples)
+    assert logits.shape == (len(sweeps), len(sweeps.materials))
+    assert (logits.argmax(axis=1) != 1).all()
+    named = logits.argmax(axis=1)[sweeps.labels != 1]
+    assert np.mean(named == part.labels) > 0.9
+    assert np.mean(model.forms["float"].logits(part.samples).argmax(axis=1) == named[: len(part)]) > 0.95
+
+
+def test_groups_that_can_be_left_out_judge():
+    """Each group in parts, the first ones first; one that cuts recordings does not, and recordings do where there is none."""
+    n = 24
+    labels, recording = np.arange(n) % 2, np.arange(n) // 2
+    groups = {"recording": recording, "speed": recording % 3, "force": recording % 2, "odd": np.arange(n) % 2}
+    sweeps = Dataset(np.zeros((n, 16, 1, 1), np.uint8), labels, ("a", "b"), 10.0, groups, "x")
+    assert [part.group for part in inner_parts(sweeps)] == ["force", "speed", "force", "speed", "speed"]
+    for part in inner_parts(sweeps):
+        assert set(sweeps.groups[part.group][part.out]).isdisjoint(sweeps.groups[part.group][~part.out])
+    pure = replace(sweeps, labels=recording % 2, groups={"recording": recording})
+    parts = inner_parts(pure)
+    assert [part.group for part in parts] == ["recording"] * 5
+    assert np.sum([part.out for part in parts], axis=0).tolist() == [1] * n
+    one = replace(pure, labels=(recording == 3).astype(int))
+    with pytest.raises(FormatError, match="a material has one recording; two of each are needed"):
+        inner_parts(one)
+
+
+def test_what_cannot_be_fitted_is_named():
+    """A constant skin, and a window that is too short; nothing else is tried."""
+    still = replace(easy(), samples=np.full_like(easy().samples, 7))
+    with pytest.raises(FormatError, match="every taxel of every sweep is constant; check the skin"):
+        recipe.fit(still, 1, CLOSED)
+    with pytest.raises(FormatError, match="a window of 12 frames is too short for the network; record at least 16"):
+        recipe.fit(replace(easy(), samples=easy().samples[:, :12]), 1, CLOSED)

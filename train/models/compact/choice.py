@@ -1,0 +1,160 @@
+"""What a trunk needs to hold, and how its heads see it: chosen by groups that were held out. In: features. Out: a Choice.
+
+Candidates differ in the filters, in how these are pooled, in the spectrum, in whether heads see augmented copies, and in
+whether trained stages join in. Each is judged by the cross entropy of sweeps whose group it did not see, its temperature
+being the best for them, and every group counts the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from appliance.inference.classifier import softmax
+from train.data.splitters import InnerPart
+from train.models.compact.heads import HeadData, HeadPart, HeadPlan
+
+Array = NDArray[Any]
+TINY = 1e-12
+ERRORS = 2.0
+"""Standard errors by which a candidate must be better than the first: it is the best of about ten."""
+Columns = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One candidate. losses: cross entropy [n] of each held-out sweep; logits [n, K] are of the temperature that is best."""
+
+    plan: HeadPlan
+    logits: Array
+    losses: Array
+
+
+class Court:
+    """Judges candidates on held-out parts. known: what heads are fitted to, for each part the same sweeps in the same order;
+    their features may differ, where a trunk was trained without the part."""
+
+    def __init__(self, known: Sequence[HeadData], parts: Sequence[InnerPart], classes: int) -> None:
+        self._known, self._parts, self._classes = known, parts, classes
+        self.sweeps = np.concatenate([np.flatnonzero(part.out) for part in parts])
+        self.labels = known[0].labels[self.sweeps]
+        groups = [part.group for part in parts]
+        sizes = {name: sum(int(p.out.sum()) for p in parts if p.group == name) for name in groups}
+        self.weights = np.concatenate([np.full(p.out.sum(), 1 / sizes[p.group] / len(sizes)) for p in parts])
+        self.clusters = np.concatenate([np.full(p.out.sum(), i) for i, p in enumerate(parts)])
+        self._logits: dict[tuple[Columns, bool], Array] = {}
+
+    def judge(self, parts: Sequence[HeadPart]) -> Judged:
+        """The candidate that adds the logits of `parts`, each scaled to the same size."""
+        logits = [self._of(part) for part in parts]
+        factors = [1 / max(float(np.abs(x - x.mean(axis=1, keepdims=True)).mean()), TINY) for x in logits]
+        total = np.sum([x * f for x, f in zip(logits, factors, strict=True)], axis=0)
+        found = minimize_scalar(lambda t: self._cost(total / np.exp(t)), bounds=(-6, 4))
+        temperature = float(np.exp(found.x))
+        plan = HeadPlan(tuple(replace(p, factor=f / temperature) for p, f in zip(parts, factors, strict=True)))
+        return Judged(plan, total / temperature, self._losses(total / temperature))
+
+    def loss(self, judged: Judged) -> float:
+        """Mean cross entropy, every group counting the same."""
+        return float(self.weights @ judged.losses)
+
+    def accuracy(self, judged: Judged) -> float:
+        """Share of held-out sweeps that are named rightly, every group counting the same."""
+        return float(self.weights @ self._right(judged))
+
+    def better(self, one: Judged, other: Judged) -> bool:
+        """Whether `one` names no fewer sweeps rightly, and its loss is lower by more than ERRORS standard errors of the paired
+        difference.
+
+        The error is that over held-out parts, or over sweeps where it is larger: a few parts may agree by chance.
+        """
+        if self.accuracy(one) < self.accuracy(other):
+            return False
+        gain = (other.losses - one.losses) * self.weights
+        by_part = np.bincount(self.clusters, gain)
+        spread = [np.sqrt(n / max(n - 1, 1) * ((x - x.mean()) ** 2).sum()) for x in (gain, by_part) if (n := len(x))]
+        return bool(gain.sum() > ERRORS * max(spread))
+
+    def costs(self, one: Judged, other: Judged) -> bool:
+        """Whether `one` names fewer sweeps rightly than `other`, by more than a standard error of the paired difference."""
+        lost = self.weights * (self._right(other).astype(float) - self._right(one))
+        error = np.sqrt(((lost - lost.mean()) ** 2).sum())
+        return bool(lost.sum() > error)
+
+    def _right(self, judged: Judged) -> Array:
+        right: Array = judged.logits.argmax(axis=1) == self.labels
+        return right
+
+    def _losses(self, logits: Array) -> Array:
+        losses: Array = -np.log(np.maximum(softmax(logits)[np.arange(len(logits)), self.labels], TINY))
+        return losses
+
+    def _cost(self, logits: Array) -> float:
+        """What the temperature makes least: the mean cross entropy, each label being right with probability
+        (n + 1) / (n + 2), Platt's correction: without it a few sweeps, all right, would allow any certainty."""
+        p, wrong = np.log(np.maximum(softmax(logits), TINY)), 1 / (len(self.labels) + 2)
+        right = p[np.arange(len(p)), self.labels]
+        return float(-self.weights @ ((1 - wrong) * right + wrong * p.mean(axis=1)))
+
+    def _of(self, part: HeadPart) -> Array:
+        """Logits [n, K] of one discriminant for the held-out sweeps."""
+        key = part.columns, part.copies
+        if key not in self._logits:
+            self._logits[key] = np.concatenate(
+                [self._tested(part, known, p.out) for known, p in zip(self._known, self._parts, strict=True)]
+            )
+        return self._logits[key]
+
+    def _tested(self, part: HeadPart, known: HeadData, out: Array) -> Array:
+        weight, bias = part.fit(known.take(~out).given(), self._classes)
+        return known.features[out] @ weight.T + bias
+
+
+def choose(
+    court: Court, kinds: Mapping[str, Sequence[Array]], pools: Sequence[Array], bands: Array, log: Callable[[str], None]
+) -> Judged:
+    """The candidate with the least loss, where it is `better` than the usual one; else the usual one.
+
+    What the sweeps are too few to tell apart is not chosen among. The usual one is the first kind, pooled in both ways.
+    Filters and pools are chosen first; then whether these see the spectrum and copies, or the spectrum is enough alone.
+    kinds: sets of filters by name, each a list of filters [n] that get a discriminant of their own. pools: the features
+    [F] of every filter's magnitude, then of its share. bands: numbers of the spectrum's features, which may be none.
+    """
+
+    def judged(named: str, parts: Sequence[HeadPart]) -> Judged:
+        log(f"choosing: {named}")
+        return court.judge(parts)
+
+    def best(of: Sequence[Judged]) -> Judged:
+        return min(of, key=court.loss)
+
+    plain = [
+        judged(f"{name} filters, {', '.join(('magnitudes', 'shares')[: len(pooled)])}", _parts(filters, pooled))
+        for name, filters in kinds.items()
+        for pooled in (pools, pools[:1])[: len(pools)]
+    ]
+    first = [part.columns for part in best(plain).plan.parts]
+    seen = {"without the spectrum": first}
+    if len(bands):
+        seen |= {
+            "with the spectrum": [(*first[0], *bands.tolist()), *first[1:]],
+            "the spectrum alone": [tuple(bands.tolist())],
+        }
+    more = [
+        judged(f"{name}{', with copies' * copies}", [HeadPart(columns, copies) for columns in sets])
+        for name, sets in seen.items()
+        for copies in (False, True)
+        if copies or sets is not first
+    ]
+    chosen = best([*plain, *more])
+    return chosen if court.better(chosen, plain[0]) else plain[0]
+
+
+def _parts(sets: Sequence[Array], pools: Sequence[Array]) -> list[HeadPart]:
+    """A discriminant for each of `sets` of filters, pooled in some ways."""
+    return [HeadPart(tuple(np.concatenate([pool[filters] for pool in pools]).tolist()), False) for filters in sets]

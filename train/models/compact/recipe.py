@@ -1,0 +1,232 @@
+"""The default recipe: a trunk and its heads, chosen by held-out groups of the training sweeps. In: a Dataset. Out: a Fit.
+
+The bank and the spectrum are fixed, so that choosing among them takes seconds and no PyTorch. Trained stages are tried
+beside what was chosen, where PyTorch is installed: trained without a held-out part of each group, they join in if they
+help there. What the heads do not use is left out of the trunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+from train.data.sets import Dataset
+from train.data.splitters import InnerPart, inner_parts
+from train.metrics.score import interval
+from train.models.compact import bank, choice, graph, spectrum
+from train.models.compact.architectures import ARCHITECTURES, Architecture
+from train.models.compact.augment import Augmentation, default_augmentation
+from train.models.compact.bank import Bank
+from train.models.compact.choice import Court, Judged
+from train.models.compact.copies import COPIES, copies
+from train.models.compact.fitted import Fit
+from train.models.compact.heads import HeadData, HeadPart, HeadPlan
+from train.models.linear_head import hold_out_or_all
+from train.models.methods import Log, no_log
+from train.models.scale import texture_scale
+from train.onnx_tools.graph_builder import run
+from train.onnx_tools.quantize import calibration_sweeps
+
+Array = NDArray[Any]
+STAGES = ARCHITECTURES["50k"]
+"""The stages that are tried."""
+TRIALS = 3
+"""Parts without which stages are trained, to judge them."""
+LEAST_SWEEPS = 200
+"""For training stages: fewer than a few batches give stages that know them by heart."""
+FIXED = Architecture((), planned=len(STAGES.channels), fewest=0)
+"""A trunk without stages that prepares counts as one with STAGES does."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a user may set. steps: of the training of stages; 0 to try none. augmentation: None for the usual one. choose:
+    whether anything is chosen; else it is the first candidate."""
+
+    steps: int = 600
+    augmentation: Augmentation | None = None
+    choose: bool = True
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """A trunk without heads, for sweeps of one set. weights: of stages and bank, as graph.trunk_graph takes them."""
+
+    sweeps: Dataset
+    scale: float
+    weights: Mapping[str, Array]
+    architecture: Architecture
+    ranges: graph.Ranges
+
+    def features(self, sweeps: Dataset, int8: bool = True) -> Array:
+        """What the heads see of `sweeps`, float32 [n, F]."""
+        ranges = self.ranges if int8 else None
+        return run(
+            graph.trunk_graph(sweeps.format, self.scale, self.weights, self.architecture, ranges), sweeps.samples
+        )
+
+    def layout(self) -> dict[str, slice]:
+        """See graph.layout."""
+        return graph.layout(self.sweeps.format, self.weights, self.architecture)
+
+
+def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = no_log) -> Fit:
+    """Choose and fit on `sweeps`, of which each material must occur; a fifth of the groups is what stages never see.
+
+    Raises FormatError where the window is shorter than a filter, every taxel is constant, or materials have too few
+    recordings to hold some out.
+    """
+    augmentation = settings.augmentation or default_augmentation(FIXED.zero_sum(sweeps.format.window))
+    fixed = fixed_trunk(sweeps, seed)
+    changed = list(copies(sweeps, augmentation, seed, COPIES))
+    parts, classes = inner_parts(sweeps), len(sweeps.materials)
+    known = _known(fixed, sweeps, changed)
+    court = Court([known] * len(parts), parts, classes)
+    chosen = _choose(court, fixed, settings.choose, log)
+    staged = None
+    if settings.steps and len(sweeps) >= LEAST_SWEEPS and find_spec("torch"):
+        staged = _with_stages(sweeps, seed, settings, augmentation, known, parts, chosen, log)
+    train, held, by = hold_out_or_all(sweeps, seed)
+    judged, court = staged or (chosen, court)
+    stages = _stages(train, seed, settings, augmentation, log) if staged else None
+    trunk, plan = _pruned(fixed, stages, judged.plan)
+    heads: dict[str, Array] = {}
+    for name, int8 in (("head", False), ("int8", True)):
+        weight, bias = plan.fit(_known(trunk, sweeps, changed, int8).given(), classes)
+        heads |= {f"{name}.weight": weight - weight.mean(axis=0), f"{name}.bias": bias - bias.mean()}
+    about = {
+        "seed": seed, "recipe": {"scene": vars(augmentation), "steps": settings.steps, "keep_means": False},
+        "held_out_by": by, "chosen": describe(trunk, plan), "validation": _validation(court, judged),
+    }  # fmt: skip
+    return Fit(
+        {**trunk.weights, **heads},
+        trunk.scale,
+        trunk.architecture,
+        trunk.ranges,
+        train,
+        held,
+        about,
+        plan=plan.uncooled(),
+    )
+
+
+def fixed_trunk(sweeps: Dataset, seed: int) -> Trunk:
+    """The trunk with the whole bank and the spectrum. Raises FormatError where the window is shorter than a filter, or
+    every taxel of every sweep is constant."""
+    form, rng = sweeps.format, np.random.default_rng(seed)
+    some = calibration_sweeps(sweeps.samples[rng.permutation(len(sweeps))])
+    if not np.ptp(sweeps.samples, axis=1).any():
+        raise FormatError("every taxel of every sweep is constant; check the skin, nothing can be learnt from this")
+    scale = texture_scale(sweeps.samples)
+    architecture = replace(FIXED, spectrum=spectrum.count(form) > 0, pools=2)
+    kinds = (False,) if architecture.zero_sum(form.window) else (False, True)
+    drawn = bank.draw(form, rng, kinds)
+    seen: list[Array] = [np.empty(0)] * len(drawn)
+    for numbers, model in graph.bank_responses(form, scale, architecture, drawn):
+        for number, values in zip(numbers, run(model, some).swapaxes(0, 2), strict=True):
+            seen[number] = values.ravel()
+    ranges = graph.Ranges(graph.count_range(some, architecture), ())
+    return Trunk(sweeps, scale, bank.fitted(drawn, seen, rng).weights(), architecture, ranges)
+
+
+def _choose(court: Court, trunk: Trunk, choosing: bool, log: Log) -> Judged:
+    """choice.choose for a trunk with the whole bank; the usual candidate where there is no choosing."""
+    layout, filters = trunk.layout(), Bank.of(trunk.weights)
+    pools = [np.arange(layout[name].start, layout[name].stop) for name in ("sizes", "shares")]
+    bands = np.arange(layout["bands"].start, layout["bands"].stop) if "bands" in layout else np.empty(0, int)
+    zero_sum, free = np.flatnonzero(~filters.free), np.flatnonzero(filters.free)
+    if not choosing:
+        return court.judge([HeadPart(tuple(np.concatenate([pool[zero_sum] for pool in pools]).tolist()), False)])
+    kinds = {"zero-sum": [zero_sum]}
+    if len(free):  # a half of each: a bundle has room for as many filters as one kind has
+        kinds |= {"free": [free], "both": [zero_sum[::2], free[::2]]}
+    return choice.choose(court, kinds, pools, bands, log)
+
+
+def _known(trunk: Trunk, sweeps: Dataset, changed: Sequence[Dataset], int8: bool = True) -> HeadData:
+    features = [trunk.features(one, int8) for one in (sweeps, *changed)]
+    source = np.tile(np.arange(len(sweeps)), len(changed))
+    return HeadData(features[0], sweeps.labels, np.concatenate(features[1:]), source)
+
+
+def _with_stages(
+    sweeps: Dataset, seed: int, settings: Settings, augmentation: Augmentation, known: HeadData,
+    parts: Sequence[InnerPart], chosen: Judged, log: Log,
+) -> tuple[Judged, Court] | None:  # fmt: skip
+    """`chosen` with trained stages, whose features come before all others, and the court that judged it; None
+    where that names clearly fewer sweeps rightly. TRIALS parts judge, of each group in turn.
+
+    What differs so much in kind errs on other sweeps: the two together stand a condition that nobody recorded better than
+    either alone, which no held-out part shows. So stages join in unless they cost something."""
+    classes, size = len(sweeps.materials), sum(STAGES.channels)
+    plain = [replace(p, columns=tuple(np.add(p.columns, size).tolist()), factor=1.0) for p in chosen.plan.parts]
+    stages = HeadPart(tuple(range(size)), True)
+    changed = list(copies(sweeps, augmentation, seed, COPIES))
+    joined: list[HeadData] = []
+    for part in parts[:TRIALS]:
+        trained = _stages(sweeps.take(~part.out), seed, settings, augmentation, log)
+        own = _known(trained, sweeps, changed)
+        both = (np.hstack([own.features, known.features]), np.hstack([own.copied, known.copied]))
+        joined.append(HeadData(both[0], known.labels, both[1], known.source))
+        court = Court(joined, parts[: len(joined)], classes)
+        without = court.judge(plain)
+        best = court.judge([stages, *plain])
+        if court.costs(best, without):
+            return None
+    return best, court
+
+
+def _stages(sweeps: Dataset, seed: int, settings: Settings, augmentation: Augmentation, log: Log) -> Trunk:
+    """Stages trained on `sweeps`, as a trunk of their own."""
+    from train.models.compact import fit as training  # here: the rest of the recipe needs no PyTorch
+
+    recipe = training.FitRecipe(steps=settings.steps, augmentation=augmentation)
+    weights, scale, ranges = training.train_stages(sweeps, seed, recipe, log, STAGES)
+    return Trunk(sweeps, scale, weights, STAGES, ranges)
+
+
+def _pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
+    """The trunk with only what the plan's discriminants see, and the plan for it."""
+    size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
+    fixed_used = used[used >= size] - size
+    filters, shares, bands = (
+        fixed_used[(fixed_used >= layout[name].start) & (fixed_used < layout[name].stop)] - layout[name].start
+        if name in layout
+        else np.empty(0, int)
+        for name in ("sizes", "shares", "bands")
+    )
+    pools = (len(filters) > 0) + (len(shares) > 0)
+    architecture = replace(stages.architecture if stages else FIXED, spectrum=len(bands) > 0, pools=pools)
+    weights = dict(stages.weights) if stages else {}
+    weights |= Bank.of(fixed.weights).take(filters).weights() if pools else {}
+    ranges = replace(fixed.ranges, responses=stages.ranges.responses) if stages else fixed.ranges
+    return Trunk(fixed.sweeps, fixed.scale, weights, architecture, ranges), plan.renumbered(used)
+
+
+def describe(trunk: Trunk, plan: HeadPlan) -> str:
+    """In words: what the trunk holds, and how many discriminants see copies."""
+    filters = Bank.of(trunk.weights).free if trunk.architecture.pools else np.empty(0, bool)
+    what = [f"{int((filters == free).sum())} {name} filters" for free, name in ((False, "zero-sum"), (True, "free"))
+            if (filters == free).any()]  # fmt: skip
+    what += ["magnitudes and shares" if trunk.architecture.pools > 1 else "magnitudes"] if len(filters) else []
+    what += ["spectrum"] if trunk.architecture.spectrum else []
+    what += (
+        [f"stages of {', '.join(map(str, trunk.architecture.channels))} channels"]
+        if trunk.architecture.channels
+        else []
+    )
+    copied = sum(part.copies for part in plan.parts)
+    return f"{', '.join(what)}; {len(plan.parts)} discriminants, {copied} with augmented copies"
+
+
+def _validation(court: Court, judged: Judged) -> dict[str, Any]:
+    """Accuracy on held-out parts of heads that did not see them, with its 95 % interval by part."""
+    right = judged.logits.argmax(axis=1) == court.labels
+    low, high = interval(right, court.clusters)
+    return {"accuracy": round(float(right.mean()), 4), "n": len(right), "low": low, "high": high}
