@@ -24,8 +24,9 @@ from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.moved import AugmentedCopies, MovedFit, fit_moved
 from train.calibration.novelty import Embedding
 from train.calibration.temperature import fit_temperature
-from train.models.compact.copies import copies
-from train.models.compact.fit import COPIES, Fit
+from train.models.compact.copies import COPIES, copies
+from train.models.compact.fitted import Fit
+from train.models.compact.heads import HeadPart, HeadPlan
 from train.onnx_tools.graph_builder import joined, run
 
 Array = NDArray[Any]
@@ -109,7 +110,7 @@ def calibrate(fit: Fit) -> Posthoc:
     return fit_posthoc(*posthoc_inputs(fit))
 
 
-def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies]:
+def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies, HeadPlan]:
     """The arguments of `fit_posthoc`: what the int8 trunk gives for the sweeps that were trained on and held out, in this
     order, and for augmented copies of both; those of the training sweeps are the ones that its head was fitted to.
 
@@ -127,28 +128,30 @@ def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, Augmented
     copied_groups = np.append(np.tile(train.group(by), COPIES), np.tile(held.group(by), COPIES))
     is_held = np.repeat([False, True], [len(side) for side in sides])
     copied = AugmentedCopies(np.concatenate(features), np.concatenate(sides), copied_groups, is_held)
-    return tenths, labels, groups, np.arange(len(labels)) >= len(train), fit.bands, copied
+    return tenths, labels, groups, np.arange(len(labels)) >= len(train), fit.bands, copied, fit.plan
 
 
 def fit_posthoc(
-    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, copied: AugmentedCopies | None = None
-) -> Posthoc:
+    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, copied: AugmentedCopies | None = None,
+    plan: HeadPlan | None = None,
+) -> Posthoc:  # fmt: skip
     """Fit all of it to features [N, D + 1, F] of sweeps with labels [N] from 0 to K - 1, of groups [N].
 
     judged: bool [N], sweeps that the trunk did not see. Only these find temperatures and rule, each with heads that did
     not see its group. fixed: so many features, the last ones, were not trained; see novelty.embed. Where there are some,
     most of a distance is in them, and all sweeps find its limit: of more positions, so that it is less a matter of chance.
+    plan: of the head that names the material; None for one discriminant that sees everything.
     Raises FormatError as novelty.embed, and where there is only one group or nothing to judge by.
     """
     whole, classes, every = tenths[:, -1], int(labels.max()) + 1, np.ones(len(labels), bool)
     more = copied or AugmentedCopies(whole[:0], labels[:0], groups[:0], every[:0])
+    plan = plan or HeadPlan((HeadPart(tuple(range(whole.shape[1])), copies=True),))
 
     def naming_head(fit: Array) -> tuple[Array, Array]:
         """The head fitted to the groups in `fit`, bool [N]."""
         also = more.take(np.isin(more.groups, groups[fit]) & ~more.held)
-        return early_exit.lda(
-            np.concatenate([whole[fit], also.features]), np.concatenate([labels[fit], also.labels]), classes
-        )
+        weight, bias = plan.fit((whole[fit], labels[fit], also.features, also.labels), classes)
+        return weight.T, bias
 
     logits, numbers = early_exit.cross_fitted_logits(tenths, labels, groups, judged, fixed)
     warmth = fit_temperature(logits[:, -1], labels[numbers], groups[numbers])
@@ -193,10 +196,14 @@ def assemble_model(
     weight, bias = (np.asarray(part, np.float32) for part in head)
     add("Gemm", whole, weight - weight.mean(1, keepdims=True), bias - bias.mean(), output="logits")
     outputs: dict[str, list[int]] = {"logits": [1, len(bias)]}
+    projection, offset = "embedding.projection", "embedding.offset"
+    if known or steps is not None:
+        for name, value in ((projection, embedding.projection), (offset, embedding.offset)):
+            model.graph.initializer.append(numpy_helper.from_array(np.array(value, order="C"), name))
     if steps is not None:
         count = len(steps.weight)
-        z = add("MatMul", *tenths, embedding.projection, output="head.turned")
-        z = add("Add", z, embedding.offset, output="head.each")
+        z = add("MatMul", *tenths, projection, output="head.turned")
+        z = add("Add", z, offset, output="head.each")
         # [1, D, r] -> [D, 1, r]: one head for each row
         rows = add("Slice", z, np.array([0]), np.array([count]), np.array([1]), output="head.first")
         rows = add("Transpose", rows, output="head.rows", perm=[1, 0, 2])
@@ -204,7 +211,7 @@ def assemble_model(
         add("Transpose", add("Add", rows, steps.bias[:, None], output="head.said"), output="early", perm=[1, 0, 2])
         outputs["early"] = [1, count, len(bias)]
     if known:
-        add("Gemm", whole, embedding.projection, embedding.offset, output="embedding")
+        add("Gemm", whole, projection, offset, output="embedding")
         outputs["embedding"] = [1, embedding.projection.shape[1]]
     del model.graph.output[:]
     for name, shape in outputs.items():

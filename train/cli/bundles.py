@@ -17,9 +17,12 @@ from train.cli import options
 from train.cli.options import Add
 from train.export import measure, pack, quantized_bundle, sign
 from train.models import methods
-from train.models.compact import fit
-from train.models.compact.architectures import ARCHITECTURES, DEFAULT
+from train.models.compact import recipe
+from train.models.compact.architectures import ARCHITECTURES
 from train.models.compact.augment import default_augmentation
+from train.models.compact.fitted import Fit
+
+STEPS = recipe.Settings().steps
 
 
 def register(add: Add) -> None:
@@ -45,8 +48,7 @@ def register(add: Add) -> None:
 
 
 def _add_fit(add: Add) -> None:
-    recipe = fit.FitRecipe()
-    command = add("fit", run_fit, "train a network on sweep sets")
+    command = add("fit", run_fit, "choose a model and fit it to sweep sets")
     options.add_set(command)
     command.add_argument(
         "--seed", type=int, required=True, help="of the training, and of simulated sets that name none"
@@ -54,16 +56,18 @@ def _add_fit(add: Add) -> None:
     command.add_argument("--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)")
     command.add_argument("--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7")
     command.add_argument("--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set")
-    command.add_argument("--steps", type=int, default=recipe.steps, help=f"of training (default {recipe.steps})")
+    command.add_argument(
+        "--steps", type=int, default=STEPS, help=f"of training of stages (default {STEPS}; 0 for none)"
+    )
     command.add_argument("--row-shift", type=float, metavar="SHARE", dest="moved",
                      help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
     command.add_argument("--stretch", type=float, metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
     command.add_argument(
         "--size",
-        choices=[*ARCHITECTURES, "usual"],
-        default="usual",
-        help="size of the network (default: that of compact)",
+        choices=[*ARCHITECTURES, "chosen"],
+        default="chosen",
+        help="train a network of this size (default: filters, spectrum and stages as held-out groups ask for)",
     )
     command.add_argument(
         "--keep-means", action="store_true", help="give the head each taxel's mean too, for comparison"
@@ -111,11 +115,21 @@ def run_fit(args: argparse.Namespace) -> None:
             args.rest.parent.mkdir(parents=True, exist_ok=True)
             rest.save(args.rest)
             print(f"rest: {len(rest)} sweeps in {args.rest}")
-    architecture = ARCHITECTURES.get(args.size, DEFAULT)
     changes = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
+    architecture = ARCHITECTURES.get(args.size, recipe.FIXED)
     augmentation = replace(default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes)
-    recipe = fit.FitRecipe(steps=args.steps, augmentation=augmentation, keep_means=args.keep_means)
-    made = fit.fit(sweeps, args.seed, recipe, options.Log(), architecture)
+    if args.size in ARCHITECTURES:
+        from train.models.compact import fit  # here: the default recipe needs no PyTorch
+
+        trained = fit.FitRecipe(steps=args.steps, augmentation=augmentation, keep_means=args.keep_means)
+        made = fit.fit(sweeps, args.seed, trained, options.Log(), architecture)
+    elif args.keep_means:
+        raise FormatError(
+            f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default recipe removes means"
+        )
+    else:
+        made = recipe.fit(sweeps, args.seed, recipe.Settings(args.steps, augmentation), options.Log())
+        print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
     made.save(args.out)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
     by = f"held-out {made.about['held_out_by']}"
@@ -127,7 +141,7 @@ def run_fit(args: argparse.Namespace) -> None:
 
 def run_export(args: argparse.Namespace) -> None:
     """Pack the bundle and print its figures."""
-    _print(quantized_bundle.export(fit.Fit.load(args.fit), *_packing(args)), args.out)
+    _print(quantized_bundle.export(Fit.load(args.fit), *_packing(args)), args.out)
 
 
 def run_pack(args: argparse.Namespace) -> None:
@@ -150,7 +164,9 @@ def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | Non
 
 
 def _print(manifest: Manifest, out: Path) -> None:
-    """The figures of a bundle, and its size."""
+    """The figures of a bundle, and its size; why it is not in int8, where it might be."""
+    if why := manifest.made.get("float_because"):
+        print(f"in float, not int8, which takes more time: {why}")
     _print_figures(manifest.figures)
     size = measure.sizes(out)[1]
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")

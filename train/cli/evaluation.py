@@ -16,7 +16,7 @@ from appliance.inference.classifier import Classifier
 from train.cli import options
 from train.cli.options import Add
 from train.data import sets
-from train.evaluation import cnn_curve, evaluate, robustness, sim_calibration, uncertainty
+from train.evaluation import evaluate, robustness, sim_calibration, uncertainty
 from train.evaluation.corruptions import EvaluationSweeps
 from train.export import contact_positions
 from train.metrics import score
@@ -38,7 +38,7 @@ def register(add: Add) -> None:
     calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     calibrate.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
     follow = add("cnn-curve", run_cnn_curve, "follow the paper's CNN while it learns the simulated skin")
-    follow.add_argument("--size", choices=cnn_curve.SIZES, default="small",
+    follow.add_argument("--size", choices=("small", "whole"), default="small",
                        help="small (a stand-in of a minute) or whole (an hour of one core)")  # fmt: skip
     follow.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulated world and the training (1)")
     follow.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
@@ -205,6 +205,8 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
     if args.steps is not None and args.steps < 1:
         raise FormatError(f"--steps {args.steps} is none; use 1 or more")
     log = options.Log()
+    from train.evaluation import cnn_curve  # here: it imports PyTorch
+
     print(cnn_curve.table(cnn_curve.follow(
         args.out, args.size, args.seed, args.remove_means, steps=args.steps, log=log
     )))  # fmt: skip

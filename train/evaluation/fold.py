@@ -171,7 +171,11 @@ def key(task: FoldTask, data: str) -> str:
 
 def fingerprint(about: Any, *modules: str) -> str:
     """32 hex digits of a hash of `about` (for JSON), the code of `modules` and all that they import here, and the libraries."""
-    versions = [version(name) for name in ("numpy", "scikit-learn", "torch")]
+    versions = [
+        version(name)
+        for name in ("numpy", "scikit-learn", "torch")
+        if find_spec(name.replace("scikit-learn", "sklearn"))
+    ]
     return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
 
 

@@ -7,6 +7,7 @@ Cases without training again. Sweeps that a rule, a limit or a temperature is fi
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +26,8 @@ from train.evaluation import parallel
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
 from train.models import methods
-from train.models.compact.fit import Fit
+from train.models.compact.fitted import Fit
+from train.models.compact.heads import HeadPlan
 from train.models.methods import Effort
 from train.onnx_tools.graph_builder import run as run_graph
 
@@ -57,7 +59,7 @@ class Case:
     0 on without the one left out; seen_groups [N]: positions or recordings; judged: bool [N], those that the trunk did
     not see, which may judge. copied: features [M, F] of augmented copies, of copied_labels, copied_groups and
     copied_held [M]; see AugmentedCopies.
-    new, labels, places: features of test sweeps, the set's labels, and where the skin sat.
+    new, labels, places: features of test sweeps, the set's labels, and where the skin sat. plan: HeadPlan.json as text.
     """
 
     left_out: int
@@ -74,6 +76,7 @@ class Case:
     new: Array
     labels: Array
     places: Array
+    plan: str = ""
 
     def known(self) -> Array:
         """bool [n], the test sweeps of materials that were trained."""
@@ -83,7 +86,8 @@ class Case:
     def posthoc(self) -> Posthoc:
         """What is fitted on the trunk of this training."""
         copies = AugmentedCopies(self.copied, self.copied_labels, self.copied_groups, self.copied_held)
-        return fit_posthoc(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies)
+        plan = HeadPlan.read(json.loads(self.plan)) if self.plan else None
+        return fit_posthoc(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies, plan)
 
     def numbered(self) -> Array:
         """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out mean nothing."""
@@ -98,19 +102,22 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     Raises FormatError where the method is none of the compact family, or cannot work with this set.
     """
     (method,) = methods.find([task.method], task.effort)
-    if methods.module_of(task.method) != "train.models.compact.methods":
-        raise FormatError(f"method {task.method!r} gives no features of tenths; use compact or one of its family")
+    if not methods.module_of(task.method).startswith("train.models.compact."):
+        raise FormatError(
+            f"method {task.method!r} gives no features of tenths; use default, compact or one of its family"
+        )
     kept = task.train[sweeps.labels[task.train] != task.left_out]
     part = sweeps.take(kept)
     if task.left_out != NONE_LEFT_OUT:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).fit  # type: ignore[attr-defined]
-    seen, seen_labels, seen_groups, judged, fixed, copies = posthoc_inputs(made)
+    seen, seen_labels, seen_groups, judged, fixed, copies, plan = posthoc_inputs(made)
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
         task.left_out, task.fold, fixed, seen, seen_labels, seen_groups, judged, copies.features, copies.labels, copies.groups,
         copies.held, run_graph(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
+        json.dumps(plan.json()),
     )  # fmt: skip
 
 

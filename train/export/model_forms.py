@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from appliance.core import storage
@@ -95,6 +94,8 @@ def _packed_forms(method: Method, sweeps: Dataset, seed: int, work: Path) -> Ite
 
 def _save_torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
     """The network as TorchScript, which needs none of our code to be read."""
+    import torch  # here: other forms need no PyTorch
+
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", DeprecationWarning)
         traced: Any = torch.jit.trace(model.network.eval(), torch.from_numpy(train.samples[:1]))

@@ -11,13 +11,14 @@ import os
 import platform
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime
-import torch
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle
@@ -31,7 +32,7 @@ from train.calibration.posthoc import HeldOut, calibrate
 from train.data.sets import Dataset
 from train.export.contact_positions import place_of
 from train.metrics.score import accuracy_figure, fuse
-from train.models.compact.fit import Fit
+from train.models.compact.fitted import Fit
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
 from train.onnx_tools.graph_builder import run
@@ -101,7 +102,7 @@ def pack(
         thresholds=limits, place=place, runtime=RUNTIME, early=content.early, known=content.known, moved=content.moved,
         files={k: bundle.file_entry(v) for k, v in files.items()},
         made={"commit": commit, "set": train.source, "machine": platform.machine(), "cpus": os.cpu_count(),
-              "torch": torch.__version__, "onnxruntime": onnxruntime.__version__} | content.about,
+              "torch": metadata.version("torch") if find_spec("torch") else None, "onnxruntime": onnxruntime.__version__} | content.about,
     )  # fmt: skip
     with _replacing(target) as folder:
         for file, data in files.items():

@@ -1,6 +1,6 @@
-"""Quantization of a trained network for the box. In: a Fit. Out: its bundle in int8, or ExportRefused.
+"""Quantization of a trained network for the box. In: a Fit. Out: its bundle.
 
-A network whose int8 form does not answer as the trained one is refused.
+Where the int8 form does not answer as the fitted one does, the bundle holds the float form.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import onnx
-import torch
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle
@@ -22,10 +21,9 @@ from appliance.sim import skin
 from train.data.sets import Dataset
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
-from train.models.compact.fit import Fit
-from train.models.compact.network import Compact
+from train.models.compact import graph, recipe
+from train.models.compact.fitted import Fit
 from train.models.methods import model_inputs
-from train.models.paper_cnn import INT8_NODES, random_paper_cnn
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import with_head
 from train.onnx_tools.parity import Parity
@@ -54,8 +52,26 @@ def export(
     fit: Fit, target: Path, name: str, version: str, commit: str, full_scale: float | None = None,
     pitch_mm: float | None = None,
 ) -> bundle.Manifest:  # fmt: skip
-    """Quantize `fit`, check it, and pack it; see pack.pack. Raises ExportRefused where a check fails."""
+    """Quantize `fit`, check it, and pack it; see pack.pack. Where int8 differs too much the bundle holds the float form, and
+    `made` says why. Raises ExportRefused where another check fails."""
     reference, model = graphs(fit)
+    about = (
+        fit.about
+        if fit.architecture.pools or not fit.architecture.channels
+        else fit.about | {"torch_difference": _torch_difference(fit, reference)}
+    )
+    content = Content(model, "raw", fit.train, fit.held, fit.about["held_out_by"], about, made=fit)
+    try:
+        content = checked(content, reference)
+    except ExportRefused as e:
+        content = replace(content, model=reference, made=fit.in_float(), about=about | {"float_because": str(e)})
+    return pack(content, target, name, version, commit, full_scale, pitch_mm)
+
+
+def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
+    """The largest of a logit between PyTorch and the float graph. Raises ExportRefused above MOST_TORCH_DIFFERENCE."""
+    import torch  # here: a fit without trained stages is exported without PyTorch
+
     with torch.no_grad():
         wanted = fit.network()(torch.from_numpy(fit.held.samples.astype(np.float32))).numpy()
     difference = float(np.abs(wanted - parity.logits(reference, fit.held.samples)).max())
@@ -64,9 +80,7 @@ def export(
             f"the float graph differs from pytorch by {difference:.3g} in a logit (limit {MOST_TORCH_DIFFERENCE}); "
             "fit again; if it stays, compare train/models/compact/graph.py with network.py"
         )
-    about = fit.about | {"torch_difference": difference}
-    content = Content(model, "raw", fit.train, fit.held, fit.about["held_out_by"], about, made=fit)
-    return pack(checked(content, reference), target, name, version, commit, full_scale, pitch_mm)
+    return difference
 
 
 def graphs(fit: Fit) -> tuple[onnx.ModelProto, onnx.ModelProto]:
@@ -154,13 +168,18 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
 def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     """Write what `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx, both with random weights.
 
-    The first is the default bundle's network in float32, the second the paper's CNN in int8; both take its sweeps.
+    The first is a trunk like the default bundle's in float32, the second the paper's CNN in int8; both take its sweeps.
     """
+    from train.models.paper_cnn import INT8_NODES, random_paper_cnn  # here: it imports PyTorch
+
     rng, form, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        small = Compact(form, classes, 0.1, norm=False).eval().graph()
     counts = rng.integers(0, 256, (4, form.window, form.rows, form.cols), np.uint8)
+    sweeps = Dataset(counts, np.arange(4) % classes, skin.MATERIALS, form.rate_hz, {}, "random counts")
+    trunk = recipe.fixed_trunk(sweeps, seed)
+    architecture = replace(trunk.architecture, pools=1)
+    small = graph.trunk_graph(form, trunk.scale, trunk.weights, architecture)
+    size = small.graph.output[0].type.tensor_type.shape.dim[1].dim_value
+    small = with_head(small, rng.standard_normal((classes, size)), np.zeros(classes))
     paper = quantize(random_paper_cnn(form, classes, rng), counts, INT8_NODES)
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "fp32.onnx", folder / "paper_int8.onnx"

@@ -40,6 +40,7 @@ BOX_ON_HARD = "alignment/place.json"
 """Beside the chart's folder: what the box answers to T-HARD's sweeps."""
 SEVEN = ("direction=0", "force<=180")
 FAMILIES = {
+    "train.models.compact.default": "Palpate",
     "train.models.compact.methods": "Palpate",
     "train.models.baselines": "L and H",
     "train.models.paper_cnn": "deep networks",
@@ -95,7 +96,7 @@ class Chart:
     rounds: int = measure.ROUNDS
 
 
-COMPACT = ("compact", *(f"compact-{size}" for size in ARCHITECTURES))
+COMPACT = ("default", "filter-bank", "compact", *(f"compact-{size}" for size in ARCHITECTURES))
 FULL = Chart(
     {
         "hard": ChartPart(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1"),

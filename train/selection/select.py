@@ -81,6 +81,7 @@ def candidates(scene: Scene) -> list[str]:
         return list(scene.methods)
     known = methods.every()
     family = [name for name in known if name.startswith("compact-")] or ["compact"]
+    family.append("filter-bank")
     return [name for name in ("L-gauss", "L-svm", "H-svm", *family) if name in known]
 
 

@@ -103,5 +103,9 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     assert "flagged" in contact_plot.draw(figures)
     with pytest.raises(FormatError, match="no positions"):
         contact_positions.measure(
-            Classifier(replace(wide, manifest=replace(wide.manifest, place=None)), SystemClock()), "", "", "", print
+            Classifier(replace(wide, manifest=replace(wide.manifest, place=None, moved=None)), SystemClock()),
+            "",
+            "",
+            "",
+            print,
         )

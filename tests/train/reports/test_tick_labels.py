@@ -16,12 +16,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter
 
 from appliance.core.types import SweepFormat
-from tests.factories import choice_data
+from tests.factories import choice_data, development_data
 from tests.factories.chart_data import DOTS
 from tests.factories.paths import ROOT
 from tests.rig import soak_page
 from train.reports import (
     contact_plot,
+    development_report,
     overview_plot,
     paper_report,
     plot_style,
@@ -63,6 +64,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
     "soak": lambda: soak_page.charts(committed("soak/results.json")),
     "sweep": lambda: sweep_plot.draw(sweep_plot.load("sim:T-REAL:1001:1", 3)),
     "image": image,
+    "development": lambda: development_report.render(development_data.figures()),
     "overview": lambda: overview_plot.draw("paper"),
 }
 
