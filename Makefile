@@ -89,7 +89,7 @@ bench: $(DESKTOP) ## measure this machine: docs/bench.json, and the tables of RE
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
 	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --seed 1 --out build/default.npz
-	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 2
+	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 3
 
 chart: $(DESKTOP) ## speed against accuracy: docs/chart/ (goes on where it was interrupted)
 	$(BIN)/palpate-train chart $(CHART)

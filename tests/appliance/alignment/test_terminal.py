@@ -120,7 +120,7 @@ def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
 
 def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
     """The View says that there are none, and what to do; the centre is in taxels."""
-    without = replace(default_bundle, manifest=replace(default_bundle.manifest, place=None))
+    without = replace(default_bundle, manifest=replace(default_bundle.manifest, place=None, moved=None))
     views = views_of(resting(), without)
     last = [v for v in views(14.5) if v.centre][-1]
     assert last.state == "no-positions"

@@ -31,7 +31,11 @@ def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert figures["memory"] == {"seed": 2000}
     assert {"commit", "seed", "machine"} <= figures.keys()
     on_disk = sum(file.stat().st_size for file in bundle.DEFAULT.iterdir())
-    assert figures["bundle_kb"] == {"model": 42.1, "all": pytest.approx(on_disk / 1000, abs=0.05)}
+    model = (bundle.DEFAULT / bundle.MODEL).stat().st_size
+    assert figures["bundle_kb"] == {
+        "model": pytest.approx(model / 1000, abs=0.05),
+        "all": pytest.approx(on_disk / 1000, abs=0.05),
+    }
     assert re.fullmatch(r"20\d\d-\d\d-\d\d", figures["date"])
     assert [len(figures["load_average"][when]) for when in ("before", "after")] == [3, 3]
     assert list(figures)[-3:] == ["bundle_kb", "date", "load_average"]
