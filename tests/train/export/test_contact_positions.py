@@ -76,7 +76,7 @@ def test_sets_without_positions():
 @pytest.mark.slow
 def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     """A skin in place is not flagged, one that is a row forward always is; figures, picture and lines agree."""
-    monkeypatch.setattr(contact_positions, "OFF_MM", (5.0,))
+    monkeypatch.setattr(contact_positions, "OFF_MM", (8.0,))
     wide = replace(model, manifest=replace(model.manifest, place=ContactPositions(4.0, (5.5,), (6.0,), 1.2)))
     figures = contact_positions.measure(
         Classifier(wide, SystemClock()), "sim:T-LAB:3:2", "sim:T-LAB:1:1", "sim:T-HARD:1:1", lambda line: None
@@ -84,12 +84,12 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     assert figures["other positions"]["moved"][0] == 0
     assert figures["T-HARD"]["moved"][0] == 1
     back, home, ahead = figures["moved"]["rows"]
-    assert (back["mm"], home["mm"], ahead["mm"]) == (-5, 0, 5)
+    assert (back["mm"], home["mm"], ahead["mm"]) == (-8, 0, 8)
     assert home["accuracy"] == figures["other positions"]["accuracy"]
     assert (home["n"], home["attachments"], home["moved"][0], ahead["moved"][0]) == (12, 1, 0, 1)
     assert back["told_mm"] > ahead["told_mm"] + 0.5  # the trained place is a little ahead
     assert ahead["accuracy"][0] < home["accuracy"][0] > 0.8
-    assert figures["rows, forwards"]["lost_at_mm"] == 5
+    assert figures["rows, forwards"]["lost_at_mm"] == 8
     assert ahead["told_mm"] > 1.2 > home["told_mm"]
     for point in (home, ahead):
         assert point["accuracy"][0] * 12 + point["wrong"] + point["unsure"] + point["unknown"] == pytest.approx(
@@ -98,7 +98,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
         assert point["wrong_share"][0] == pytest.approx(point["wrong"] / 12, abs=1e-3)
         assert point["network"][0] >= point["accuracy"][0]
     text = "\n".join(contact_positions.lines(figures))
-    assert "rows +5.0 mm" in text
+    assert "rows +8.0 mm" in text
     assert "network alone" in text
     assert "flagged" in contact_plot.draw(figures)
     with pytest.raises(FormatError, match="no positions"):

@@ -117,7 +117,9 @@ def test_labels_are_where_they_say(name: str, drawn: list[tuple[Figure, tuple[st
                 named += 1
             else:
                 assert wrong_labels(axis) == []
-    assert (named > 0) == (name in ("less", "image")), "only kept parts and rows of taxels have names instead of values"
+    assert (named > 0) == (name in ("less", "image", "development")), (
+        "only kept parts, taxels and cases have names instead of values"
+    )
 
 
 @pytest.mark.slow
