@@ -93,7 +93,7 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
         box.put(archive, f".palpate-{name}.tar")
         box.report("building its environment")
         box.run("building the environment", build(release), user="root", stdin=f".palpate-{name}.tar", limit_s=BUILD_S)
-        box.run("tidying up", f"rm -f .palpate-{name}.tar")
+    box.run("tidying up", "rm -f .palpate-*.tar")  # of an install that was cut after it had built, too
     kept = box.run("users, folders and settings", prepare(release, board, signers), user="root")
     if kept:
         box.report(f"{' '.join(kept.split())} stays as it is there: a file, not the link to the release's")
