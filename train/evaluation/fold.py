@@ -171,11 +171,7 @@ def key(task: FoldTask, data: str) -> str:
 
 def fingerprint(about: Any, *modules: str) -> str:
     """32 hex digits of a hash of `about` (for JSON), the code of `modules` and all that they import here, and the libraries."""
-    versions = [
-        version(name)
-        for name in ("numpy", "scikit-learn", "torch")
-        if find_spec(name.replace("scikit-learn", "sklearn"))
-    ]
+    versions = [version("numpy"), version("scikit-learn"), *([version("torch")] if find_spec("torch") else [])]
     return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
 
 

@@ -84,8 +84,7 @@ def _rows(figures: Json) -> Iterator[tuple[str, str]]:
         "resident memory after 1,000 sweeps, with the simulated readout board in it",
         f"{memory['after_1000']:.1f} MiB; {growth:+.1f} MiB in the next 900",
     )
-    if "without_board" in memory:
-        yield "of it without the simulated readout board", f"{memory['without_board']:.1f} MiB"
+    yield "of it without the simulated readout board", f"{memory['without_board']:.1f} MiB"
     yield (
         "share of one core while the skin streams, without the simulated readout board",
         f"{100 * figures['cpu_share_streaming']:.1f} %",

@@ -5,46 +5,24 @@ Each is what the box runs, the int8 graph; the form "float" is the same before q
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
 
 from train.data.sets import Dataset
 from train.models.compact import recipe
-from train.models.compact.fitted import Fit
+from train.models.compact.fitted import CompactModel
 from train.models.linear_head import expanded_head
-from train.models.methods import FULL_EFFORT, Effort, Log, Method, Model, no_log
-from train.onnx_tools.graph_builder import GraphModel, run, with_head
+from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
+from train.onnx_tools.graph_builder import GraphModel, with_head
 
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class ChosenModel:
-    """A fit as the box runs it. fit: what it comes from, with the sweeps that heads were fitted to. weight [K, F], bias
-    [K]: its head for all materials. ran: what was chosen. forms: "float", the same before quantization."""
-
-    fit: Fit
-    weight: Array
-    bias: Array
-    ran: str
-    forms: Mapping[str, Model] = field(default_factory=dict)
-
-    def logits(self, inputs: Array) -> Array:
-        """Raw counts [n, T, R, C] -> float32 [n, K]."""
-        return run(self.graph(), inputs)
-
-    def graph(self) -> onnx.ModelProto:
-        """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
-        return with_head(self.fit.trunk(), self.weight, self.bias)
-
-
-def train(sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log) -> ChosenModel:
+def train(sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log) -> CompactModel:
     """Choose and fit as `palpate-train fit` does, on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
     Raises FormatError as recipe.fit, and where only one material occurs.
@@ -55,7 +33,7 @@ def train(sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Setting
     heads = {name: expanded_head(fit.weights[f"{name}.weight"], fit.weights[f"{name}.bias"], present, len(sweeps.materials))
              for name in ("head", "int8")}  # fmt: skip
     forms = {"float": GraphModel(with_head(fit.trunk(int8=False), *heads["head"]))}
-    return ChosenModel(fit, *heads["int8"], fit.about["chosen"], forms)
+    return CompactModel(fit, *heads["int8"], fit.about["chosen"], forms=forms)
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:

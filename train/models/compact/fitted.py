@@ -6,6 +6,7 @@ PyTorch is needed for `network` alone.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,8 +23,8 @@ from train.models.compact import graph, spectrum
 from train.models.compact.architectures import Architecture
 from train.models.compact.augment import Augmentation
 from train.models.compact.heads import HeadPlan
-from train.models.methods import Cost
-from train.onnx_tools.graph_builder import with_head
+from train.models.methods import Cost, Model
+from train.onnx_tools.graph_builder import run, with_head
 
 if TYPE_CHECKING:
     from train.models.compact.network import Compact
@@ -136,3 +137,31 @@ class Fit:
         except (KeyError, ValueError, checker.ValidationError, shape_inference.InferenceError) as e:
             raise FormatError(f"{path.name}: its weights are not those of its {architecture}; fit again") from e
         return fit
+
+
+@dataclass(frozen=True)
+class CompactModel:
+    """A fit as the box runs it. forms: "float", the same before quantization.
+
+    fit: what it comes from, with the sweeps that were trained on and held out. weight [K, F], bias [K]: its head for all
+    materials. ran: what was computed or chosen. cost: of the training of stages.
+    """
+
+    fit: Fit
+    weight: Array
+    bias: Array
+    ran: str
+    cost: Cost = field(default_factory=list)
+    forms: Mapping[str, Model] = field(default_factory=dict)
+
+    def features(self, inputs: Array, tenths: bool = False) -> Array:
+        """Raw counts [n, T, R, C] -> what the head sees, float32 [n, F]; of each tenth [n, 10, F], see graph.trunk_graph."""
+        return run(self.fit.trunk(tenths=tenths), inputs)
+
+    def logits(self, inputs: Array) -> Array:
+        """Raw counts [n, T, R, C] -> float32 [n, K]."""
+        return run(self.graph(), inputs)
+
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
+        return with_head(self.fit.trunk(), self.weight, self.bias)

@@ -6,53 +6,23 @@ network that the graph was made from.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
 
 from train.data.sets import Dataset
 from train.models.compact.architectures import ARCHITECTURES, DEFAULT, Architecture
 from train.models.compact.fit import FitRecipe, fit_on
-from train.models.compact.fitted import Fit
+from train.models.compact.fitted import CompactModel
 from train.models.linear_head import expanded_head, hold_out_or_all
-from train.models.methods import FULL_EFFORT, Cost, Effort, Log, Method, Model, no_log
+from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from train.models.training import NetworkModel, describe_run, scale_steps
-from train.onnx_tools.graph_builder import run, with_head
 
 Array = NDArray[Any]
 RECIPE = FitRecipe()
-
-
-@dataclass(frozen=True)
-class CompactModel:
-    """A compact network as the box runs it. forms: "float", the same before quantization.
-
-    fit: what it comes from, with the sweeps that were trained on and held out. weight [K, F], bias [K]: its head.
-    """
-
-    fit: Fit
-    weight: Array
-    bias: Array
-    ran: str
-    cost: Cost = field(default_factory=list)
-    forms: Mapping[str, Model] = field(default_factory=dict)
-
-    def features(self, inputs: Array, tenths: bool = False) -> Array:
-        """Raw counts [n, T, R, C] -> what the head sees, float32 [n, F]; of each tenth [n, 10, F], see graph.trunk_graph."""
-        return run(self.fit.trunk(tenths=tenths), inputs)
-
-    def logits(self, inputs: Array) -> Array:
-        """Raw counts [n, T, R, C] -> float32 [n, K]."""
-        return run(self.graph(), inputs)
-
-    def graph(self) -> onnx.ModelProto:
-        """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
-        return with_head(self.fit.trunk(), self.weight, self.bias)
 
 
 def train_compact(

@@ -91,7 +91,7 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     chosen = _choose(court, fixed, settings.choose, log)
     staged = None
     if settings.steps and len(sweeps) >= LEAST_SWEEPS and find_spec("torch"):
-        staged = _with_stages(sweeps, seed, settings, augmentation, known, parts, chosen, log)
+        staged = _with_stages(sweeps, changed, seed, settings, augmentation, known, parts, chosen, log)
     train, held, by = hold_out_or_all(sweeps, seed)
     judged, court = staged or (chosen, court)
     stages = _stages(train, seed, settings, augmentation, log) if staged else None
@@ -156,8 +156,8 @@ def _known(trunk: Trunk, sweeps: Dataset, changed: Sequence[Dataset], int8: bool
 
 
 def _with_stages(
-    sweeps: Dataset, seed: int, settings: Settings, augmentation: Augmentation, known: HeadData,
-    parts: Sequence[InnerPart], chosen: Judged, log: Log,
+    sweeps: Dataset, changed: Sequence[Dataset], seed: int, settings: Settings, augmentation: Augmentation,
+    known: HeadData, parts: Sequence[InnerPart], chosen: Judged, log: Log,
 ) -> tuple[Judged, Court] | None:  # fmt: skip
     """`chosen` with trained stages, whose features come before all others, and the court that judged it; None
     where that names clearly fewer sweeps rightly. TRIALS parts judge, of each group in turn.
@@ -167,7 +167,6 @@ def _with_stages(
     classes, size = len(sweeps.materials), sum(STAGES.channels)
     plain = [replace(p, columns=tuple(np.add(p.columns, size).tolist()), factor=1.0) for p in chosen.plan.parts]
     stages = HeadPart(tuple(range(size)), True)
-    changed = list(copies(sweeps, augmentation, seed, COPIES))
     joined: list[HeadData] = []
     for part in parts[:TRIALS]:
         trained = _stages(sweeps.take(~part.out), seed, settings, augmentation, log)
