@@ -233,7 +233,7 @@ def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.f
     f = manifest.format
     arrays = _arrays(data, GOLDEN, "samples", "logits")
     samples, logits = arrays["samples"], arrays["logits"]
-    if samples.shape[1:] != (f.window, f.rows, f.cols) or samples.dtype != f.numpy_type or not len(samples):
+    if samples.shape[1:] != (f.window, *f.shape) or samples.dtype != f.numpy_type or not len(samples):
         raise BundleError(f"{GOLDEN} holds {samples.dtype} {samples.shape}, which does not fit the format {f}")
     if logits.shape != (len(samples), len(manifest.labels)):
         raise BundleError(

@@ -162,7 +162,8 @@ class Manifest:
 
     def json(self) -> bytes:
         """The bytes of manifest.json; equal manifests give equal bytes."""
-        return (json.dumps(asdict(self), indent=1, sort_keys=True) + "\n").encode()
+        values = asdict(self) | {"format": self.format.json()}
+        return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
     @classmethod
     def parse(cls, text: bytes) -> Manifest:

@@ -25,6 +25,8 @@ from appliance.core.schema import typed
 
 DATA_TYPES = ("uint8", "int16", "uint16", "float32")
 """Data types of a taxel's raw count; the position in this tuple is its code in packets (PROTOCOL.md)."""
+MOST_AXES = 8
+"""Largest number of values that a taxel has."""
 
 EPOCH_BITS = 40
 """An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two enumerations of the
@@ -66,8 +68,8 @@ class Status(StrEnum):
 class SweepFormat:
     """Format of a sweep: `rows` x `cols` taxels, `rate_hz` frames per second, `window` frames used, counts of `dtype`.
 
-    It is part of a bundle: another skin needs another bundle, not other code.
-    Raises FormatError for a value out of range.
+    axes: values of each taxel; the last is the one along the skin's normal. It is part of a bundle: another skin needs
+    another bundle, not other code. Raises FormatError for a value out of range.
     """
 
     rows: int
@@ -75,6 +77,7 @@ class SweepFormat:
     rate_hz: float
     window: int
     dtype: str
+    axes: int = 1
 
     def __post_init__(self) -> None:
         if self.dtype not in DATA_TYPES:
@@ -85,6 +88,8 @@ class SweepFormat:
             raise FormatError(f"a rate of {self.rate_hz} Hz is out of range; use 0.001 to 1e6")
         if self.window < 1:
             raise FormatError(f"a window of {self.window} frames is empty; use at least 1")
+        if not 1 <= self.axes <= MOST_AXES:
+            raise FormatError(f"{self.axes} axes of each taxel are out of range; use 1 to {MOST_AXES}")
 
     @property
     def numpy_type(self) -> np.dtype[Any]:
@@ -97,17 +102,42 @@ class SweepFormat:
         return 1e9 / self.rate_hz
 
     @property
-    def skin(self) -> tuple[int, int, str]:
-        """What a readout board must have in common with a bundle: rows, columns, data type."""
-        return self.rows, self.cols, self.dtype
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one frame's raw counts: [R, C], or [R, C, A] if a taxel has several axes."""
+        return shape(self.rows, self.cols, self.axes)
+
+    @property
+    def channels(self) -> int:
+        """Numbers in one frame: R * C * A."""
+        return self.rows * self.cols * self.axes
+
+    @property
+    def skin(self) -> tuple[tuple[int, ...], str]:
+        """What a readout board must have in common with a bundle: shape of a frame, data type."""
+        return self.shape, self.dtype
+
+    def json(self) -> dict[str, Any]:
+        """All fields by name, for JSON. One axis is left out, so that files and ids remain those of earlier versions."""
+        return {name: value for name, value in asdict(self).items() if (name, value) != ("axes", 1)}
 
     def __str__(self) -> str:
-        return f"{self.rows}x{self.cols} {self.dtype} at {self.rate_hz:g} Hz, window {self.window}"
+        return f"{shown(self.shape)} {self.dtype} at {self.rate_hz:g} Hz, window {self.window}"
+
+
+def shape(rows: int, cols: int, axes: int) -> tuple[int, ...]:
+    """Shape of one frame: [R, C], or [R, C, A] if a taxel has several axes."""
+    return (rows, cols) if axes == 1 else (rows, cols, axes)
+
+
+def shown(shape: Sequence[int]) -> str:
+    """A shape for a person: "3x3", "3x3x3"."""
+    return "x".join(map(str, shape))
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """n frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped numbers, taxels [n, R, C] raw counts."""
+    """n frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped numbers, taxels [n, R, C] or [n, R, C, A] raw
+    counts."""
 
     t_ns: NDArray[np.int64]
     seq: NDArray[np.int64]
@@ -120,7 +150,7 @@ class Frames:
     def empty(cls, fmt: SweepFormat) -> Frames:
         """No frames of this format."""
         none = np.empty(0, np.int64)
-        return cls(none, none, np.empty((0, fmt.rows, fmt.cols), fmt.numpy_type))
+        return cls(none, none, np.empty((0, *fmt.shape), fmt.numpy_type))
 
     @classmethod
     def joined(cls, runs: Sequence[Frames]) -> Frames:
@@ -214,7 +244,7 @@ class Verdict:
 
 
 def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
-    return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.numpy_type, (fmt.rows, fmt.cols))])
+    return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.numpy_type, fmt.shape)])
 
 
 def save(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})) -> None:
@@ -228,7 +258,7 @@ def save(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = 
     own = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"}
     packed = io.BytesIO()  # np.save writes to a file without Python's I/O, and a full disk then gives no errno
     np.save(packed, table, allow_pickle=False)
-    content = {**about, **own, "format": asdict(fmt), "crc32": crc32(packed.getvalue()), "schema": SCHEMA}
+    content = {**about, **own, "format": fmt.json(), "crc32": crc32(packed.getvalue()), "schema": SCHEMA}
     storage.put_all({path.with_suffix(".json"): json.dumps(content, indent=1).encode(), path: packed.getvalue()})
 
 

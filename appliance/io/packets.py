@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from appliance.core.types import DATA_TYPES, EPOCH_BITS
+from appliance.core.types import DATA_TYPES, EPOCH_BITS, MOST_AXES, shape, shown
 
 MAGIC = b"\x50\xc1"
 VERSION = 1
-HEADER = struct.Struct("<2sBBHBBBBBxII")
+HEADER = struct.Struct("<2sBBHBBBBBBII")
 CRC = struct.Struct("<I")
 MAX_PAYLOAD = 4096
 MAX_FRAMES = 255
@@ -30,7 +30,7 @@ count."""
 
 _DTYPES = tuple(np.dtype(d).newbyteorder("<") for d in DATA_TYPES)
 _IDENTITY = struct.Struct("<BBBB16s16s")
-_FORMAT = struct.Struct("<BBBxIII")
+_FORMAT = struct.Struct("<BBBBIII")
 
 
 class PacketKind(IntEnum):
@@ -59,7 +59,7 @@ class Request(IntEnum):
 @dataclass(frozen=True, slots=True)
 class Packet:
     """Consecutive frames. seq, t_us: sequence number and time of the first, 32 bits as sent. flags: bits of Flag.
-    taxels: raw counts [n, R, C]."""
+    taxels: raw counts [n, R, C] or [n, R, C, A]."""
 
     seq: int
     t_us: int
@@ -97,7 +97,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class SkinFormat:
-    """What a readout board sends: grid, data type, frames per second, frames in its FIFO and in a packet."""
+    """What a readout board sends: grid, data type, frames per second, frames in its FIFO and in a packet, axes."""
 
     rows: int
     cols: int
@@ -105,6 +105,12 @@ class SkinFormat:
     rate_hz: float
     fifo_frames: int
     packet_frames: int
+    axes: int = 1
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one frame: [R, C] or [R, C, A]."""
+        return shape(self.rows, self.cols, self.axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,26 +127,28 @@ def _seal(head: bytes, payload: bytes) -> bytes:
 
 
 def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
-    """A frame packet. taxels: raw counts [n, R, C] of one of DATA_TYPES. seq and t_us are sent modulo 2**32.
+    """A frame packet. taxels: raw counts [n, R, C] or [n, R, C, A] of one of DATA_TYPES. seq and t_us are sent modulo
+    2**32.
 
     Raises FormatError if the frames do not fit one packet.
     """
-    n, rows, cols = taxels.shape
+    n, rows, cols, *axes = taxels.shape
     code = _DTYPES.index(taxels.dtype.newbyteorder("<"))
     payload = taxels.astype(_DTYPES[code], copy=False).tobytes()
     if not 0 < n <= MAX_FRAMES or len(payload) > MAX_PAYLOAD:
         raise FormatError(
-            f"{n} frames of {rows} x {cols} taxels do not fit a packet of {MAX_PAYLOAD} bytes; send fewer"
+            f"{n} frames of {shown(taxels.shape[1:])} {taxels.dtype} do not fit a packet of {MAX_PAYLOAD} bytes; send fewer"
         )
     head = HEADER.pack(
-        MAGIC, VERSION, PacketKind.FRAMES, len(payload), flags, n, rows, cols, code, seq % (1 << 32), t_us % (1 << 32)
-    )
+        MAGIC, VERSION, PacketKind.FRAMES, len(payload), flags, n, rows, cols, code, _axes_byte(*axes),
+        seq % (1 << 32), t_us % (1 << 32),
+    )  # fmt: skip
     return _seal(head, payload)
 
 
 def pack_reply(request: Request, payload: bytes, version: int = VERSION) -> bytes:
     """A reply packet: a CDC-ACM board's answer to a request byte."""
-    return _seal(HEADER.pack(MAGIC, version, PacketKind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0), payload)
+    return _seal(HEADER.pack(MAGIC, version, PacketKind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0, 0), payload)
 
 
 def unpack(data: bytes) -> Unpacked:
@@ -172,10 +180,11 @@ def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
     """The packet at `at` and its size; (None, 0) if more bytes are needed, (None, 1) if there is no packet."""
     if len(data) - at < HEADER.size:
         return None, 0
-    _, version, kind, length, flags, count, rows, cols, code, seq, t_us = HEADER.unpack_from(data, at)
-    frames = kind == PacketKind.FRAMES and version == VERSION and code < len(_DTYPES) and count > 0 and rows * cols > 0
+    _, version, kind, length, flags, count, rows, cols, code, axes, seq, t_us = HEADER.unpack_from(data, at)
+    axes = axes or 1
+    frames = kind == PacketKind.FRAMES and version == VERSION and code < len(_DTYPES) and axes <= MOST_AXES
     if frames:
-        frames = length == count * rows * cols * _DTYPES[code].itemsize
+        frames = 0 < length == count * rows * cols * axes * _DTYPES[code].itemsize
     if length > MAX_PAYLOAD or not (frames or kind == PacketKind.REPLY):
         return None, 1
     end = at + HEADER.size + length
@@ -186,8 +195,8 @@ def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
     size = end + CRC.size - at
     if kind == PacketKind.REPLY:
         return Reply(count, data[at + HEADER.size : end]), size
-    taxels = np.frombuffer(data, _DTYPES[code], count * rows * cols, at + HEADER.size).reshape(count, rows, cols)
-    return Packet(seq, t_us, flags, taxels), size
+    counts = np.frombuffer(data, _DTYPES[code], count * rows * cols * axes, at + HEADER.size)
+    return Packet(seq, t_us, flags, counts.reshape(count, *shape(rows, cols, axes))), size
 
 
 def follow(
@@ -236,17 +245,28 @@ def unpack_identity(payload: bytes) -> Identity:
 def pack_format(skin: SkinFormat) -> bytes:
     """Payload of the FORMAT reply."""
     code, rate_mhz = DATA_TYPES.index(skin.dtype), round(skin.rate_hz * 1000)
-    return _FORMAT.pack(skin.rows, skin.cols, code, rate_mhz, skin.fifo_frames, skin.packet_frames)
+    return _FORMAT.pack(
+        skin.rows, skin.cols, code, _axes_byte(skin.axes), rate_mhz, skin.fifo_frames, skin.packet_frames
+    )
 
 
 def unpack_format(payload: bytes) -> SkinFormat:
-    """Read a FORMAT reply. Raises FormatError if it is too short or the code of its data type is unknown."""
+    """Read a FORMAT reply. Raises FormatError if it is too short, or its data type or number of axes is unknown."""
     if len(payload) < _FORMAT.size:
         raise FormatError(f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the firmware")
-    rows, cols, code, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
+    rows, cols, code, axes, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
     if code >= len(DATA_TYPES):
         raise FormatError(f"data type {code} is not on the list 0..{len(DATA_TYPES) - 1}; update the appliance")
-    return SkinFormat(rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo_frames, packet_frames)
+    if axes > MOST_AXES:
+        raise FormatError(
+            f"{axes} axes of each taxel are more than the {MOST_AXES} that there can be; check the firmware"
+        )
+    return SkinFormat(rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo_frames, packet_frames, axes or 1)
+
+
+def _axes_byte(axes: int = 1) -> int:
+    """One axis is sent as 0: the byte was 0 before there were several."""
+    return 0 if axes == 1 else axes
 
 
 def _text(raw: bytes) -> str:

@@ -15,7 +15,7 @@ import usb.core
 from appliance.core.clock import Clock, DeviceClock
 from appliance.core.config import SensorConfig
 from appliance.core.errors import FormatError, SensorError, SensorMismatch, SensorSilent
-from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
+from appliance.core.types import EPOCH_BITS, Frames, SweepFormat, shown
 from appliance.io import packets, usb_link
 
 RATE_TOLERANCE = 0.01
@@ -96,7 +96,7 @@ class Stream:
 
     def __init__(self, fmt: SweepFormat, counters: SensorCounters) -> None:
         self._format, self._counters = fmt, counters
-        self._grid, self._dtype = (fmt.rows, fmt.cols), fmt.numpy_type
+        self._shape, self._dtype = fmt.shape, fmt.numpy_type
         self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(
             np.int64
         )  # time of frame i of a packet after its first
@@ -126,8 +126,8 @@ class Stream:
         self._leftover = unpacked.leftover
         self._counters.garbage_bytes += unpacked.garbage
         for p in unpacked.packets:
-            if p.taxels.shape[1:] != self._grid or p.taxels.dtype != self._dtype:
-                form = f"{p.taxels.shape[1:]} {p.taxels.dtype}"
+            if p.taxels.shape[1:] != self._shape or p.taxels.dtype != self._dtype:
+                form = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
                 raise SensorMismatch(f"the skin sent {form}, but it had announced {self._format}; check its firmware")
             self._counters.fifo_overflows += bool(p.flags & packets.Flag.OVERFLOW.value)
         fresh, position, lost, stale = packets.follow(unpacked.packets, self._position)
@@ -264,9 +264,9 @@ class UsbSensor:
         except FormatError as e:
             raise SensorMismatch(f"the skin does not answer as PROTOCOL.md says: {e}") from e
         f = self._format
-        if (skin.rows, skin.cols, skin.dtype) != f.skin or abs(skin.rate_hz / f.rate_hz - 1) > RATE_TOLERANCE:
+        if (skin.shape, skin.dtype) != f.skin or abs(skin.rate_hz / f.rate_hz - 1) > RATE_TOLERANCE:
             raise SensorMismatch(
-                f"the skin sends {skin.rows}x{skin.cols} {skin.dtype} at {skin.rate_hz:g} Hz, the bundle wants {f}; "
+                f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, the bundle wants {f}; "
                 "plug in the skin that it was trained for, or deploy a bundle for this one"
             )
         return who

@@ -11,7 +11,6 @@ import struct
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from enum import IntEnum
 from pathlib import Path
 from typing import IO
@@ -51,7 +50,7 @@ class CaptureWriter(Observer):
     """
 
     def __init__(self, path: Path, fmt: SweepFormat) -> None:
-        head = json.dumps(asdict(fmt)).encode()
+        head = json.dumps(fmt.json()).encode()
         self._ended = False
         self._log = TroubleLog(f"capture: {path} cannot be written", "it ends here, classifying goes on")
         try:

@@ -48,7 +48,7 @@ class SweepCutter:
         # slot = seq % size: a frame is found without searching and stays available until it is overwritten
         self._seq = np.full(self._size, -1, np.int64)
         self._t_ns = np.zeros(self._size, np.int64)
-        self._taxels = np.zeros((self._size, fmt.rows, fmt.cols), fmt.numpy_type)
+        self._taxels = np.zeros((self._size, *fmt.shape), fmt.numpy_type)
         self._newest = -1
         self._open: _Open | None = None
         self._closing: list[tuple[_Open, int]] = []  # (sweep, stop ns) whose window may still lack frames

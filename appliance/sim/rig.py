@@ -157,7 +157,7 @@ class Board:
         ppm: float = 0.0, latency: Callable[[], int] = lambda: 150_000, serial: str = "SIM0001", first_seq: int = 0,
     ) -> None:  # fmt: skip
         self.identity = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-sim", serial)
-        self.skin = packets.SkinFormat(fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames)
+        self.skin = packets.SkinFormat(fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames, fmt.axes)
         self.present = True
         self.running = False
         self._robot, self._clock, self._latency = robot, clock, latency
@@ -167,7 +167,7 @@ class Board:
         self._first_seq = first_seq
         self._next = 0  # number of the next frame to send
         self._arrival_ns: int | None = None  # of the packet that begins with this frame, once drawn
-        self._frames = np.zeros((0, fmt.rows, fmt.cols), fmt.numpy_type)
+        self._frames = np.zeros((0, *fmt.shape), fmt.numpy_type)
         self._base = 0  # number of the first frame in _frames
 
     def frame_ns(self, i: int) -> int:

@@ -46,6 +46,7 @@ class Skin:
     cols: int = skin.FORMAT.cols
     rate_hz: float = skin.FORMAT.rate_hz
     dtype: str = skin.FORMAT.dtype
+    axes: int = skin.FORMAT.axes
 
 
 class Backend(Protocol):

@@ -34,7 +34,7 @@ class Nowhere:
 
 def board(what: Skin, clock: Clock) -> rig.Board:
     """A board that answers as `what` and sends numbered frames of that form."""
-    fmt = SweepFormat(what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype)
+    fmt = SweepFormat(what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype, what.axes)
     act = rig.Act(numbered(_LENGTH, fmt), 10**9, 10**9 + 1, "")
     robot = rig.Robot(repeat(act), Nowhere(), start="", stop="")
     made = rig.Board(fmt, robot, clock, serial=what.serial, fifo_frames=round(_FIFO_S * what.rate_hz))

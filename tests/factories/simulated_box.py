@@ -21,9 +21,9 @@ SETTLE_S = 0.02
 
 
 def numbered(n: int, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
-    """Frames [n, R, C] whose raw counts identify the frame and the taxel."""
-    grid = np.arange(fmt.rows * fmt.cols).reshape(fmt.rows, fmt.cols)
-    return ((np.arange(first, first + n) % 97)[:, None, None] + grid).astype(fmt.numpy_type)
+    """Frames [n, R, C] or [n, R, C, A] whose raw counts identify the frame, the taxel and the axis."""
+    grid = np.arange(fmt.channels).reshape(1, *fmt.shape)
+    return ((np.arange(first, first + n) % 97).reshape(-1, *(1,) * len(fmt.shape)) + grid).astype(fmt.numpy_type)
 
 
 def idle_devices(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -> devices.SimDevices:

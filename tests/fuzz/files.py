@@ -97,13 +97,13 @@ def manifest(data: bytes, folder: Path) -> None:
     assert got.manifest == read or read != read, "two readings of one manifest differ"  # NaN among the figures
     assert re.fullmatch("[0-9a-f]{8}", got.id)
     assert set(got.enrolled) <= set(read.labels)
-    assert got.golden.shape[1:] == (read.format.window, read.format.rows, read.format.cols)
+    assert got.golden.shape[1:] == (read.format.window, *read.format.shape)
 
 
 def _usable(read: bundle.Manifest) -> None:
     """What other modules do with a manifest cannot fail."""
     f = read.format
-    for value in (f.rows, f.cols, f.window, read.schema, read.thresholds.dead_taxels):
+    for value in (f.rows, f.cols, f.axes, f.window, read.schema, read.thresholds.dead_taxels):
         assert type(value) is int, f"{value!r} is no whole number"
         assert abs(value) < 1 << 63
     limits = [getattr(read.thresholds, field.name) for field in fields(read.thresholds)]
@@ -136,8 +136,8 @@ def recording(data: bytes, folder: Path) -> None:
         return
     n = len(got.frames.t_ns)
     assert got.frames.seq.shape == got.frames.t_ns.shape == (n,)
-    assert got.frames.taxels.shape == (n, fmt.rows, fmt.cols)
-    assert np.zeros((fmt.rows, fmt.cols)).size * fmt.period_ns > 0
+    assert got.frames.taxels.shape == (n, *fmt.shape)
+    assert np.zeros(fmt.shape).size * fmt.period_ns > 0
     for number in (got.id, got.start_ns, got.stop_ns, got.lost, got.complete_ns, got.object):
         assert type(number) is int, f"{number!r} is no whole number"
     for text in (got.material, got.position, got.session):
@@ -167,7 +167,7 @@ def played(data: bytes, folder: Path) -> None:
         frames = play.read()
         numbers += frames.seq.tolist()
         assert frames.t_ns.dtype == np.int64
-        assert frames.taxels.shape[1:] == (play.format.rows, play.format.cols)
+        assert frames.taxels.shape[1:] == play.format.shape
         for edge in play.edges(play.now_ns()):
             assert 0 <= edge.t_ns < 1 << 63, f"an edge at {edge.t_ns} ns"
         for command in play.commands():

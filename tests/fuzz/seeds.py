@@ -23,7 +23,7 @@ from tests.factories.paths import ROOT
 from tests.fuzz.files import NPY
 
 ENDLESS = packets.HEADER.pack(
-    packets.MAGIC, packets.VERSION, packets.PacketKind.REPLY, packets.MAX_PAYLOAD, 0, 1, 0, 0, 0, 0, 0
+    packets.MAGIC, packets.VERSION, packets.PacketKind.REPLY, packets.MAX_PAYLOAD, 0, 1, 0, 0, 0, 0, 0, 0
 )
 """The header of the largest packet there can be; what follows waits for its end."""
 
@@ -33,6 +33,7 @@ def unpack() -> list[bytes]:
     frames = next(iter(script.tubes(1, 1))).frames[:60]
     sent = [packets.pack(2**32 - 12 + 6 * i, 2**32 - 16_000 + 8000 * i, frames[6 * i : 6 * i + 6]) for i in range(5)]
     others = [packets.pack(7, 9, np.arange(12).reshape(2, 2, 3).astype(d), packets.Flag.OVERFLOW) for d in DATA_TYPES]
+    axes = packets.pack(7, 9, np.arange(54, dtype=np.float32).reshape(2, 3, 3, 3))
     who = packets.pack_identity(packets.Identity(1, (1, 2, 3), "Palpate skin", "0042"))
     form = packets.pack_format(packets.SkinFormat(4, 4, "uint8", 750, 750, 6))
     replies = packets.pack_reply(packets.Request.IDENTITY, who) + packets.pack_reply(packets.Request.FORMAT, form)
@@ -52,6 +53,7 @@ def unpack() -> list[bytes]:
         form,
         broken,
         *others,
+        axes,
         ENDLESS + sent[0],
     ]
 
@@ -86,10 +88,15 @@ def manifest() -> list[bytes]:
 
 
 def recording() -> list[bytes]:
-    """Two recordings of four frames, of two skins: each its sidecar, then its records."""
+    """Recordings of four frames, of three skins: each its sidecar, then its records."""
     found, n = [], np.arange(4)
-    for fmt in (SweepFormat(2, 2, 100.0, 4, "int16"), SweepFormat(1, 1, 35.61, 4, "uint8")):
-        taxels = np.arange(4 * fmt.rows * fmt.cols).reshape(4, fmt.rows, fmt.cols).astype(fmt.numpy_type)
+    skins = (
+        SweepFormat(2, 2, 100.0, 4, "int16"),
+        SweepFormat(1, 1, 35.61, 4, "uint8"),
+        SweepFormat(2, 1, 9.0, 4, "int16", 3),
+    )
+    for fmt in skins:
+        taxels = np.arange(4 * fmt.channels).reshape(4, *fmt.shape).astype(fmt.numpy_type)
         sweep = Sweep(1, 0, 40_000_000, Status.OK, Frames(n, n, taxels), material="wood", session="a")
         with TemporaryDirectory() as folder:
             path = Path(folder) / "sweep.npy"

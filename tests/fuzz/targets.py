@@ -52,9 +52,10 @@ def by_the_document(data: bytes) -> list[bytes]:
     """All whole packets in `data`, as PROTOCOL.md's table reads, in few words and without care for speed."""
     found, at = [], 0
     while (at := data.find(b"\x50\xc1", at)) >= 0 and len(data) - at >= 20:
-        version, kind, n, _, count, rows, cols, digit = struct.unpack_from("<BBHBBBBB", data, at + 2)
+        version, kind, n, _, count, rows, cols, digit, axes = struct.unpack_from("<BBHBBBBBB", data, at + 2)
         end = at + 20 + n + 4
-        frames = version == 1 and digit in ITEM_SIZES and n == count * rows * cols * ITEM_SIZES[digit] > 0
+        frames = version == 1 and digit in ITEM_SIZES and axes <= 8
+        frames = frames and n == count * rows * cols * max(axes, 1) * ITEM_SIZES[digit] > 0
         if n <= 4096 and (kind == 1 or (kind == 0 and frames)):
             if end > len(data):
                 break
@@ -138,7 +139,8 @@ def _replies(data: bytes, replies: list[wire.Reply]) -> None:
         except FormatError as e:
             one_line(e)
         try:
-            assert wire.pack_format(skin := wire.unpack_format(payload)) == payload[:3] + b"\0" + payload[4:16], skin
+            axes = payload[3:4].replace(b"\1", b"\0")
+            assert wire.pack_format(skin := wire.unpack_format(payload)) == payload[:3] + axes + payload[4:16], skin
         except FormatError as e:
             one_line(e)
 

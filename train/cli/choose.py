@@ -81,7 +81,7 @@ def _pack(
 
 def _described(manifest: Manifest, cost: BundleCost, requested: scene.Scene) -> Json:
     used = {k: round(v, 3) for k, v in cost.used(requested.budget).items()}
-    return {"name": manifest.name, "version": manifest.version, "format": asdict(manifest.format), "ms": cost.ms,
+    return {"name": manifest.name, "version": manifest.version, "format": manifest.format.json(), "ms": cost.ms,
             "kb": cost.kb, "mb": cost.mb, "used": used, "figures": manifest.figures}  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def _origin(args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset) -
     budget = {k: v for k, v in vars(requested.budget).items() if v != float("inf")}
     return {
         "scene": requested.name, "command": shlex.join(words), "set": sweeps.source, "digest": digest(sweeps), "sweeps": len(sweeps),
-        "format": asdict(sweeps.format), "materials": list(sweeps.materials), "merge": dict(requested.merge),
+        "format": sweeps.format.json(), "materials": list(sweeps.materials), "merge": dict(requested.merge),
         "varies": list(requested.varies), "stress": dict(requested.stress), "budget": budget, "effort": effort.share,
         "seeds": list(range(1, requested.seeds + 1)),
     } | score.provenance()  # fmt: skip

@@ -72,7 +72,7 @@ class Result:
         return result | times | {
             "folds": len(self.folds), "agreement": min(f.agreement for f in self.folds), "ran": ", ".join(ran),
             "materials": list(sweeps.materials), "confusion": confusion.tolist(), "set": sweeps.source,
-            "format": asdict(sweeps.format),
+            "format": sweeps.format.json(),
         } | self.origin  # fmt: skip
 
     def _counts(self, logits: Array) -> dict[str, Any]:

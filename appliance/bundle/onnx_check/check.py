@@ -113,7 +113,7 @@ def _takes(graph: Message, manifest: Manifest, features: int | None) -> None:
     need(len(graph.input) == 1, f"it has {len(graph.input)} inputs instead of one")
     kind, shape = _declared(graph.input[0])
     f = manifest.format
-    want, form = (f.dtype, (1, f.window, f.rows, f.cols)) if manifest.input == "raw" else ("float32", (1, features))
+    want, form = (f.dtype, (1, f.window, *f.shape)) if manifest.input == "raw" else ("float32", (1, features))
     fits = kind == want and _fits(shape, form)
     need(fits, f"it takes {kind} {list(shape)}, the manifest has {want} {list(form)}")
 

@@ -145,7 +145,7 @@ def test_streams_without_a_gap(need: Need):
         assert (frames.t_ns <= now(u)).all()
         assert (np.diff(frames.seq) == 1).all()
         assert (np.diff(frames.t_ns) > 0).all()
-        assert frames.taxels.shape[1:] == (u.format.rows, u.format.cols)
+        assert frames.taxels.shape[1:] == u.format.shape
         assert frames.taxels.dtype == u.format.numpy_type
         check_content(u, frames)
         assert reader.sensor.counters.lost_frames == reader.sensor.counters.garbage_bytes == 0
@@ -210,6 +210,7 @@ def test_serial_number_chooses(need: Need):
     [
         ({"protocol": 2}, "protocol 2"),
         ({"rows": 3}, "3x4"),
+        ({"axes": 3}, "4x4x3"),
         ({"dtype": "int16"}, "int16"),
         ({"rate_hz": 765.0}, "765 Hz"),
     ],

@@ -3,6 +3,7 @@
 import itertools
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.core.errors import FormatError
-from appliance.core.types import DATA_TYPES, EPOCH_BITS
+from appliance.core.types import DATA_TYPES, EPOCH_BITS, MOST_AXES
 from appliance.io import packets as wire
 from tests.factories.paths import ROOT
 
@@ -40,6 +41,27 @@ def test_bytes_are_the_documents_table():
     assert wire.pack(0xFFFFFFFF, 7, np.arange(8, dtype=np.uint8).reshape(2, 2, 2), wire.Flag.TRIGGER) == by_hand
 
 
+@pytest.mark.parametrize(("byte", "shape"), [(0, (4, 2)), (1, (4, 2)), (2, (2, 2, 2)), (8, (1, 1, 8))])
+def test_axes_of_a_taxel(byte: int, shape: tuple[int, ...]):
+    """The byte after the data type is the number of axes, and 0 means one, in which form the box writes it, too."""
+    payload = bytes(range(8))
+    head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, 8, 0, 1, *shape[:2], 0, byte, 5, 7)
+    by_hand = head + payload + struct.pack("<I", zlib.crc32(head + payload))
+    (packet,) = wire.unpack(by_hand).packets
+    np.testing.assert_array_equal(packet.taxels, np.arange(8, dtype=np.uint8).reshape(1, *shape))
+    if byte != 1:
+        assert wire.pack(5, 7, packet.taxels) == by_hand
+
+
+@pytest.mark.parametrize(("byte", "size"), [(9, 9), (3, 8), (255, 255)])
+def test_axes_that_cannot_be(byte: int, size: int):
+    """More than eight axes, or another number than the payload holds: the bytes are garbage."""
+    head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, size, 0, 1, 1, 1, 0, byte, 5, 7)
+    data = head + bytes(size) + struct.pack("<I", zlib.crc32(head + bytes(size)))
+    got = wire.unpack(data)
+    assert (got.packets, got.garbage + len(got.leftover)) == ([], len(data))
+
+
 def test_document_names_the_numbers():
     """Magic, limits and offsets in PROTOCOL.md are the code's."""
     text = PROTOCOL.read_text()
@@ -50,6 +72,7 @@ def test_document_names_the_numbers():
     assert all(f"| {r.value} | {r.name} |" in text for r in wire.Request)
     assert f"| 1 | IDENTITY | {len(wire.pack_identity(wire.Identity(1, (1, 2, 3), 'b', 's')))} bytes" in text
     assert f"| 2 | FORMAT | {len(wire.pack_format(wire.SkinFormat(4, 4, 'uint8', 750, 750, 4)))} bytes" in text
+    assert f"axes A of each taxel: 0 or 1 for one, at most {MOST_AXES}" in text
     assert "data type: " + ", ".join(f"{i} {d}" for i, d in enumerate(DATA_TYPES)) in text
 
 
@@ -168,6 +191,11 @@ def test_identity_and_format_survive():
     skin = wire.SkinFormat(16, 1, "int16", 35.61, 100, 2)
     assert wire.unpack_identity(wire.pack_identity(who) + b"later fields") == who
     assert wire.unpack_format(wire.pack_format(skin)) == skin
+    assert wire.unpack_format(wire.pack_format(three := replace(skin, axes=3))) == three
+    one = bytearray(wire.pack_format(skin))
+    assert one[3] == 0
+    one[3] = 1
+    assert wire.unpack_format(bytes(one)) == skin
 
 
 @pytest.mark.parametrize(
@@ -176,6 +204,7 @@ def test_identity_and_format_survive():
         (wire.unpack_identity, b"\x01", "36"),
         (wire.unpack_format, b"\x01", "16"),
         (wire.unpack_format, b"\x04\x04\x09" + bytes(13), "data type 9"),
+        (wire.unpack_format, b"\x04\x04\x00\x09" + bytes(12), "9 axes of each taxel are more than the 8"),
     ],
 )
 def test_broken_replies_are_named(call, value, hint):

@@ -216,12 +216,13 @@ def test_a_host_that_pauses_too_long():
     [
         ({"identity": {"protocol": 2}}, "protocol 2"),
         ({"skin": {"rows": 3}}, "3x4"),
+        ({"skin": {"axes": 3}}, "4x4x3 uint8"),
         ({"skin": {"dtype": "int16"}}, "int16"),
         ({"skin": {"rate_hz": 765.0}}, "765 Hz"),
     ],
 )
 def test_a_board_that_does_not_fit(change: dict, hint: str):
-    """Another protocol, grid, data type or rate: state mismatch, naming both sides; a matching board is used."""
+    """Another protocol, grid, number of axes, data type or rate: state mismatch, naming both sides; a matching board is used."""
     simulated = idle_devices()
     board = simulated.backend.board
     before = {name: getattr(board, name) for name in change}
@@ -234,6 +235,31 @@ def test_a_board_that_does_not_fit(change: dict, hint: str):
     for name, value in before.items():
         setattr(board, name, value)
     assert len(read_for(sensor, simulated, 1)) > 100
+
+
+@pytest.mark.parametrize("acm", [False, True])
+def test_a_skin_with_three_axes(acm: bool):
+    """All axes of every frame arrive in their places; a box for one axis refuses the board, and the other way round."""
+    pillars = SweepFormat(3, 3, 1000.0, 2000, "float32", 3)
+    simulated = idle_devices(fmt=pillars, acm=acm)
+    sensor = sensor_on(simulated, pillars)
+    frames = read_for(sensor, simulated, 1)
+    assert (len(frames) > 900, sensor.counters.lost_frames) == (True, 0)
+    wanted = numbered(97, pillars)[(frames.seq & ((1 << EPOCH_BITS) - 1)) % 97]
+    np.testing.assert_array_equal(frames.taxels, wanted)
+    sensor.close()
+    flat = sensor_on(simulated, replace(pillars, axes=1))
+    read_for(flat, simulated, 1)
+    assert "the skin sends 3x3x3 float32" in str(flat.trouble)
+
+
+def test_frames_with_other_axes_than_announced():
+    """A board that announces one axis and sends three: mismatch, naming both."""
+    simulated = idle_devices(fmt=replace(FMT, axes=3))
+    simulated.backend.board.skin = replace(simulated.backend.board.skin, axes=1)
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 1)
+    assert "the skin sent 4x4x3 uint8, but it had announced 4x4 uint8" in str(sensor.trouble)
 
 
 def test_a_board_that_answers_nonsense(monkeypatch: pytest.MonkeyPatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,8 @@ from appliance.recording.capture import CaptureWriter, Playback
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Box, Pipeline
 from appliance.sim import devices, rig, script, skin
+from tests.factories import toy_bundle
+from tests.factories.paths import ONE_AXIS
 from tests.factories.simulated_box import SECOND, OnSweep, Rigged
 
 
@@ -70,6 +73,18 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     for a, b in zip(box.kept, sweeps, strict=True):
         assert a.frames.taxels.tobytes() == b.frames.taxels.tobytes()
         assert (a.frames.t_ns == b.frames.t_ns).all()
+
+
+def test_a_capture_from_before_there_were_axes(tmp_path: Path):
+    """Its sweeps get the verdicts that the box gave then."""
+    model = toy_bundle.load(tmp_path / "bundle")
+    verdicts, sweeps = played(ONE_AXIS / "capture", model)
+    then = json.loads((ONE_AXIS / "verdicts.json").read_text())
+    assert [(v.sweep, v.status, v.label, v.fused) for v in verdicts] == [
+        (v["sweep"], v["status"], v["label"], v["fused"]) for v in then
+    ]
+    np.testing.assert_allclose([v.scores for v in verdicts], [v["scores"] for v in then], rtol=1e-5)
+    np.testing.assert_array_equal(sweeps[1].frames.taxels, load(ONE_AXIS / "sweep.npy")[0].frames.taxels)
 
 
 @pytest.mark.slow
