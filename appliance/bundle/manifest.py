@@ -17,6 +17,7 @@ from appliance.core.schema import typed
 from appliance.core.types import SweepFormat
 from appliance.signal import features
 from appliance.signal.contact import ContactPositions
+from appliance.signal.window_check import WindowLimits
 
 SCHEMA = 4
 """Version that is written. Versions 1 (without `early`, `known`), 2 (without `runtime`, `counter`, `place`) and 3 (without
@@ -34,18 +35,12 @@ _VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
 
 
 @dataclass(frozen=True, slots=True)
-class Thresholds:
+class Thresholds(WindowLimits):
     """Limits for a window before the network runs, and for the network's answer.
 
-    contact: least mean over time of a loaded taxel, in counts above the tare. full_scale: the sensor's highest count.
-    saturated: largest accepted share of full-scale counts in a window. dead_taxels: largest number that the model
-    tolerates. unsure: least probability for status ok.
+    dead_taxels: largest number that the model tolerates. unsure: least probability for status ok.
     """
 
-    contact: float
-    full_scale: float
-    saturated: float = 0.01
-    dead_taxels: int = 0
     unsure: float = UNSURE
 
 

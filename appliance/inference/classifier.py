@@ -8,20 +8,20 @@ enrolled, gets a status with the reason instead of a label.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from appliance.bundle.bundle import GOLDEN_TOLERANCE, Bundle
-from appliance.bundle.manifest import MEANS, Thresholds
+from appliance.bundle.manifest import MEANS
 from appliance.core.errors import BundleError
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.novelty import Means
 from appliance.inference.session import ModelRunner
 from appliance.signal import features
 from appliance.signal.contact import moved
+from appliance.signal.window_check import Finding, inspect
 
 if TYPE_CHECKING:
     from appliance.core.clock import Clock
@@ -30,57 +30,6 @@ if TYPE_CHECKING:
 _NONE = np.empty(0)
 LEAST_PROBABILITY = 1e-12
 """Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto all others."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Result of the check of a window: status ok, or why it is refused, with the taxels in `detail`."""
-
-    status: Status
-    detail: str = ""
-
-
-def _taxels(mask: Any) -> str:
-    return "taxel " + " ".join(f"{r + 1}.{c + 1}" for r, c in np.argwhere(mask))
-
-
-def inspect(taxels: NDArray[Any], tare: NDArray[np.float64], limits: Thresholds) -> Finding:
-    """Check a window before it is classified. taxels: raw counts [T, R, C]; tare: counts [R, C] of the unloaded skin.
-
-    A loaded taxel always varies, so that a constant one is stuck. A constant unloaded taxel is dead if all its direct
-    neighbours are loaded; at the edge of the contact it may be unloaded. One that gives no numbers is always dead.
-    """
-    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # [R * C, T]: three times as fast to reduce
-    highest = series.max(axis=1)
-    still = (series.min(axis=1) == highest).reshape(tare.shape)
-    load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
-    if not np.isfinite(load).all():  # possible with float32 counts; no output of the network is an answer then
-        return Finding(Status.DEAD_TAXEL, _taxels(~np.isfinite(load)))
-    loaded = load >= limits.contact
-    if not loaded.any():
-        return Finding(Status.NO_CONTACT, f"strongest taxel {load.max():.1f} digits")
-    full = np.zeros(tare.shape)  # share of the frames
-    if highest.max() >= limits.full_scale:  # seldom; counting takes longer than all the rest
-        full = (series >= limits.full_scale).mean(axis=1).reshape(tare.shape)
-    stuck = still & loaded & (full < 1)
-    if stuck.any():
-        return Finding(Status.STUCK_TAXEL, _taxels(stuck))
-    if full.mean() > limits.saturated:
-        return Finding(Status.SATURATED, _taxels(full > 0))
-    silent = still & ~loaded
-    if silent.any():
-        dead = silent & _enclosed(loaded)
-        if dead.sum() > limits.dead_taxels:
-            return Finding(Status.DEAD_TAXEL, _taxels(dead))
-    return Finding(Status.OK)
-
-
-def _enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether all direct neighbours of a taxel are loaded, bool [R, C]; what is beyond the skin's edge counts as loaded."""
-    padded = np.ones((loaded.shape[0] + 2, loaded.shape[1] + 2), bool)
-    padded[1:-1, 1:-1] = loaded
-    enclosed: NDArray[np.bool_] = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
-    return enclosed
 
 
 def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:

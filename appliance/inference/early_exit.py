@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import BundleError
 from appliance.core.types import Status, Sweep, Verdict
-from appliance.inference.classifier import Classifier, inspect, softmax
+from appliance.inference.classifier import Classifier, softmax
+from appliance.signal.window_check import inspect
 
 if TYPE_CHECKING:
     from appliance.bundle.manifest import Early

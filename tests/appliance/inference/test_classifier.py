@@ -10,88 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle, Early, Thresholds
+from appliance.bundle.bundle import Bundle, Early
 from appliance.bundle.manifest import SCHEMA
 from appliance.core.errors import BundleError
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference import session
-from appliance.inference.classifier import Classifier, fuse, inspect, softmax
+from appliance.inference.classifier import Classifier, fuse, softmax
 from appliance.sim.rig import VirtualClock
 from tests.factories import toy_bundle
-
-LIMITS = Thresholds(contact=10, full_scale=255, saturated=0.01)
-BARE = np.zeros((4, 4))
-
-
-def moving(level: float = 80, shape: tuple[int, ...] = (300, 4, 4)) -> np.ndarray:
-    """A window of a skin that is loaded everywhere and vibrates."""
-    return np.random.default_rng(0).integers(level - 5, level + 5, shape).astype(np.uint8)
 
 
 def sweep_of(taxels: np.ndarray, **more) -> Sweep:
     """A sweep with this window."""
     n = np.arange(len(taxels))
     return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels), **more)
-
-
-def test_a_sound_window_passes():
-    """A loaded, vibrating skin is accepted, also if its last row is off the tube."""
-    taxels = moving()
-    assert inspect(taxels, BARE, LIMITS).status is Status.OK
-    taxels[:, 3] = 0
-    assert inspect(taxels, BARE, LIMITS).status is Status.OK
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "status", "detail"),
-    [
-        (np.s_[:, :, :], 0, Status.NO_CONTACT, "0.0 digits"),
-        (np.s_[:, 1, 2], 90, Status.STUCK_TAXEL, "taxel 2.3"),
-        (np.s_[:, 1, 2], 0, Status.DEAD_TAXEL, "taxel 2.3"),
-        (np.s_[:, 0, 0], 0, Status.DEAD_TAXEL, "taxel 1.1"),
-        (np.s_[:, 0, 1], 255, Status.SATURATED, "taxel 1.2"),
-        (np.s_[:60, 2:, 2:], 255, Status.SATURATED, "taxel 3.3 3.4 4.3 4.4"),
-    ],
-)
-def test_a_spoiled_window_is_named(place, value: int, status: Status, detail: str):
-    """Each kind of fault, with its taxel (row.column from 1)."""
-    taxels = moving()
-    taxels[place] = value
-    found = inspect(taxels, BARE, LIMITS)
-    assert found.status is status
-    assert detail in found.detail
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_taxel_that_gives_no_number_is_dead(value: float):
-    """One frame of it is enough, also at the edge, and for any number of dead taxels that the bundle tolerates."""
-    taxels = moving().astype(np.float32)
-    taxels[150, 0, 3] = value
-    found = inspect(taxels, BARE, replace(LIMITS, dead_taxels=3))
-    assert (found.status, found.detail) == (Status.DEAD_TAXEL, "taxel 1.4")
-
-
-def test_a_bundle_that_tolerates_dead_taxels():
-    """As many dead taxels as the bundle allows are accepted."""
-    taxels = moving()
-    taxels[:, 1, 2] = 0
-    assert inspect(taxels, BARE, replace(LIMITS, dead_taxels=1)).status is Status.OK
-
-
-def test_tare_counts():
-    """The load is counted from the tare."""
-    assert inspect(moving(80), np.full((4, 4), 75.0), LIMITS).status is Status.NO_CONTACT
-
-
-@given(st.integers(1, 40), st.integers(1, 5), st.integers(1, 5), st.integers(0, 255), st.integers(0, 2**32 - 1))
-def test_any_window_gets_a_status(n: int, rows: int, cols: int, spread: int, seed: int):
-    """Any counts of any shape, one frame long or constant: a status, never an error."""
-    taxels = np.random.default_rng(seed).integers(0, spread + 1, (n, rows, cols)).astype(np.uint8)
-    assert inspect(taxels, np.zeros((rows, cols)), LIMITS).status in Status
 
 
 def test_softmax_is_equation_10():
