@@ -26,8 +26,9 @@ SITE = Path("/etc/palpate/palpate.toml")
 class SensorConfig:
     """Where the skin is and how it is read.
 
-    vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link: the USB interface to use,
-    "vendor" (bulk) or "acm" (a serial port over USB).
+    vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link: "vendor" (bulk transfers),
+    "acm" (a serial port over USB, without the kernel's driver), or "serial" (any serial port, with the kernel's
+    driver). port: path of this serial port; "" finds the one with the ids. baud: its bits per second.
     read_bytes: size of one read, in whole USB packets. timeout_ms: longest wait of one read. silence_ms: time without a
     frame after which the skin counts as lost. retry_ms: time between two searches for a missing skin.
     """
@@ -35,7 +36,9 @@ class SensorConfig:
     vendor_id: int = number(0x1209, 1, 0xFFFF, hex=True)
     product_id: int = number(0x7AC7, 1, 0xFFFF, hex=True)
     serial: str = ""
-    link: Literal["vendor", "acm"] = "vendor"
+    link: Literal["vendor", "acm", "serial"] = "vendor"
+    port: str = ""
+    baud: int = number(115200, 1200, 4_000_000)
     read_bytes: int = number(4096, 512, 1 << 20, step=512)
     timeout_ms: int = number(100, 1, 1_000)
     silence_ms: int = number(500, 1, 60_000)

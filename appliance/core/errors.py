@@ -61,6 +61,10 @@ class SensorLost(SensorError):
     state = "lost"
 
 
+class SensorOverflow(SensorLost):
+    """One transfer was larger than the read (errno 75) and is lost; the link itself goes on."""
+
+
 class SensorSilent(SensorError):
     """The skin is connected but sends nothing."""
 

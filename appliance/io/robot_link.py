@@ -6,13 +6,9 @@ read, sentences are dropped and counted, and no frame is lost.
 
 from __future__ import annotations
 
-import contextlib
-import errno
-import fcntl
 import os
 import re
 import sys
-import termios
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +21,7 @@ import serial
 from appliance.core.clock import Clock
 from appliance.core.config import SerialConfig
 from appliance.core.types import Verdict
+from appliance.io import serial_port
 
 TALKER = "PPLP"
 COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD")
@@ -34,8 +31,6 @@ MAX_LINE = 128
 """Characters of a sentence or command."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
-PSEUDO_TERMINALS = range(136, 144)
-"""Major device numbers of pseudo-terminals."""
 _UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 
 
@@ -219,11 +214,7 @@ class SerialSink:
         """Close the port; sentences that were not sent are lost."""
         if self._port:
             port, self._port = self._port, None
-            with contextlib.suppress(OSError):  # a port that is gone cannot be closed properly
-                # if another program opened the port before, the exclusive mode would outlast us and lock us out, too
-                fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
-            with contextlib.suppress(OSError):
-                port.close()
+            serial_port.close(port)
 
     def _flush(self) -> None:
         if not self._port and not self._open():
@@ -247,10 +238,9 @@ class SerialSink:
             return False
         self._retry_ns = now + RETRY_NS
         try:
-            port = self._opener(self._config.port, self._config.baud, timeout=0, write_timeout=0, exclusive=True)
-            _keep_others_out(port.fileno())
+            port = serial_port.open_alone(self._config.port, self._config.baud, self._opener)
         except (OSError, ValueError) as e:  # SerialException is an OSError
-            held = getattr(e, "errno", None) in (errno.EBUSY, errno.EAGAIN)
+            held = serial_port.is_held(e)
             advice = "end the program that has it (fuser shows it)" if held else "check serial.port and group dialout"
             self.trouble = f"serial port {self._config.port} cannot be opened: {e}; {advice}"
             return False
@@ -262,13 +252,3 @@ class SerialSink:
         self.close()
         self._begun = 0
         self._retry_ns = self._clock.now_ns() + RETRY_NS
-
-
-def _keep_others_out(port: int) -> None:
-    """Make the kernel refuse any further open of `port`, except by root: another reader would take commands away, and a
-    lock only binds programs that ask for it.
-
-    Pseudo-terminals are left out: one would stay locked, also for us, if we were killed while its other end is open.
-    """
-    if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
-        fcntl.ioctl(port, termios.TIOCEXCL)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+from collections.abc import Iterator
 from typing import Any
 
 import usb.core
@@ -14,11 +15,17 @@ import usb.util
 
 from appliance.core.clock import Clock
 from appliance.core.config import SensorConfig
-from appliance.core.errors import SensorAbsent, SensorBusy, SensorDenied, SensorError, SensorLost, SensorMismatch
+from appliance.core.errors import (
+    SensorAbsent,
+    SensorBusy,
+    SensorDenied,
+    SensorError,
+    SensorLost,
+    SensorMismatch,
+    SensorOverflow,
+)
 from appliance.io import packets
-
-REPLY_MS = 500
-"""Longest wait for the reply to a request."""
+from appliance.io.link import REPLY_MS, reply_to
 
 
 class VendorLink:
@@ -34,24 +41,30 @@ class VendorLink:
         return [self._number]
 
     def request(self, request: packets.Request, length: int) -> bytes:
-        """Send a request; returns a reply of at most `length` bytes, b"" for length 0."""
+        """Send a request; returns a reply of at most `length` bytes, b"" for length 0. Raises SensorError."""
         kind = usb.util.CTRL_TYPE_VENDOR | usb.util.CTRL_RECIPIENT_INTERFACE | (0x80 if length else 0)
-        reply = self._device.ctrl_transfer(kind, request, 0, self._number, length or None, REPLY_MS)
+        with _explained():
+            reply = self._device.ctrl_transfer(kind, request, 0, self._number, length or None, REPLY_MS)
         return bytes(reply) if length else b""
 
     def read(self, size: int, timeout_ms: int) -> bytes:
-        """One bulk transfer of at most `size` bytes. A stalled endpoint is cleared for the next read."""
+        """One bulk transfer of at most `size` bytes; b"" if none came within `timeout_ms`.
+
+        Raises SensorOverflow for a larger one, else SensorError. A stalled endpoint is cleared for the next read.
+        """
         try:
             return bytes(self._device.read(self._in, size, timeout_ms))
+        except usb.core.USBTimeoutError:
+            return b""
         except usb.core.USBError as e:
             if e.errno == errno.EPIPE:
                 with contextlib.suppress(usb.core.USBError):
                     self._device.clear_halt(self._in)
-            raise
+            raise _explain(e) from e
 
     def close(self) -> None:
         """Ask the board to stop, unless it is gone, and release it."""
-        with contextlib.suppress(usb.core.USBError):
+        with contextlib.suppress(SensorError):
             self.request(packets.Request.STOP, 0)
         usb.util.dispose_resources(self._device)
 
@@ -68,21 +81,10 @@ class AcmLink(VendorLink):
         return [i.bInterfaceNumber for i in self._device.get_active_configuration() if i.bInterfaceClass in (2, 10)]
 
     def request(self, request: packets.Request, length: int) -> bytes:
-        """Send a request byte; returns the reply, b"" for length 0. The board is not streaming, so no frames are
-        lost."""
-        self._device.write(self._out, bytes([request]), REPLY_MS)
-        data, until_ns = b"", self._clock.now_ns() + REPLY_MS * 1_000_000
-        while length:
-            data += self.read(512, REPLY_MS)
-            for reply in packets.unpack(data).replies:
-                if reply.request == request:
-                    return reply.payload
-            # without a limit a board that sends a few bytes now and then would keep this loop running
-            if len(data) > 4 * packets.MAX_PAYLOAD or self._clock.now_ns() >= until_ns:
-                raise SensorMismatch(
-                    f"the skin sends frames but does not answer request {request.name}; check its firmware"
-                )
-        return b""
+        """Send a request byte; returns the reply, b"" for length 0. Raises SensorError."""
+        with _explained():
+            self._device.write(self._out, bytes([request]), REPLY_MS)
+        return reply_to(request, self.read, self._clock) if length else b""
 
 
 def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
@@ -106,14 +108,14 @@ def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
         return link(device, interface, clock)
     except usb.core.USBError as e:
         usb.util.dispose_resources(device)
-        raise explain(e) from e
+        raise _explain(e) from e
 
 
 def _serial(device: usb.core.Device) -> str:
     try:
         return device.serial_number or ""
     except usb.core.USBError as e:
-        raise explain(e) from e
+        raise _explain(e) from e
     except UnicodeDecodeError as e:
         raise SensorMismatch(f"the skin's serial number is no text ({e}); check its firmware") from e
     except ValueError as e:  # pyusb raises it if the string descriptors may not be read
@@ -152,8 +154,18 @@ def _claim(device: usb.core.Device, number: int) -> None:
     usb.util.claim_interface(device, number)
 
 
-def explain(e: usb.core.USBError) -> SensorError:
+@contextlib.contextmanager
+def _explained() -> Iterator[None]:
+    try:
+        yield
+    except usb.core.USBError as e:
+        raise _explain(e) from e
+
+
+def _explain(e: usb.core.USBError) -> SensorError:
     """The SensorError that explains an errno of libusb."""
+    if e.errno == errno.EOVERFLOW:
+        return SensorOverflow("a USB transfer was larger than sensor.read_bytes (errno 75); it is lost, increase it")
     if e.errno == errno.EACCES:
         return SensorDenied(
             "the skin may not be opened by this user (errno 13); install the udev rule, join group plugdev"

@@ -1,22 +1,21 @@
-"""The skin on USB, also when it is unplugged and plugged in again. In: a pyusb backend, a clock. Out: Frames, state.
+"""A skin that speaks PROTOCOL.md, also when it is unplugged and plugged in again. In: a link, a clock. Out: Frames, state.
 
-No failure of the bus makes `read` raise: it returns no frames, `state` and `trouble` say why, and it tries again.
+No failure of the link makes `read` raise: it returns no frames, `state` and `trouble` say why, and it tries again.
 """
 
 from __future__ import annotations
 
-import errno
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import usb.core
 
 from appliance.core.clock import Clock, DeviceClock
 from appliance.core.config import SensorConfig
-from appliance.core.errors import FormatError, SensorError, SensorMismatch, SensorSilent
+from appliance.core.errors import FormatError, SensorError, SensorMismatch, SensorOverflow, SensorSilent
 from appliance.core.types import EPOCH_BITS, Frames, SweepFormat, shown
-from appliance.io import packets, usb_link
+from appliance.io import packets
+from appliance.io.link import SkinLink
 
 RATE_TOLERANCE = 0.01
 """Largest relative difference between the board's rate and the bundle's: 1 %, since crystals and timers differ."""
@@ -176,7 +175,7 @@ class Stream:
 
 
 class UsbSensor:
-    """The skin's readout board on USB (PROTOCOL.md, part 1).
+    """The skin's readout board on USB or on a serial port (PROTOCOL.md, part 1).
 
     States: `streaming`, or `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent`, where `trouble` says what to do.
     A board that is plugged in again is a new enumeration: its frames get a new epoch in `seq` and a new device clock.
@@ -196,7 +195,7 @@ class UsbSensor:
         self.counters = SensorCounters()
         self._config, self._format, self._clock, self._backend, self._tap = config, fmt, clock, backend, tap
         self._stream = Stream(fmt, self.counters)
-        self._link: usb_link.VendorLink | None = None
+        self._link: SkinLink | None = None
         self._retry_ns = clock.now_ns()
         self._quiet_ns = 0  # time spent reading since the last frame
 
@@ -237,21 +236,18 @@ class UsbSensor:
             self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
             return False
         try:
-            self._link = usb_link.open_board(self._config, self._backend, self._clock)
+            self._link = _open_link(self._config, self._backend, self._clock)
             self.identity = self._check(self._link)
             self._link.request(packets.Request.START, 0)
         except SensorError as e:
             self._drop(e)
-            return False
-        except usb.core.USBError as e:
-            self._drop(usb_link.explain(e))
             return False
         self._stream.restart()
         self._quiet_ns = 0
         self._set_state("streaming", None)
         return True
 
-    def _check(self, board: usb_link.VendorLink) -> packets.Identity:
+    def _check(self, board: SkinLink) -> packets.Identity:
         """Compare the board's identity and format with what this box and its bundle can use."""
         try:
             who = packets.unpack_identity(board.request(packets.Request.IDENTITY, 64))
@@ -272,19 +268,15 @@ class UsbSensor:
         return who
 
     def _transfer(self) -> bytes:
-        """One bulk transfer; b"" if nothing came. If the board has failed the link is dropped."""
+        """What one read gives; b"" if nothing came. If the board has failed the link is dropped."""
         assert self._link
         try:
             return self._link.read(self._config.read_bytes, self._config.timeout_ms)
-        except usb.core.USBTimeoutError:
-            return b""
-        except usb.core.USBError as e:
-            if e.errno == errno.EOVERFLOW:
-                # more bytes than requested: this transfer is lost, sequence numbers show how many frames it held
-                self.counters.overflows += 1
-            else:
-                self._drop(usb_link.explain(e))
-            return b""
+        except SensorOverflow:
+            self.counters.overflows += 1  # sequence numbers show how many frames it held
+        except SensorError as e:
+            self._drop(e)
+        return b""
 
     def _frames(self, data: bytes, now_ns: int) -> Frames:
         try:
@@ -309,3 +301,15 @@ class UsbSensor:
         if self._tap and state != self.state:
             self._tap.state(self._clock.now_ns(), state)
         self.state, self.trouble = state, trouble
+
+
+def _open_link(config: SensorConfig, backend: Any, clock: Clock) -> SkinLink:
+    """Find and open the configured board. Raises SensorError if it is absent, held, refused or of another kind."""
+    # each kind is imported when it is used: most boxes use one of them for ever
+    if config.link == "serial":
+        from appliance.io import serial_link
+
+        return serial_link.open_board(config, clock)
+    from appliance.io import usb_link
+
+    return usb_link.open_board(config, backend, clock)

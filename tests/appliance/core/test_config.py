@@ -88,10 +88,10 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
     ("text", "name", "hint"),
     [
         ("[trigger]\nglich_us = 3", "trigger.glich_us", "did you mean trigger.glitch_us?"),
-        ("[sensor]\nbaud = 9600", "sensor.baud", "did you mean serial.baud?"),
+        ("[sensor]\nqueue = 9", "sensor.queue", "did you mean serial.queue?"),
         ("[triger]\nmode = 'one-line'", "triger", "did you mean trigger?"),
         ("[gpio]\nx = 1", "gpio", "known are sensor, trigger, output, sweep, serial, classifier"),
-        ("baud = 9600", "baud", "did you mean serial.baud?"),
+        ("queue = 9", "queue", "did you mean serial.queue?"),
         ("sensor = 5", "sensor = 5", "write [sensor], its keys below"),
         ("[trigger]\nglitch_us = 0", "trigger.glitch_us = 0", "a whole number from 1 to 1000000"),
         ("[trigger]\nglitch_us = true", "trigger.glitch_us = True", "a whole number from 1"),

@@ -21,9 +21,9 @@ import pytest
 from appliance.core.errors import LineError
 from appliance.core.types import EPOCH_BITS, EdgeKind, Frames
 from appliance.io.gpio_lines import Lines
+from appliance.io.link import REPLY_MS
 from appliance.io.robot_link import Command, SerialSink, checksum, sentence
 from appliance.io.trigger import GpioTrigger
-from appliance.io.usb_link import REPLY_MS
 from appliance.io.usb_sensor import UsbSensor
 from tests import backends
 from tests.backends import Backend, Skin, mocks, remote, skins

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from appliance.core.config import OutputConfig, SerialConfig
 from appliance.core.errors import ConfigError
 from appliance.core.types import Status, Verdict
-from appliance.io import robot_link as sink_room
+from appliance.io import serial_port
 from appliance.io.gpio_lines import Lines
 from appliance.io.robot_link import (
     COMMANDS,
@@ -197,7 +197,7 @@ def is_shut(port: int) -> bool:
 def test_a_port_is_kept_from_others(monkeypatch: pytest.MonkeyPatch):
     """While the box has a port the kernel refuses it to others; after closing it is free, even if another had it
     open."""
-    monkeypatch.setattr(sink_room, "PSEUDO_TERMINALS", range(0))
+    monkeypatch.setattr(serial_port, "PSEUDO_TERMINALS", range(0))
     with pseudo_terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
         sink = sink_on(name)
         assert not is_shut(other.fileno())

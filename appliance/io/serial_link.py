@@ -1,0 +1,145 @@
+"""A readout board on a serial port: finds and opens the port, sends bytes, reads what has come.
+
+In: the path of a port or its USB ids. Out: bytes, or a SensorError that explains what failed. With `request` it carries
+PROTOCOL.md, part 1; skins of other protocols use `write` and `read` alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import termios
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import serial
+
+from appliance.core.clock import Clock
+from appliance.core.config import SensorConfig
+from appliance.core.errors import SensorAbsent, SensorBusy, SensorDenied, SensorError, SensorLost
+from appliance.io import packets, serial_port
+from appliance.io.link import REPLY_MS, reply_to
+from appliance.io.serial_port import PortInfo
+
+COLLECT_NS = 4_000_000
+"""Least time between two reads: a port at 2 Mbaud is ready some thousand times a second, and every turn of the loop
+costs the box more than the bytes of one. Times of frames do not suffer, since the fit takes the promptest arrivals."""
+
+
+class SerialLink:
+    """An opened serial port: requests are single bytes, replies come as packets."""
+
+    def __init__(self, path: str, baud: int, clock: Clock, opener: Callable[..., Any] = serial.Serial) -> None:
+        self.path, self._clock = path, clock
+        self._read_ns = 0
+        try:
+            self._port = serial_port.open_alone(path, baud, opener)
+        except (OSError, ValueError) as e:  # SerialException is an OSError
+            raise _refused(path, e) from e
+        _be_prompt(self._port)
+
+    def request(self, request: packets.Request, length: int) -> bytes:
+        """Send a request byte; returns the reply, b"" for length 0. Raises SensorError."""
+        self.write(bytes([request]))
+        return reply_to(request, self.read, self._clock) if length else b""
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`. Raises SensorLost if the port is gone or takes nothing for REPLY_MS."""
+        while data:
+            try:
+                if not select.select([], [self._port.fileno()], [], REPLY_MS / 1000)[1]:
+                    raise SensorLost(f"{self.path} takes no bytes; unplug and replug the skin")
+                data = data[os.write(self._port.fileno(), data) :]
+            except BlockingIOError:
+                continue
+            except OSError as e:
+                raise _lost(self.path, e) from e
+
+    def read(self, size: int, timeout_ms: int) -> bytes:
+        """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorLost if the port is gone."""
+        try:
+            if not select.select([self._port.fileno()], [], [], timeout_ms / 1000)[0]:
+                return b""
+            self._clock.sleep_until(self._read_ns + COLLECT_NS)
+            data = os.read(self._port.fileno(), size)
+        except BlockingIOError:
+            return b""
+        except OSError as e:
+            raise _lost(self.path, e) from e
+        if not data:
+            raise _lost(self.path, OSError(errno.ENODEV, "end of file"))
+        self._read_ns = self._clock.now_ns()
+        return data
+
+    def close(self) -> None:
+        """Release the port. A board of PROTOCOL.md is asked to stop first."""
+        serial_port.close(self._port)
+
+
+class BoardLink(SerialLink):
+    """A serial port with a board that speaks PROTOCOL.md."""
+
+    def close(self) -> None:
+        """Ask the board to stop, unless it is gone, and release the port."""
+        with contextlib.suppress(SensorError):
+            self.request(packets.Request.STOP, 0)
+        super().close()
+
+
+def open_board(
+    config: SensorConfig, clock: Clock, ports: Callable[[], Iterable[PortInfo]] = serial_port.ports
+) -> BoardLink:
+    """Open the configured port, or the one with the configured USB ids. Raises SensorError."""
+    path = config.port or find(((config.vendor_id, config.product_id),), config.serial, ports())
+    return BoardLink(path, config.baud, clock)
+
+
+def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[PortInfo]) -> str:
+    """The path of the first port with one of the USB `ids` (vendor, product) and this serial number, "" for any.
+
+    Raises SensorAbsent naming the ports that there are.
+    """
+    ids, ports = list(ids), list(ports)
+    for port in ports:
+        if (port.vendor_id, port.product_id) in ids and serial_number in ("", port.serial):
+            return port.path
+    wanted = " or ".join(f"{vendor:04x}:{product:04x}" for vendor, product in ids)
+    wanted = f"with USB ids {wanted}" if ids else "named"
+    number = f" and serial number {serial_number}" if serial_number else ""
+    there = ", ".join(map(str, ports)) or "none"
+    raise SensorAbsent(
+        f"no serial port {wanted}{number}; there are: {there}; plug the skin in, or name its port with sensor.port"
+    )
+
+
+def _be_prompt(port: Any) -> None:
+    """Let a USB adapter pass on what it has without collecting it for 16 ms, and leave DTR up when the port is closed:
+    many boards restart when it rises, and would never be ready for a program that tries again."""
+    with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
+        port.set_low_latency_mode(True)
+    with contextlib.suppress(termios.error, OSError):
+        modes = termios.tcgetattr(port.fileno())
+        modes[2] &= ~termios.HUPCL
+        termios.tcsetattr(port.fileno(), termios.TCSANOW, modes)
+
+
+def _refused(path: str, e: Exception) -> SensorError:
+    """Why a port could not be opened."""
+    code = getattr(e, "errno", None)
+    if serial_port.is_held(e):
+        return SensorBusy(f"port held by another program: {path} (errno {code}); end it, `fuser {path}` shows which")
+    if code == errno.EACCES:
+        return SensorDenied(f"{path} may not be opened by this user (errno 13); add the user to group dialout")
+    if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        return SensorAbsent(f"no port {path} (errno {code}); plug the skin in, or correct sensor.port")
+    return SensorLost(f"{path} cannot be opened: {e}; check sensor.port and the baud rate of its profile")
+
+
+def _lost(path: str, e: OSError) -> SensorLost:
+    if e.errno in (errno.ENODEV, errno.EIO, errno.ENXIO):
+        return SensorLost(
+            f"the skin on {path} was unplugged (errno {e.errno}); plug it in again, it is taken up by itself"
+        )
+    return SensorLost(f"{path} failed: {e}; trying again, check its cable if this stays")
