@@ -14,7 +14,7 @@ from appliance.alignment.view import Display, View
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import SensorConfig
 from appliance.core.devices import Devices
-from appliance.core.types import Frames
+from appliance.core.types import Frames, normal
 from appliance.io.usb_sensor import UsbSensor
 from appliance.signal.contact import IN_PLACE, Point, advice, centre
 
@@ -29,7 +29,7 @@ SHOWN = 10
 class Alignment:
     """Reads the skin and makes Views of it.
 
-    The unloaded value of a taxel is the lowest it has been since the skin was connected: so nobody has to press a key,
+    Of a skin with several axes it looks at the normal one alone. The unloaded value of a taxel is the lowest it has been since the skin was connected: so nobody has to press a key,
     and a finger that lay on the skin at the start is noticed when it is lifted.
     """
 
@@ -43,7 +43,7 @@ class Alignment:
 
     def _reset(self) -> None:
         """Start anew: this may be another skin than before."""
-        self._latest = Frames.empty(self._model.format).taxels
+        self._latest = normal(Frames.empty(self._model.format).taxels, 1)
         self._lowest = np.full(self._shape, np.inf)
         self._full = SHOWN * abs(self._model.manifest.thresholds.contact)
         self._enumerations = self._sensor.counters.enumerations
@@ -53,7 +53,7 @@ class Alignment:
         frames = self._sensor.read()
         if self._sensor.counters.enumerations != self._enumerations:
             self._reset()
-        self._latest = np.concatenate([self._latest, frames.taxels])[-self._span :]
+        self._latest = np.concatenate([self._latest, normal(frames.taxels, 1)])[-self._span :]
 
     def close(self) -> None:
         """Release the skin."""

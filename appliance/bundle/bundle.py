@@ -1,8 +1,8 @@
 """The model bundle. In: a folder. Out: a checked Bundle. No file is used before its hash and form were checked.
 
 A bundle is `manifest.json`, `model.onnx`, `golden.npz` and, if the manifest has `known`, `means.npz`. The graph takes
-the sensor's raw counts as `sweep` [1, T, R, C] (or float32 features [1, n] as `features`, if the manifest's input is
-one of features.KINDS); all scaling is inside it. Its outputs by name:
+the sensor's raw counts as `sweep` [1, T, R, C], or [1, T, R, C, A] where a taxel has several axes (or float32 features
+[1, n] as `features`, if the manifest's input is one of features.KINDS); all scaling is inside it. Its outputs by name:
 
 - `logits` float32 [1, K0] for the K0 labels of training;
 - `early` float32 [1, D, K0], optional: row d (from 0) holds the logits after (d + 1) / (D + 1) of the window;
@@ -107,7 +107,8 @@ class Classes:
 class Bundle:
     """A bundle whose files agree with its manifest.
 
-    id: see `identity`. model: the bytes of model.onnx. golden: raw counts [G, T, R, C]; golden_logits: float32 [G, K].
+    id: see `identity`. model: the bytes of model.onnx. golden: raw counts [G, T, R, C] or [G, T, R, C, A];
+    golden_logits: float32 [G, K].
     classes: the class means, None if the manifest has no `known`.
     """
 

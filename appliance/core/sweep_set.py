@@ -25,8 +25,8 @@ Set = TypeVar("Set", bound="SweepSet")
 class SweepSet:
     """N sweeps with their labels and groups.
 
-    samples: raw counts [N, T, R, C] of one of DATA_TYPES. labels: int [N], indices into `materials`. rate_hz: frames
-    per second. groups: int [N] each; sweeps with the same number in `recording` are parts of one recording. source: the
+    samples: raw counts [N, T, R, C] or [N, T, R, C, A] of one of DATA_TYPES. labels: int [N], indices into `materials`.
+    rate_hz: frames per second. groups: int [N] each; sweeps with the same number in `recording` are parts of one recording. source: the
     name used in messages. Raises FormatError naming `source` and what is wrong.
     """
 
@@ -39,9 +39,10 @@ class SweepSet:
 
     def __post_init__(self) -> None:
         x, n = self.samples, len(self.materials)
-        if x.ndim != 4 or 0 in x.shape:
+        if x.ndim not in (4, 5) or 0 in x.shape or x.shape[4:] == (1,):
             raise self._error(
-                f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], none empty"
+                f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], none empty, "
+                "and axes after them only where there are several"
             )
         if x.dtype.name not in DATA_TYPES:
             raise self._error(f"samples are {x.dtype}; use one of {', '.join(DATA_TYPES)}{_conversion(x)}")
@@ -76,8 +77,8 @@ class SweepSet:
     @property
     def format(self) -> SweepFormat:
         """The format of each sweep."""
-        _, window, rows, cols = self.samples.shape
-        return SweepFormat(rows, cols, self.rate_hz, window, self.samples.dtype.name)
+        _, window, rows, cols, *axes = self.samples.shape
+        return SweepFormat(rows, cols, self.rate_hz, window, self.samples.dtype.name, *axes)
 
     def group(self, name: str) -> Array:
         """Group `name`, int [N]; without a group `recording` each sweep is its own. Raises FormatError."""

@@ -129,6 +129,14 @@ def shape(rows: int, cols: int, axes: int) -> tuple[int, ...]:
     return (rows, cols) if axes == 1 else (rows, cols, axes)
 
 
+def normal(counts: NDArray[Any], before: int) -> NDArray[Any]:
+    """The axis along the skin's normal alone, the last one: [..., R, C] of [..., R, C] or [..., R, C, A].
+
+    before: dimensions before the rows, 0 for one frame, 1 for a window.
+    """
+    return counts[..., -1] if counts.ndim == before + 3 else counts
+
+
 def shown(shape: Sequence[int]) -> str:
     """A shape for a person: "3x3", "3x3x3"."""
     return "x".join(map(str, shape))

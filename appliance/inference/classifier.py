@@ -79,8 +79,7 @@ class Classifier:
         self._clock, self._fusion, self._max_sweeps = clock, fusion, max_sweeps
         self._object = 0
         self._scores: list[NDArray[np.float64]] = []  # of the object's sweeps so far
-        f = bundle.format
-        self.tare: NDArray[np.float64] = np.zeros((f.rows, f.cols))
+        self.tare: NDArray[np.float64] = np.zeros(bundle.format.shape)
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
         rule = bundle.manifest.moved
@@ -95,11 +94,11 @@ class Classifier:
         return {"how": self._fusion, "sure": self.min_probability, "most_sweeps": self._max_sweeps}
 
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
-        """Logits float32 [K] of one window of raw counts [T, R, C]."""
+        """Logits float32 [K] of one window of raw counts [T, R, C] or [T, R, C, A]."""
         return self._classify(taxels)[0]
 
     def early(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
-        """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C]; the model must have this
+        """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C] or [T, R, C, A]; the model must have this
         output.
 
         Frames that have not come yet may have any value: rows that depend on them are meaningless.
@@ -111,7 +110,7 @@ class Classifier:
         self._model.prepare("early")
 
     def embedding(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
-        """Embedding float32 [r] of one window of raw counts [T, R, C]; the model must have this output."""
+        """Embedding float32 [r] of one window of raw counts [T, R, C] or [T, R, C, A]; the model must have this output."""
         return self._run(("embedding",), taxels)[0]
 
     def self_test(self) -> float:

@@ -52,7 +52,7 @@ def admit(old: Bundle, label: str) -> None:
 
 
 def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
-    """`old` with `label` as its last label, learned from `sweeps`: raw counts [n, T, R, C]. Deterministic.
+    """`old` with `label` as its last label, learned from `sweeps`: raw counts [n, T, R, C] or [n, T, R, C, A]. Deterministic.
 
     The early heads do not know the label, so that the new bundle gives no early answers; the figures of `old` no longer
     hold and are removed. Other problems are reported as warnings and do not prevent the enrolment.
@@ -62,12 +62,7 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     m, f = old.manifest, old.format
     assert old.classes
     assert m.known
-    if (
-        sweeps.ndim != 4
-        or not len(sweeps)
-        or sweeps.shape[1:] != (f.window, f.rows, f.cols)
-        or sweeps.dtype != f.numpy_type
-    ):
+    if sweeps.shape[1:] != (f.window, *f.shape) or not len(sweeps) or sweeps.dtype != f.numpy_type:
         raise FormatError(f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}")
     run = Classifier(old, SystemClock())
     z, golden = (np.stack([run.embedding(s) for s in of]).astype(np.float64) for of in (sweeps, old.golden))

@@ -146,7 +146,7 @@ class SweepCutter:
             self._open.answered = True
 
     def latest(self, n: int) -> NDArray[Any] | None:
-        """The newest `n` frames as raw counts [n, R, C], for a tare; None if some of them are missing."""
+        """The newest `n` frames as raw counts [n, R, C] or [n, R, C, A], for a tare; None if some of them are missing."""
         window = np.arange(self._newest - n + 1, self._newest + 1)
         slots = window % self._size
         return self._taxels[slots] if self._newest >= 0 and (self._seq[slots] == window).all() else None

@@ -18,7 +18,7 @@ from appliance.core.errors import ApplianceError
 from appliance.core.health import Health
 from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
-from appliance.core.types import Status, Sweep, SweepFormat, Verdict
+from appliance.core.types import Status, Sweep, SweepFormat, Verdict, normal
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.io.robot_link import Command, Port, sentence
@@ -93,7 +93,7 @@ class Box:
         return self._classifier.bundle.format
 
     def newest_frame(self) -> NDArray[Any] | None:
-        """The newest frame [R, C] of raw counts, None before the first."""
+        """The newest frame [R, C] or [R, C, A] of raw counts, None before the first."""
         frames = self._cutter.latest(1)
         return None if frames is None else frames[0]
 
@@ -210,7 +210,7 @@ class Box:
         """What belongs into the sidecar of a recorded sweep beside its frames, as it is now: for JSON.
 
         device: the board's name, serial number and firmware, None before it was asked. clock: see DeviceClock.quality.
-        tare: [R, C] raw counts.
+        tare: [R, C] or [R, C, A] raw counts.
         """
         who = self._sensor.identity
         return {
@@ -261,7 +261,7 @@ class Box:
         if frames is None or self._cutter.sweeping or self._sensor.state != "streaming":
             raise ApplianceError(f"tare needs {TARE_S} s of signal without loss and outside a sweep; try again")
         self._classifier.tare = frames.mean(axis=0, dtype=np.float64)
-        return [f"largest {self._classifier.tare.max():.1f} digits"]
+        return [f"largest {normal(self._classifier.tare, 0).max():.1f} digits"]
 
     def _new_object(self) -> list[object]:
         self._cutter.new_object()

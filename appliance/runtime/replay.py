@@ -72,7 +72,7 @@ class KeptSweep:
     """A kept sweep with the content of its sidecar; older sidecars hold less.
 
     object: the folder, run and object number that fused sweeps share. rule: None where the sidecar has none. tare:
-    [R, C] raw counts. bundle: its id, or "". verdict: as `Verdict.as_dict` gives it, or empty.
+    [R, C] or [R, C, A] raw counts. bundle: its id, or "". verdict: as `Verdict.as_dict` gives it, or empty.
     """
 
     sweep: Sweep
@@ -89,7 +89,7 @@ class KeptSweep:
         sweep, fmt = load(path)
         about = sidecar(path)
         try:
-            tare = np.broadcast_to(np.asarray(about.get("tare", 0.0), np.float64), (fmt.rows, fmt.cols))
+            tare = np.broadcast_to(np.asarray(about.get("tare", 0.0), np.float64), fmt.shape)
             rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
             touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))

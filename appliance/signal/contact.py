@@ -4,11 +4,12 @@ one.
 Pure functions. The classifier calls them once per sweep, to detect that the skin has moved; `alignment` many times per
 second, to show it to a person. Taxels measure a contact only where they are: if it extends beyond the skin's edge, its
 centre is computed too close to the skin's middle. The distance is then too small but never has the wrong sign, so that
-a person who follows it and measures again arrives.
+a person who follows it and measures again arrives. Of a skin with several axes only the normal one counts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import BundleError
+from appliance.core.types import normal
 
 MOST_POSITIONS, MOST_MM = 1000, 1e6
 """Largest number of positions in a bundle, since each sweep is compared with all of them; largest length, 1 km."""
@@ -75,13 +77,15 @@ def _length(value: Any) -> bool:
 def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> Point | None:
     """The contact's centre (row, column) in taxels, 0.0 at the centre of taxel 1.1; None without contact.
 
-    taxels: raw counts [T, R, C] of a window or of the latest frames. tare: mean counts [R, C] of the unloaded skin.
+    taxels: raw counts [T, R, C] or [T, R, C, A] of a window or of the latest frames. tare: mean counts [R, C] or
+    [R, C, A] of the unloaded skin.
     contact: counts above the tare from which a taxel is loaded (the bundle's threshold).
     The centre is the mean position of the loaded taxels, weighted by their mean load: the centre of pressure of the
     part that the skin covers. A fit of the contact's shape would have no bias towards the skin's middle, but the gains
     of taxels differ between attachments, and that causes larger errors in a fit. A saturated taxel counts at full
     scale.
     """
+    taxels, tare = normal(taxels, 1), normal(tare, 0)
     series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # contiguous: twice as fast to reduce
     load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
     load = fill_dead_taxels(np.where(np.isfinite(load) & (load >= contact), load, 0))
@@ -108,8 +112,8 @@ def fill_dead_taxels(load: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(load > 0, load, filled)
 
 
-def advice(offset: Point, shape: tuple[int, int]) -> str:
-    """Describes the offset (mm along rows, columns) from a trained position on a skin of `shape` taxels, for example
+def advice(offset: Point, shape: Sequence[int]) -> str:
+    """Describes the offset (mm along rows, columns) from a trained position on a skin of `shape` [R, C], for example
     "2.1 mm too far towards row 4". The larger direction comes first; one below LEAST_PART is left out."""
     least = LEAST_PART * np.hypot(*offset)
     parts = [
@@ -122,9 +126,9 @@ def advice(offset: Point, shape: tuple[int, int]) -> str:
 
 
 def moved(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, positions: ContactPositions) -> str:
-    """ "" if the contact of a sweep [T, R, C] is at a trained position, otherwise for example "moved 2.1 mm too far
-    towards row 4". tare, contact: as for `centre`."""
+    """ "" if the contact of a sweep is at a trained position, otherwise for example "moved 2.1 mm too far towards row 4".
+    taxels, tare, contact: as for `centre`."""
     found = centre(taxels, tare, contact)
     if found is None or positions.within(offset := positions.offset(found)):
         return ""
-    return f"moved {advice(offset, tare.shape)}"
+    return f"moved {advice(offset, tare.shape[:2])}"

@@ -1,6 +1,9 @@
 """Features of the paper's classical classifiers, its equations 1 to 5. In: raw counts of one window, frame rate. Out:
 taxel weights [M], L-features [3] and H-features [short windows x bands]. Pure functions of numpy arrays.
 
+Raw counts are [T, R, C], or [T, R, C, A] where a taxel has several axes: each is then a time series of its own, and the
+taxel's weight comes from its normal axis.
+
 Any grid, rate and data type is possible. Where the paper's formulas leave a choice, the docstring says what was chosen.
 Two rules hold for every rate. A band ends at the Nyquist frequency if that is below its upper edge. A band without any
 bin of the spectrum gets the first bin above its lower edge, or the highest bin.
@@ -33,18 +36,22 @@ SILENT = 1e-12
 
 
 def taxel_weights(taxels: NDArray[Any]) -> Array:
-    """Eq. 4: each taxel's share of the activation, [M] with M = R * C and sum 1. taxels: raw counts [T, R, C].
+    """Eq. 4: each taxel's share of the activation, [M] with M = R * C * A and sum 1. taxels: raw counts.
 
     A taxel with a negative mean (int16 after a tare) counts as not touched and gets weight 0, so that no weight is
     negative or grows without bound where means cancel. If no mean is positive all weights are 1 / M.
     Raises FormatError for an array that is no sweep.
     """
-    return time_series.weights(time_series.of(taxels))
+    return time_series.weights(time_series.of(taxels), axes(taxels))
+
+
+def axes(taxels: NDArray[Any]) -> int:
+    """Number of axes of each taxel in raw counts [T, R, C] or [T, R, C, A]."""
+    return taxels.shape[3] if taxels.ndim == 4 else 1
 
 
 def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
-    """Eq. 1 to 3: [roughness in log(counts^2), c1 in Hz, c2 in Hz]. taxels: raw counts [T, R, C]; rate_hz: frames per
-    second.
+    """Eq. 1 to 3: [roughness in log(counts^2), c1 in Hz, c2 in Hz]. taxels: raw counts; rate_hz: frames per second.
 
     A linear trend is removed from each taxel, so that drift does not leak into the low bands. A centroid is the
     power-weighted mean frequency of each taxel in the band, averaged with the weights of eq. 4. The mean power divides
@@ -55,7 +62,7 @@ def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
     time_series.check_rate(rate_hz)
     frames = x.shape[1]
     power = np.maximum(time_series.power(time_series.detrended(x), frames), FLOOR)
-    weights = time_series.weights(x)
+    weights = time_series.weights(x, axes(taxels))
     first, last = _bins(HIGH_HZ, frames, rate_hz)
     roughness = np.log(power[:, first : last + 1].sum() / max(last - first, 1))
     centroids = [_centroid(power, weights, band, frames, rate_hz) for band in (HIGH_HZ, LOW_HZ)]
@@ -79,7 +86,7 @@ def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Ar
     """Eq. 5: power over time and frequency, float64 [l * q] for l short windows and q bands (`h_shape`), 0 to 1, no
     unit.
 
-    taxels: raw counts [T, R, C]; rate_hz: frames per second; window: "rect" is the paper's, "hann" leaks less.
+    taxels: raw counts; rate_hz: frames per second; window: "rect" is the paper's, "hann" leaks less.
     Short window l starts with the first frame at or after l * 0.05 s. The mean of its frames is subtracted before the
     window function is applied. Taxels are added with the weights of eq. 4, and each short window is divided by its sum
     over q: it sums to 1, or is 0 if silent. Raises FormatError as `h_shape`, for an array that is no sweep, and for an
@@ -93,7 +100,7 @@ def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Ar
     power = time_series.power(cut, frames)[:, :, : top + 1]
     power[:, :, 0] = 0.0
     total = np.zeros((count, 2 * bands))
-    total[:, : top + 1] = np.tensordot(time_series.weights(x), power, 1)
+    total[:, : top + 1] = np.tensordot(time_series.weights(x, axes(taxels)), power, 1)
     paired = total.reshape(count, bands, 2).sum(axis=2)
     normalised: Array = paired / np.maximum(paired.sum(axis=1, keepdims=True), SILENT)
     return normalised.ravel()
@@ -105,14 +112,14 @@ KINDS: Kinds = MappingProxyType({"L": l_features, "H": h_features})
 
 
 def compute(kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS) -> NDArray[np.float32]:
-    """Feature set `kind` (of `kinds`) of raw counts [T, R, C] at `rate_hz`: float32 [n]. Raises FormatError."""
+    """Feature set `kind` (of `kinds`) of raw counts at `rate_hz`: float32 [n]. Raises FormatError."""
     if kind not in kinds:
         raise FormatError(f"feature set {kind!r} is unknown; use one of {', '.join(kinds)}")
     return kinds[kind](taxels, rate_hz).astype(np.float32)
 
 
 def given(kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS) -> NDArray[Any]:
-    """Input of a graph of input `kind` for raw counts [T, R, C]: the counts if "raw", otherwise `compute`."""
+    """Input of a graph of input `kind` for raw counts: the counts if "raw", otherwise `compute`."""
     return taxels if kind == "raw" else compute(kind, taxels, rate_hz, kinds)
 
 

@@ -1,5 +1,6 @@
-"""One window as time series, the basis of all features. In: raw counts [T, R, C]. Out: float64 [M, T] with M = R * C;
-means, taxel weights, detrended series and power spectra. Pure functions of numpy arrays.
+"""One window as time series, the basis of all features. In: raw counts [T, R, C] or [T, R, C, A]. Out: float64
+[M, T] with M = R * C * A, the axes of a taxel side by side; means, taxel weights, detrended series and power spectra. Pure
+functions of numpy arrays.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ Means of unsigned counts are this small only in windows of a million frames."""
 
 
 def of(taxels: NDArray[Any]) -> Array:
-    """Raw counts [T, R, C] as one time series per taxel, row by row: float64 [M, T]. Raises FormatError for an array
-    that is no sweep or not finite."""
-    if taxels.ndim != 3 or taxels.size == 0:
-        raise FormatError(f"an array of shape {taxels.shape} is no sweep; use frames x rows x columns, none of them 0")
+    """Raw counts [T, R, C] or [T, R, C, A] as one time series per taxel and axis, row by row: float64 [M, T]. Raises
+    FormatError for an array that is no sweep or not finite."""
+    if taxels.ndim not in (3, 4) or taxels.size == 0:
+        raise FormatError(
+            f"an array of shape {taxels.shape} is no sweep; use frames x rows x columns (x axes), none of them 0"
+        )
     x = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T, np.float64)
     if not np.isfinite(x).all():
         raise FormatError("the sweep holds counts that are not a number or infinite; check how it was recorded")
@@ -46,12 +49,13 @@ def means(x: Array) -> Array:
     return mean
 
 
-def weights(x: Array) -> Array:
-    """Eq. 4 for `x` [M, T]: weights [M] that sum to 1, see `features.taxel_weights`."""
-    mean = np.maximum(means(x), 0.0)
+def weights(x: Array, axes: int = 1) -> Array:
+    """Eq. 4 for `x` [M, T]: weights [M] that sum to 1, see `features.taxel_weights`. Each of a taxel's `axes` gets the
+    same part of the taxel's weight, which is its share of the load along the normal."""
+    mean = np.maximum(means(x[axes - 1 :: axes]), 0.0)
     total = mean.sum()
-    share: Array = mean / total if total > 0 else np.full(len(x), 1 / len(x))
-    return share
+    share: Array = mean / total if total > 0 else np.full(len(mean), 1 / len(mean))
+    return share.repeat(axes) / axes
 
 
 def detrended(x: Array) -> Array:

@@ -36,39 +36,57 @@ class Finding:
     detail: str = ""
 
 
-def _taxels(mask: Any) -> str:
-    return "taxel " + " ".join(f"{r + 1}.{c + 1}" for r, c in np.argwhere(mask))
+def _taxels(mask: NDArray[np.bool_]) -> str:
+    """The taxels of a mask [R, C, A], with their axes where only some of several are meant: "taxel 1.2 and 2.3 axis 1"."""
+    named = []
+    for r, c in np.argwhere(mask.any(axis=2)):
+        axes = "" if mask[r, c].all() else " axis " + " ".join(str(a + 1) for a in np.flatnonzero(mask[r, c]))
+        named.append(f"{r + 1}.{c + 1}{axes}")
+    return "taxel " + (" " if mask.shape[2] == 1 else " and ").join(named)
 
 
 def inspect(taxels: NDArray[Any], tare: NDArray[np.float64], limits: WindowLimits) -> Finding:
-    """Check a window before it is classified. taxels: raw counts [T, R, C]; tare: counts [R, C] of the unloaded skin.
+    """Check a window before it is classified. taxels: raw counts [T, R, C] or [T, R, C, A]; tare: counts [R, C] or
+    [R, C, A] of the unloaded skin.
 
-    A loaded taxel always varies, so that a constant one is stuck. A constant unloaded taxel is dead if all its direct
-    neighbours are loaded; at the edge of the contact it may be unloaded. One that gives no numbers is always dead.
+    A taxel is loaded by its normal axis. A loaded taxel always varies, on each axis, so that a constant one is stuck. A
+    constant unloaded taxel is dead if all its direct neighbours are loaded; at the edge of the contact it may be unloaded.
+    One that gives no numbers is always dead. Shear has a sign, so that its axes are saturated at both ends.
     """
-    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # [R * C, T]: three times as fast to reduce
-    highest = series.max(axis=1)
-    still = (series.min(axis=1) == highest).reshape(tare.shape)
-    load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
+    form = (*tare.shape, 1)[:3]  # [R, C, A]
+    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # [R * C * A, T]: three times as fast to reduce
+    highest, lowest = series.max(axis=1), series.min(axis=1)
+    still = (lowest == highest).reshape(form)
+    load = series.mean(axis=1, dtype=np.float64).reshape(form) - tare.reshape(form)
     if not np.isfinite(load).all():  # possible with float32 counts; no output of the network is an answer then
         return Finding(Status.DEAD_TAXEL, _taxels(~np.isfinite(load)))
-    loaded = load >= limits.contact
+    loaded = load[..., -1:] >= limits.contact  # [R, C, 1]
     if not loaded.any():
-        return Finding(Status.NO_CONTACT, f"strongest taxel {load.max():.1f} digits")
-    full = np.zeros(tare.shape)  # share of the frames
-    if highest.max() >= limits.full_scale:  # seldom; counting takes longer than all the rest
-        full = (series >= limits.full_scale).mean(axis=1).reshape(tare.shape)
+        return Finding(Status.NO_CONTACT, f"strongest taxel {load[..., -1].max():.1f} digits")
+    full = _at_full_scale(series, highest, lowest, limits.full_scale, form)
     stuck = still & loaded & (full < 1)
     if stuck.any():
         return Finding(Status.STUCK_TAXEL, _taxels(stuck))
     if full.mean() > limits.saturated:
         return Finding(Status.SATURATED, _taxels(full > 0))
-    silent = still & ~loaded
+    silent = still[..., -1:] & ~loaded
     if silent.any():
-        dead = silent & _enclosed(loaded)
+        dead = silent & _enclosed(loaded[..., 0])[..., None]
         if dead.sum() > limits.dead_taxels:
-            return Finding(Status.DEAD_TAXEL, _taxels(dead))
+            return Finding(Status.DEAD_TAXEL, _taxels(dead & still))
     return Finding(Status.OK)
+
+
+def _at_full_scale(
+    series: NDArray[Any], highest: NDArray[Any], lowest: NDArray[Any], full_scale: float, form: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Share of the frames at full scale, as `form` [R, C, A]; on shear axes at its negative, too."""
+    full = np.zeros(form)
+    if highest.max() >= full_scale:  # seldom; counting takes longer than all the rest
+        full = (series >= full_scale).mean(axis=1).reshape(form)
+    if form[2] > 1 and lowest.reshape(form)[..., :-1].min() <= -full_scale:
+        full[..., :-1] += (series <= -full_scale).mean(axis=1).reshape(form)[..., :-1]
+    return full
 
 
 def _enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:

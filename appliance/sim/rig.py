@@ -58,7 +58,7 @@ class SkippingClock:
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """One sweep of the robot. frames: raw counts [n, R, C]. start, stop: frames at which its edges come. label: the
+    """One sweep of the robot. frames: raw counts [n, R, C] or [n, R, C, A]. start, stop: frames at which its edges come. label: the
     material. new_object: NEW OBJECT comes with the first frame."""
 
     frames: NDArray[Any]
@@ -211,7 +211,7 @@ class Board:
         return packets.pack(self._first_seq + first, device_us, self._block(first, n), flags)
 
     def _block(self, first: int, n: int) -> NDArray[Any]:
-        """Frames `first` to `first + n` of the script [n, R, C]; after its end all counts are 0."""
+        """Frames `first` to `first + n` of the script [n, R, C] or [n, R, C, A]; after its end all counts are 0."""
         if self._robot.skipped:
             begin, end = (i - self._base for i in self._robot.skipped)
             self._frames, self._robot.skipped = np.delete(self._frames, slice(begin, end), axis=0), None

@@ -39,15 +39,19 @@ def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
     Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
     """
     if name in ("skin", "rest"):
-        if fmt != skin.FORMAT:
-            raise FormatError(f"the simulated skin sends {skin.FORMAT}, the bundle wants {fmt}; use --sim replay:FILE")
-        return (tubes(seed) if name == "skin" else rests(seed)), "sim"
+        worlds = {world.format: world for world in (skin.WORLD, skin.World(shear=True))}
+        if fmt not in worlds:
+            sent = " or ".join(map(str, worlds))
+            raise FormatError(f"the simulated skin sends {sent}, the bundle wants {fmt}; use --sim replay:FILE")
+        return (tubes if name == "skin" else rests)(seed, world=worlds[fmt]), "sim"
     if name.startswith(SETS):
         return replay(Path(name.removeprefix(SETS)), fmt), "replay"
     raise ConfigError(f"--sim {name} is unknown; use skin, rest, or replay:FILE with a sweep set")
 
 
-def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = ()) -> Iterator[Act]:
+def tubes(
+    seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = (), world: skin.World = skin.WORLD
+) -> Iterator[Act]:
     """Sweeps over the six tubes in random order; each begins at another spot of its tube.
 
     sweeps: their number; None for no end. places: positions of the skin, the next one for each round of six tubes; by
@@ -55,7 +59,6 @@ def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement]
     """
     rng = np.random.default_rng(seed)
     rate = skin.FORMAT.rate_hz
-    world = skin.World()
     rounds = itertools.cycle(places or skin.placements("T-LAB", seed))
     tubes_left: list[str] = []
     for _ in itertools.count() if sweeps is None else range(sweeps):
@@ -68,10 +71,9 @@ def tubes(seed: int, sweeps: int | None = None, places: Sequence[skin.Placement]
         yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
 
 
-def rests(seed: int) -> Iterator[Act]:
+def rests(seed: int, world: skin.World = skin.WORLD) -> Iterator[Act]:
     """A finger that is lifted and put on the wooden tube again, without end; the skin is moved between the touches."""
     rng = np.random.default_rng(seed)
-    world = skin.World()
     off = round(LIFTED_S * skin.FORMAT.rate_hz)
     for dx_mm, dy_mm in itertools.cycle(RESTS_MM):
         place = skin.Placement(dx_mm, dy_mm, seed=seed)

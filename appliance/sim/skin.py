@@ -1,5 +1,6 @@
 """Simulated skin: a soft finger with a 4 x 4 tactile skin slides along a tube. In: the name of a material, the
-placement of the skin on the finger, a random generator. Out: raw counts uint8 [n, 4, 4] at 750 Hz.
+placement of the skin on the finger, a random generator. Out: raw counts uint8 [n, 4, 4] at 750 Hz; of a skin that feels
+shear, too, int16 [n, 4, 4, 3].
 
 The finger's pad is a bed of springs that is pressed on the tube. Each further effect is one function, named in
 `EFFECTS`, with its own random stream, so that `World(off=...)` removes one and leaves the others unchanged. Rows are
@@ -9,7 +10,7 @@ along the direction of sliding (x), columns across the tube (y); row 3 leads.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.random import Generator
@@ -20,12 +21,15 @@ from appliance.core.types import SweepFormat
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
-Counts = NDArray[np.uint8]
+Counts = NDArray[Any]
 Flags = NDArray[np.bool_]
 LabelledWindows = tuple[Counts, Whole, Whole]
 SetName = Literal["T-LAB", "T-REAL", "T-HARD"]
 
 FORMAT = SweepFormat(4, 4, 750.0, 1500, "uint8")
+SHEAR_FORMAT = replace(FORMAT, dtype="int16", axes=3)
+"""Of a skin with three axes: shear along the sliding, shear across it, pressure; counts of 12 bits with a sign."""
+SHEAR_FULL = 2047
 PITCH_MM, TAXEL_MM, TUBE_RADIUS_MM = 4.0, 2.5, 25.0
 STEP_MM = 30.0 / FORMAT.rate_hz  # path from one frame to the next, at 3 cm/s
 FORCE_LIMIT = 0.2  # precision of the controller: largest error of the force, as a share of the desired one
@@ -83,6 +87,8 @@ class World:
     relief_per_mm: float = 0.12  # there it follows the relief more, as the logarithm of the height
     spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
     spot_octaves: float = 0.125  # spread of pitch and vibration frequency likewise
+    shear: bool = False  # whether the skin feels shear, too
+    friction: float = 0.4  # shear over pressure, of all tubes: the paper names no coefficient
 
     def __post_init__(self) -> None:
         if unknown := self.off - set(EFFECTS):
@@ -94,6 +100,11 @@ class World:
         if name not in known:
             raise ConfigError(f"material {name!r} is unknown; use one of {', '.join(known)}")
         return known[name]
+
+    @property
+    def format(self) -> SweepFormat:
+        """Format of the skin's sweeps."""
+        return SHEAR_FORMAT if self.shear else FORMAT
 
 
 WORLD = World()
@@ -197,9 +208,21 @@ def vibration(tube: Material, x: Array, colour: Array, moving: Flags, rng: Gener
     return (shake * moving).reshape(n, 1, 1)
 
 
+def shear(pressure: Array, height: Array, y: Array, moving: Flags, world: World) -> Array:
+    """Shear along the rows, shear across, pressure: [n, 4, 4, 3] in the unit of `pressure` [n, 4, 4].
+
+    Pressure is normal to the surface, which is tilted along the rows by the slope of the relief (`height` [n, 4, 4] in mm)
+    and across by y / radius (`y` [4, 4] in mm from the tube's crest). While the finger is `moving` [n], friction adds
+    its share of the pressure, vibrations included, against the motion; at rest there is none.
+    """
+    slope = np.diff(height, axis=0, prepend=height[:1]) / (STEP_MM * world.speed)  # 0 where the finger rests
+    along = -pressure * (slope + world.friction * moving.reshape(-1, 1, 1))
+    return np.stack([along, pressure * (y / TUBE_RADIUS_MM), pressure], axis=-1)
+
+
 def noise(n: int, rng: Generator, world: World) -> Array:
-    """Effect: white noise of the readout, [n, 4, 4] in counts."""
-    return rng.standard_normal((n, 4, 4)) * (0.0 if "noise" in world.off else world.noise_counts)
+    """Effect: white noise of the readout, [n, 4, 4] or [n, 4, 4, 3] in counts."""
+    return rng.standard_normal((n, *world.format.shape)) * (0.0 if "noise" in world.off else world.noise_counts)
 
 
 def gap(x: Array, y: Array | float, world: World) -> Array:
@@ -218,13 +241,14 @@ def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
     return np.interp(force_n, newton, depth)
 
 
-def digitize(signal: Array) -> Counts:
-    """The analogue-to-digital converter: raw counts 0 to 255."""
-    return np.clip(np.rint(signal), 0, 255).astype(np.uint8)
+def digitize(signal: Array, world: World) -> Counts:
+    """The analogue-to-digital converter: raw counts 0 to 255, with shear -2047 to 2047."""
+    least, most = (-SHEAR_FULL, SHEAR_FULL) if world.shear else (0, 255)
+    return np.clip(np.rint(signal), least, most).astype(world.format.numpy_type)
 
 
 def _touch(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Counts:
-    """Raw counts [n, 4, 4] of a finger in contact. slid: path along the tube in frames [n]. moving: [n]."""
+    """Raw counts [n, 4, 4] or [n, 4, 4, 3] of a finger in contact. slid: path on the tube in frames [n]. moving: [n]."""
     of_drift, of_spot, of_texture, of_vibration, of_noise = rng.spawn(5)
     x, y = position(placement, world)
     gain, bedding, colour = attachment(placement, world)
@@ -234,7 +258,10 @@ def _touch(tube: Material, placement: Placement, rng: Generator, world: World, s
     height = bedding + texture(tube, x, np.rint(world.speed * slid).astype(np.int64), of_texture, world)
     pressure_kpa = kpa_per_mm * np.maximum(depth - gap(x, y, world) + height, 0)
     pressure_kpa *= 1 + vibration(tube, x, colour, moving, of_vibration, world)
-    return digitize(world.counts_per_kpa * gain * pressure_kpa + noise(len(slid), of_noise, world))
+    signal = world.counts_per_kpa * gain * pressure_kpa
+    if world.shear:
+        signal = shear(signal, height, y, moving, world)
+    return digitize(signal + noise(len(slid), of_noise, world), world)
 
 
 def sweep(
@@ -247,7 +274,7 @@ def sweep(
     slide_s: float = 3.0,
     after_s: float = 0.3,
 ) -> Counts:
-    """Raw counts uint8 [n, 4, 4] of a finger that rests on the tube, slides along it and rests again.
+    """Raw counts [n, 4, 4] or [n, 4, 4, 3] of a finger that rests on the tube, slides along it and rests again.
 
     The slide is in frames [rest_s * 750, (rest_s + slide_s) * 750). Raises ConfigError for an unknown material.
     """
@@ -257,13 +284,14 @@ def sweep(
 
 
 def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Counts:
-    """The middle two seconds of a slide, raw counts uint8 [1500, 4, 4]. Raises ConfigError for an unknown material."""
+    """The middle two seconds of a slide, raw counts [1500, 4, 4] or [1500, 4, 4, 3]. Raises ConfigError for an unknown
+    material."""
     return _touch(world.tube(material), placement, rng, world, np.arange(FORMAT.window), np.ones(FORMAT.window, bool))
 
 
 def idle(n: int, rng: Generator, world: World = WORLD) -> Counts:
-    """Raw counts uint8 [n, 4, 4] of a skin without contact."""
-    return digitize(noise(n, rng, world))
+    """Raw counts [n, 4, 4] or [n, 4, 4, 3] of a skin without contact."""
+    return digitize(noise(n, rng, world), world)
 
 
 def _set_rng(name: SetName, seed: int) -> Generator:
@@ -288,7 +316,8 @@ def placements(name: SetName, seed: int) -> list[Placement]:
 
 
 def sweep_set(name: SetName, seed: int, per_material: int | None = None, world: World = WORLD) -> LabelledWindows:
-    """A set of the paper: windows uint8 [N, 1500, 4, 4], labels int64 [N] into MATERIALS, positions int64 [N].
+    """A set of the paper: windows [N, 1500, 4, 4] or [N, 1500, 4, 4, 3], labels int64 [N] into MATERIALS, positions
+    int64 [N].
 
     per_material: windows of each tube at each position (default: as in the paper). Raises ConfigError for an unknown
     set.
@@ -296,7 +325,7 @@ def sweep_set(name: SetName, seed: int, per_material: int | None = None, world: 
     places = placements(name, seed)
     each = SETS[name][1] if per_material is None else per_material
     position_of, label_of = np.divmod(np.arange(len(places) * len(MATERIALS) * each) // each, len(MATERIALS))
-    samples = np.empty((len(label_of), FORMAT.window, FORMAT.rows, FORMAT.cols), np.uint8)
+    samples = np.empty((len(label_of), FORMAT.window, *world.format.shape), world.format.numpy_type)
     for i, rng in enumerate(_set_rng(name, seed).spawn(len(samples))):
         samples[i] = window(MATERIALS[label_of[i]], places[position_of[i]], rng, world)
     return samples, label_of, position_of

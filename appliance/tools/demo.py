@@ -13,6 +13,7 @@ from typing import IO, Any
 from numpy.typing import NDArray
 
 from appliance.core.clock import Clock
+from appliance.core.types import normal
 from appliance.runtime.loop import Box
 from appliance.sim.rig import Act
 from appliance.tools.score import Answer, AnswerScore
@@ -34,9 +35,9 @@ def bar(probability: float) -> str:
 
 
 def picture(frame: NDArray[Any]) -> list[str]:
-    """A frame [R, C] of raw counts as shaded cells with their numbers, two lines a row."""
+    """A frame [R, C] or [R, C, A] of raw counts, the normal axis alone, as shaded cells with their numbers, two lines a row."""
     lines = []
-    for row in frame.astype(int):
+    for row in normal(frame, 0).astype(int):
         level = [min(23, max(0, count) * 24 // BRIGHT) for count in row]
         shade = [f"\033[48;5;{232 + v}m\033[38;5;{16 if v > 11 else 250}m" for v in level]
         lines.append("  " + "".join(f"{colour}{'':6}\033[0m" for colour in shade))

@@ -1,13 +1,14 @@
 """A bundle whose answers are known by arithmetic, for tests. In: what it shall hold. Out: a Bundle, and windows for it.
 
 Its embedding is two of four taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its materials "a", "b" and
-"c" lie at (0, 0), (6, 0) and (0, 6) there.
+"c" lie at (0, 0), (6, 0) and (0, 6) there. Of a format with several axes it looks at the normal one.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from appliance.core.types import Frames, Status, Sweep, SweepFormat
 from appliance.signal.contact import ContactPositions
 
 FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
+THREE_AXES = replace(FORMAT, axes=3)
 MEANS = np.array([[0, 0], [6, 0], [0, 6]], np.float32)
 KNOWN = Known(limit=9.0, temperature=2.0)
 MOVED = Moved(limit=4.0, temperature=3.0, unsure=0.75)
@@ -30,10 +32,12 @@ OUTPUTS = ("logits", "embedding")
 
 
 def window(z1: float, z2: float, fmt: SweepFormat = FORMAT) -> np.ndarray:
-    """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves."""
+    """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves. Shear is a tenth of it."""
     level = np.array([[100 + 10 * z1, 100 + 10 * z2], [100, 100]])
     ripple = np.where(np.arange(fmt.window) % 2, 1, -1)[:, None, None]
-    return np.rint(level + ripple).astype(fmt.numpy_type)
+    normal = level + ripple
+    shear = [0.1 * level + 2 * ripple] * (fmt.axes - 1)
+    return np.rint(np.stack([*shear, normal], axis=-1)).reshape(-1, *fmt.shape).astype(fmt.numpy_type)
 
 
 def sweep(z1: float, z2: float, number: int = 1, object: int = 0, fmt: SweepFormat = FORMAT) -> Sweep:
@@ -48,11 +52,11 @@ def model(
     """The graph; each early row d is (d + 1) times the logits; an output of another name is a copy of the logits."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
-    pick = np.zeros((4, 2), np.float32)
-    pick[0, 0] = pick[1, 1] = scale
+    pick = np.zeros((4 * fmt.axes, 2), np.float32)
+    pick[fmt.axes - 1, 0] = pick[2 * fmt.axes - 1, 1] = scale
     bias = -(MEANS[:labels] ** 2).sum(1) / 2
     constants = {
-        "axes": np.array([1]), "flat": np.array([1, 4]), "pick": pick, "shift": np.float32([-10, -10]),
+        "axes": np.array([1]), "flat": np.array([1, 4 * fmt.axes]), "pick": pick, "shift": np.float32([-10, -10]),
         "weights": MEANS[:labels].T / KNOWN.temperature, "bias": bias / np.float32(KNOWN.temperature),
         "one": np.array([1, 1, labels]), "steps": np.arange(1, steps + 1, dtype=np.float32)[None, :, None],
     }  # fmt: skip
@@ -72,7 +76,7 @@ def model(
     kind = onnx.helper.np_dtype_to_tensor_dtype(fmt.numpy_type)
     graph = onnx.helper.make_graph(
         nodes, "toy",
-        [value("sweep", kind, [1, fmt.window, fmt.rows, fmt.cols])],
+        [value("sweep", kind, [1, fmt.window, *fmt.shape])],
         [value(name, 1, shapes.get(name, [1, labels])) for name in outputs],
         [array(values, name) for name, values in constants.items()],
     )  # fmt: skip

@@ -15,7 +15,7 @@ from train.models import methods
 
 Add = Callable[[str, Callable[[argparse.Namespace], None], str], argparse.ArgumentParser]
 """Adds a command: its name, the function that runs it, its description -> its parser."""
-SET = "FILE (.npz, .h5), a folder of recordings, sim:NAME[:SEED[-LAST][:SWEEPS]] or aeon:NAME; several are joined"
+SET = "FILE (.npz, .h5), a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or aeon:NAME; several are joined"
 LOG_EVERY_S = 30
 
 

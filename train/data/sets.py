@@ -21,7 +21,7 @@ from appliance.core.sweep_set import Array
 from appliance.sim import skin
 from train.data import published, readers
 
-SIMULATED = re.compile(r"sim:(?P<name>[^:]+)(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?")
+SIMULATED = re.compile(r"sim:(?P<name>[^:]+?)(?P<shear>x3)?(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?")
 CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)(.*)")
 OWN_NUMBERS = ("recording", "position", "session", "object")
 """Groups whose numbers only mean something within their set."""
@@ -149,9 +149,10 @@ class Dataset(sweep_set.SweepSet):
 
 
 def load(spec: str, seed: int = 0) -> Dataset:
-    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings, sim:NAME[:SEED[-LAST][:SWEEPS]] or aeon:NAME.
+    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or
+    aeon:NAME.
 
-    SWEEPS: per material and position. SEED-LAST: one set of several simulated scenes, each with positions of its own.
+    x3: of a skin with three axes. SWEEPS: per material and position. SEED-LAST: one set of several simulated scenes, each with positions of its own.
     seed: for a simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
     """
     if spec.startswith("sim:"):
@@ -198,14 +199,14 @@ def _simulated(spec: str, seed: int) -> Dataset:
     found, known = SIMULATED.fullmatch(spec), get_args(skin.SetName)
     if not found or found["name"] not in known:
         raise FormatError(
-            f"set {spec!r} is unknown; use sim:NAME[:SEED[-LAST][:SWEEPS]], NAME one of {', '.join(known)}"
+            f"set {spec!r} is unknown; use sim:NAME[x3][:SEED[-LAST][:SWEEPS]], NAME one of {', '.join(known)}"
         )
     name: skin.SetName = found["name"]  # type: ignore[assignment]  # one of its values, as was just checked
     first = int(found["seed"] or seed)
     each = int(found["each"]) if found["each"] else None
-    scenes = []
+    physics, scenes = skin.World(shear=bool(found["shear"])), []
     for world in range(first, int(found["last"] or first) + 1):
-        samples, labels, position = skin.sweep_set(name, world, each)
+        samples, labels, position = skin.sweep_set(name, world, each, physics)
         groups = {"position": position, "world": np.full(len(labels), world)}
         scenes.append(Dataset(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, spec))
     if not scenes:

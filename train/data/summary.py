@@ -114,7 +114,7 @@ def known() -> str:
         "FILE.npz, .h5, .hdf5   samples [N, T, R, C], labels [N], materials [K], rate_hz, group_NAME [N]",
         "FILE.h5, .hdf5         TactMat: samples [materials, repetitions, T, R, C], materials",
         "FOLDER                 what palpate record wrote and palpate-train pull fetched, and the folders in it",
-        "sim:NAME[:SEED[-LAST][:SWEEPS]]  simulated; SWEEPS of a tube at each position, SEED to LAST joined",
+        "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]  simulated; x3: three axes, SWEEPS of a tube at each position, SEED to LAST joined",
     ]
     for name, (positions, each) in skin.SETS.items():
         total = positions * each * tubes

@@ -147,6 +147,18 @@ def test_another_skin_shape(model: Bundle):
     assert any("row 2" in line and "60" in line for line in screen)
 
 
+def test_only_the_normal_axis_is_looked_at(model: Bundle):
+    """A finger on the simulated skin with shear is found where it is; shear, which goes below zero, is not shown."""
+    world = skin.World(shear=True)
+    other = replace(model, manifest=replace(model.manifest, format=world.format))
+    script_of = script.named("rest", world.format, 1)[0]
+    seen = views_of(devices.build(world.format, script_of, rig.VirtualClock(), "sim"), other)(17)
+    assert states(seen)[-2:] == ["in-place", "no-contact"]
+    last = [v for v in seen if v.state == "in-place"][-4]
+    assert (last.shape, len(last.load), len(last.load[0])) == ((4, 4), 4, 4)
+    assert last.centre == pytest.approx((6, 6), abs=0.6)
+
+
 VIEW = View(7, "sim", "default 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1", "move it", (4, 4),
             tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4)), 80.0, (3.8, 6.0), (6.0, 6.0), MIDDLE)  # fmt: skip
 

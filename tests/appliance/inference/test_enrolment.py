@@ -64,6 +64,19 @@ def test_a_label_is_added_by_arithmetic(old: Bundle, tmp_path: Path):
     assert new.files[bundle.MODEL] == old.model
 
 
+def test_a_label_for_a_skin_with_axes(tmp_path: Path):
+    """As with one axis; sweeps without the axes are refused, naming the format."""
+    old = toy_bundle.load(tmp_path / "old", fmt=toy_bundle.THREE_AXES)
+    sweeps = np.stack([toy_bundle.window(*z, fmt=toy_bundle.THREE_AXES) for z in FELT])
+    new = enrolment.enrol(old, "felt", sweeps)
+    enrolment.write(new.files, tmp_path / "new", False)
+    it = Classifier(bundle.load(tmp_path / "new"), VirtualClock())
+    assert it(toy_bundle.sweep(7, 8, fmt=toy_bundle.THREE_AXES)).label == "felt"
+    for wrong in (sweeps[..., 2], sweeps[0], sweeps[:0]):
+        with pytest.raises(FormatError, match="cannot be enrolled; the bundle wants \\[n\\] of 2x2x3 int16"):
+            enrolment.enrol(old, "felt", wrong)
+
+
 def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
     """Written, read, self-tested: equal to what `enrol` gave; it gives the new label, the old ones, and unknown."""
     new = enrolment.enrol(old, "felt", counts(*FELT))

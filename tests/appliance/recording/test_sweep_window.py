@@ -93,6 +93,20 @@ def test_odd_window():
     assert len(sweep.frames) == 101
 
 
+def test_every_axis_is_interpolated():
+    """A missing frame of a skin with three axes lies between its neighbours on each of them."""
+    fmt = SweepFormat(2, 2, 750.0, 100, "int16", 3)
+    bench = Bench(fmt)
+    whole = frames(0, 400, fmt=fmt)
+    whole.taxels[:] = np.arange(400)[:, None, None, None] * np.array([-4, 2, 10]) + np.arange(4).reshape(2, 2, 1)
+    bench.put(Frames(*(np.delete(getattr(whole, name), [200, 201], axis=0) for name in Frames.__slots__)))
+    bench.edge(EdgeKind.START, 100)
+    bench.edge(EdgeKind.STOP, 300)
+    (sweep,) = bench.done()
+    assert (sweep.status, sweep.lost) == (Status.OK, 2)
+    np.testing.assert_array_equal(sweep.frames.taxels, whole.taxels[150:250])
+
+
 @pytest.mark.parametrize("drop", [(1000,), (1000, 1001), (875,), (875, 876), (2373, 2374), (900, 905, 906, 2000)])
 def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
     """One or two missing frames, also at the window's ends: filled on the line between neighbours, counted as lost."""

@@ -60,6 +60,17 @@ def test_the_centre_of_a_contact_that_lies_on_the_skin(at: tuple[float, float]):
         assert centre(counts(noisy), tare, 5.0) == pytest.approx(at, abs=0.15)
 
 
+def test_only_the_normal_axis_of_several_counts():
+    """Shear, however large, moves no centre; the distance is that of the normal axis alone, tare included."""
+    load, tare = patch(2.5, 1.5), np.full((4, 4), 3.0)
+    flat = counts(load + tare)
+    shear = np.stack([500 * np.indices((4, 4))[0], -counts(load)[0]], axis=-1)
+    three = np.concatenate([np.broadcast_to(shear, (*flat.shape, 2)), flat[..., None]], axis=-1)
+    tares = np.stack([np.full((4, 4), 77.0), np.zeros((4, 4)), tare], axis=-1)
+    assert centre(three, tares, 5.0) == centre(flat, tare, 5.0)
+    assert moved(three, tares, 5.0, MIDDLE) == moved(flat, tare, 5.0, MIDDLE) != ""
+
+
 def test_without_contact_there_is_no_centre():
     """Below the threshold, or where a floating-point skin gives no number: None, and nothing is moved."""
     for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):

@@ -52,6 +52,19 @@ def test_a_negative_taxel_weighs_nothing() -> None:
     np.testing.assert_allclose(features.taxel_weights(x), [0.75, 0.25, 0])
 
 
+def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel() -> None:
+    """With three equal axes all features are those of one; shear alone changes no weight."""
+    x = _sweep()
+    three = np.stack([x, x, x], axis=-1)
+    np.testing.assert_allclose(features.taxel_weights(three).reshape(-1, 3).sum(axis=1), features.taxel_weights(x))
+    np.testing.assert_allclose(features.h_features(three, RATE), features.h_features(x, RATE), atol=1e-12)
+    roughness, *centroids = features.l_features(three, RATE)
+    np.testing.assert_allclose(centroids, features.l_features(x, RATE)[1:])
+    assert roughness == pytest.approx(features.l_features(x, RATE)[0] + math.log(3))
+    three[..., :2] = _sweep(seed=5)[..., None]
+    np.testing.assert_allclose(features.taxel_weights(three)[2::3], features.taxel_weights(x) / 3)
+
+
 def _l_by_the_formula(x: np.ndarray) -> list[float]:
     """Eq. 1 to 3 written out: one complex sum a bin and taxel, after scipy's removal of the trend."""
     n = np.arange(len(x))

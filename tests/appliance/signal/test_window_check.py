@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.bundle.manifest import Thresholds
-from appliance.core.types import Status
+from appliance.core.types import Status, shape
 from appliance.signal.window_check import inspect
 
 LIMITS = Thresholds(contact=10, full_scale=255, saturated=0.01)
@@ -59,6 +59,63 @@ def test_a_taxel_that_gives_no_number_is_dead(value: float):
     assert (found.status, found.detail) == (Status.DEAD_TAXEL, "taxel 1.4")
 
 
+SHEARED = np.zeros((4, 4, 3))
+THREE = Thresholds(contact=10, full_scale=2000, saturated=0.01)
+
+
+def sheared() -> np.ndarray:
+    """A window with three axes: shear of both signs, and the normal axis loaded everywhere."""
+    shear = np.random.default_rng(1).integers(-30, 30, (300, 4, 4, 2))
+    return np.concatenate([shear, moving()[..., None]], axis=-1).astype(np.int16)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "status", "detail"),
+    [
+        (np.s_[:, :, :, 2], 3, Status.NO_CONTACT, "strongest taxel 3.0 digits"),
+        (np.s_[:, 1, 2, 0], 7, Status.STUCK_TAXEL, "taxel 2.3 axis 1"),
+        (np.s_[:, 1, 2, :2], 7, Status.STUCK_TAXEL, "taxel 2.3 axis 1 2"),
+        (np.s_[:, 1, 2], 90, Status.STUCK_TAXEL, "taxel 2.3"),
+        (np.s_[:, 1, 2:, 1], 0, Status.STUCK_TAXEL, "taxel 2.3 axis 2 and 2.4 axis 2"),
+        (np.s_[:, 1, 2], 0, Status.DEAD_TAXEL, "taxel 2.3"),
+        (np.s_[:, 1, 2, 2], 0, Status.DEAD_TAXEL, "taxel 2.3 axis 3"),
+        (np.s_[:, 0, 1, 2], 2000, Status.SATURATED, "taxel 1.2 axis 3"),
+        (np.s_[:, 0, 1, 0], 2000, Status.SATURATED, "taxel 1.2 axis 1"),
+        (np.s_[:200, 0, 1, 0], -2000, Status.SATURATED, "taxel 1.2 axis 1"),
+    ],
+)
+def test_a_spoiled_axis_is_named(place, value: int, status: Status, detail: str):
+    """Each kind of fault on one axis or all of them; a taxel whose every axis is meant is named alone."""
+    taxels = sheared()
+    assert inspect(taxels, SHEARED, THREE).status is Status.OK
+    taxels[place] = value
+    found = inspect(taxels, SHEARED, THREE)
+    assert (found.status, found.detail) == (status, detail)
+
+
+def test_the_tare_of_each_axis_counts():
+    """Contact is counted from the normal axis' tare; one of shear does not matter."""
+    tare = SHEARED.copy()
+    tare[..., :2] = 500
+    assert inspect(sheared(), tare, THREE).status is Status.OK
+    tare[..., 2] = 75
+    assert inspect(sheared(), tare, THREE).status is Status.NO_CONTACT
+
+
+def test_an_axis_that_gives_no_number_is_dead():
+    """It is named with its axis, also where it is shear."""
+    taxels = sheared().astype(np.float32)
+    taxels[9, 3, 0, 1] = np.nan
+    assert inspect(taxels, SHEARED, THREE).detail == "taxel 4.1 axis 2"
+
+
+def test_negative_full_scale_of_the_normal_axis_is_no_fault():
+    """A tared skin may be pulled; the normal axis is saturated at its upper end alone, as that of a skin of one axis."""
+    taxels = sheared()
+    taxels[:, 3, 3, 2] = np.where(np.arange(300) % 2, -2000, -1999)
+    assert inspect(taxels, SHEARED, THREE).status is Status.OK
+
+
 def test_a_bundle_that_tolerates_dead_taxels():
     """As many dead taxels as the bundle allows are accepted."""
     taxels = moving()
@@ -71,8 +128,12 @@ def test_tare_counts():
     assert inspect(moving(80), np.full((4, 4), 75.0), LIMITS).status is Status.NO_CONTACT
 
 
-@given(st.integers(1, 40), st.integers(1, 5), st.integers(1, 5), st.integers(0, 255), st.integers(0, 2**32 - 1))
-def test_any_window_gets_a_status(n: int, rows: int, cols: int, spread: int, seed: int):
+@given(
+    st.integers(1, 40), st.integers(1, 5), st.integers(1, 5), st.integers(1, 4), st.integers(0, 255),
+    st.integers(0, 2**32 - 1),
+)  # fmt: skip
+def test_any_window_gets_a_status(n: int, rows: int, cols: int, axes: int, spread: int, seed: int):
     """Any counts of any shape, one frame long or constant: a status, never an error."""
-    taxels = np.random.default_rng(seed).integers(0, spread + 1, (n, rows, cols)).astype(np.uint8)
-    assert inspect(taxels, np.zeros((rows, cols)), LIMITS).status in Status
+    form = shape(rows, cols, axes)
+    taxels = np.random.default_rng(seed).integers(0, spread + 1, (n, *form)).astype(np.uint8)
+    assert inspect(taxels, np.zeros(form), LIMITS).status in Status

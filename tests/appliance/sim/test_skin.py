@@ -31,6 +31,50 @@ def centre(frames: np.ndarray) -> np.ndarray:
     return np.array([(load.sum(1) * np.arange(4)).sum(), (load.sum(0) * np.arange(4)).sum()]) / load.sum()
 
 
+SHEAR = World(shear=True)
+
+
+def test_the_normal_axis_of_a_skin_with_shear_is_that_without() -> None:
+    """Same finger, same random numbers: but for the readout's noise the pressure is the same; shear only adds axes."""
+    off = frozenset({"noise"})
+    plain, three = (skin.sweep("wood", PLACE, rng(), World(off=off, shear=shear)) for shear in (False, True))
+    assert (plain.dtype, three.dtype, three.shape) == (np.uint8, np.int16, (*plain.shape, 3))
+    np.testing.assert_array_equal(three[..., 2], plain)
+
+
+def test_friction_pulls_against_the_motion_while_the_finger_slides() -> None:
+    """Without relief the shear along the rows is 0.4 of the pressure and negative; before and after the slide it is 0."""
+    frames = skin.sweep("metal", PLACE, rng(), replace(only("position"), shear=True)).astype(float)
+    along, normal = frames[..., 0], frames[..., 2]
+    slides = slice(225, 225 + 2250)
+    assert np.abs(along[slides] + 0.4 * normal[slides]).max() <= 1
+    assert not along[:225].any()
+    assert not along[225 + 2250 :].any()
+    y = skin.position(PLACE, STILL)[1]
+    centred = skin.sweep("metal", PLACE, rng(), replace(STILL, shear=True)).astype(float)
+    assert np.abs(centred[..., 1] - centred[..., 2] * y / 25).max() <= 1
+
+
+def test_a_steeper_relief_shears_more() -> None:
+    """Shear along the rows is the pressure times the slope of the relief, that is, the change of the normal axis."""
+    world = World(off=frozenset(EFFECTS) - {"texture"}, shear=True, counts_per_kpa=100.0, friction=0.0)
+    smooth, rough = (skin.window(m, Placement(), rng(), world).astype(float) for m in ("metal", "plastic rough"))
+    assert rough[..., 0].std(0).mean() > 10 * smooth[..., 0].std(0).mean()
+    along, normal = rough[:, 1, 1, 0], rough[:, 1, 1, 2]
+    assert np.corrcoef(along[1:] / normal[1:], np.diff(normal))[0, 1] < -0.9
+
+
+def test_sets_and_idle_skins_with_shear() -> None:
+    """Format, reproducibility; shear is noise around 0 without contact."""
+    samples, labels, _ = skin.sweep_set("T-HARD", 5, 1, SHEAR)
+    assert (samples.shape, samples.dtype) == ((6, 1500, 4, 4, 3), np.int16)
+    np.testing.assert_array_equal(labels, np.arange(6))
+    idle = skin.idle(3000, rng(), SHEAR)
+    assert idle.shape == (3000, 4, 4, 3)
+    assert np.abs(idle.mean(0)).max() < 0.1
+    assert SHEAR.format == replace(FORMAT, dtype="int16", axes=3)
+
+
 @pytest.mark.parametrize("material", MATERIALS)
 def test_a_sweep_rests_slides_and_rests(material: str) -> None:
     """Shape and type are the format's, and only the slide makes the taxels vibrate."""

@@ -210,7 +210,10 @@ def test_a_broken_tactmat_is_refused(tmp_path: Path):
     for more, message in (
         ({"materials": ["cork", "felt"]}, "are of 3 materials, 2 are named"),
         ({"labels": np.arange(12) % 3}, "lacks rate_hz"),
-        ({"labels": np.arange(12) % 3, "rate_hz": 1.0}, "samples have the shape \\[3, 4, 50, 4, 4\\]"),
+        (
+            {"labels": np.arange(12) % 3, "rate_hz": 1.0},
+            "labels holds int64 \\[12\\]; give one whole number for each of 3",
+        ),
     ):
         tactmat(tmp_path / "t.h5", **more)
         with pytest.raises(FormatError, match=f"^t.h5.*: .*{message}"):

@@ -30,6 +30,19 @@ def test_a_file_is_read_as_it_is_described(tmp_path: Path):
     assert (again.materials, again.rate_hz) == (s.materials, s.rate_hz)
 
 
+@pytest.mark.parametrize("name", ["s.npz", "s.h5"])
+def test_a_set_with_axes_is_read_as_it_was_written(tmp_path: Path, name: str):
+    """Counts and format, from either kind of file; parts of it keep the axes."""
+    samples = np.arange(6 * 8 * 2 * 3 * 3, dtype=np.int16).reshape(6, 8, 2, 3, 3)
+    s = sets.load(write(tmp_path / "good.npz", samples=samples))
+    assert str(s.format) == "2x3x3 int16 at 50 Hz, window 8"
+    s.save(tmp_path / name)
+    again = sets.load(str(tmp_path / name))
+    np.testing.assert_array_equal(again.samples, samples)
+    assert again.select(["material=a,b"]).format == s.format
+    assert again.without_means().samples.shape == samples.shape
+
+
 NAN = np.zeros((6, 8, 2, 3), np.float32)
 NAN[4, 7, 1, 2] = np.nan
 
@@ -41,6 +54,8 @@ NAN[4, 7, 1, 2] = np.nan
         ({"materials": None, "rate_hz": None}, "lacks materials, rate_hz"),
         ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
         ({"samples": np.zeros((6, 0, 2, 3), np.uint8)}, "none empty"),
+        ({"samples": np.zeros((6, 8, 2, 3, 1), np.uint8)}, "shape \\[6, 8, 2, 3, 1\\]; .* axes after them only where"),
+        ({"samples": np.zeros((6, 8, 2, 3, 9), np.uint8)}, "9 axes of each taxel are out of range"),
         ({"samples": np.zeros((6, 8, 2, 3))}, "samples are float64; use one of uint8.*samples.astype\\('float32'\\)"),
         ({"samples": np.full((6, 8, 2, 3), -1)}, "samples are int64; .*samples.astype\\('int16'\\)"),
         ({"samples": np.ones((6, 8, 2, 3), bool)}, "samples are bool; .*samples.astype\\('uint8'\\)"),
@@ -92,6 +107,9 @@ def test_simulated_sets_have_their_worlds():
     assert len(hard) == 60
     np.testing.assert_array_equal(hard.samples, sets.load("sim:T-HARD:6").samples)
     np.testing.assert_array_equal(real.samples[:54], skin.sweep_set("T-REAL", 5, 1)[0])
+    shear = sets.load("sim:T-HARDx3:6:1")
+    assert (len(shear), str(shear.format)) == (6, "4x4x3 int16 at 750 Hz, window 1500")
+    np.testing.assert_array_equal(shear.samples, skin.sweep_set("T-HARD", 6, 1, skin.World(shear=True))[0])
 
 
 @pytest.mark.parametrize("spec", ["sim:T-SOFT", "sim:T-REAL:x", "sim:T-REAL:1:0", "sim:", "sim:T-REAL:2-1"])
