@@ -6,6 +6,7 @@ was taken.
 
 from __future__ import annotations
 
+import select
 import time
 from collections import deque
 from itertools import pairwise
@@ -41,6 +42,11 @@ class SystemClock:
         left = t_ns - time.monotonic_ns()
         if left > 0:
             time.sleep(left / 1e9)
+
+
+def wait_readable(fd: int, timeout_s: float) -> bool:
+    """Wait until something can be read from `fd`, in real time; False where nothing came."""
+    return bool(select.select([fd], [], [], timeout_s)[0])
 
 
 class DeviceClock:

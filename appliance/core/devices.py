@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from appliance.core.clock import Clock
+from appliance.core.clock import Clock, wait_readable
 from appliance.core.config import Config
 
 
@@ -14,13 +15,14 @@ class Devices:
     """What the drivers use: the real devices, or those of a subclass (`sim.devices.SimDevices`).
 
     gpio: the module gpiod or its simulated double. backend: a pyusb backend, None for libusb. source: the name of the
-    source in sentences ("usb", "sim").
+    source in sentences ("usb", "sim"). wait: waits until a serial port can be read, at most so many seconds of `clock`.
     """
 
     clock: Clock
     gpio: Any
     backend: Any = None
     source: str = "usb"
+    wait: Callable[[int, float], bool] = wait_readable
 
     def wire(self, settings: Config) -> Config:
         """The settings with the lines and ids of these devices; the real ones are wired as configured."""

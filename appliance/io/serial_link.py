@@ -16,7 +16,7 @@ from typing import Any
 
 import serial
 
-from appliance.core.clock import Clock
+from appliance.core.clock import Clock, wait_readable
 from appliance.core.config import SensorConfig
 from appliance.core.errors import SensorAbsent, SensorBusy, SensorDenied, SensorError, SensorLost
 from appliance.io import packets, serial_port
@@ -29,10 +29,13 @@ costs the box more than the bytes of one. Times of frames do not suffer, since t
 
 
 class SerialLink:
-    """An opened serial port: requests are single bytes, replies come as packets."""
+    """An opened serial port: requests are single bytes, replies come as packets. wait: see `Devices`."""
 
-    def __init__(self, path: str, baud: int, clock: Clock, opener: Callable[..., Any] = serial.Serial) -> None:
-        self.path, self._clock = path, clock
+    def __init__(
+        self, path: str, baud: int, clock: Clock, opener: Callable[..., Any] = serial.Serial,
+        wait: Callable[[int, float], bool] = wait_readable,
+    ) -> None:  # fmt: skip
+        self.path, self._clock, self._wait = path, clock, wait
         self._read_ns = 0
         try:
             self._port = serial_port.open_alone(path, baud, opener)
@@ -60,7 +63,7 @@ class SerialLink:
     def read(self, size: int, timeout_ms: int) -> bytes:
         """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorLost if the port is gone."""
         try:
-            if not select.select([self._port.fileno()], [], [], timeout_ms / 1000)[0]:
+            if not self._wait(self._port.fileno(), timeout_ms / 1000):
                 return b""
             self._clock.sleep_until(self._read_ns + COLLECT_NS)
             data = os.read(self._port.fileno(), size)

@@ -145,6 +145,31 @@ class Robot:
         self._lines.drive(name, False, down_ns)
 
 
+class Film:
+    """The frames of a robot's acts, one after the other, as a skin of the form `fmt` sees them."""
+
+    def __init__(self, fmt: SweepFormat, robot: Robot) -> None:
+        self._robot = robot
+        self._frames = np.zeros((0, *fmt.shape), fmt.numpy_type)
+        self._base = 0  # number of the first frame in _frames
+
+    def frames(self, first: int, n: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
+        """Frames `first` to `first + n` of the script [n, *shape], asked for in order; after its end all counts are 0.
+
+        frame_ns: gives the host time at which a frame is taken; the edges of an act are driven by it.
+        """
+        if self._robot.skipped:
+            begin, end = (i - self._base for i in self._robot.skipped)
+            self._frames, self._robot.skipped = np.delete(self._frames, slice(begin, end), axis=0), None
+        while first + n > self._base + len(self._frames):
+            act = self._robot.next_act(self._base + len(self._frames), frame_ns)
+            more = np.zeros((4096, *self._frames.shape[1:]), self._frames.dtype) if act is None else act.frames
+            keep = max(0, min(first - self._base, len(self._frames)))
+            self._frames = np.concatenate([self._frames[keep:], more])
+            self._base += keep
+        return self._frames[first - self._base :][:n]
+
+
 class Board:
     """The simulated readout board (PROTOCOL.md): samples the script at its own rate, has a FIFO, sends packets.
 
@@ -160,15 +185,14 @@ class Board:
         self.skin = packets.SkinFormat(fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames, fmt.axes)
         self.present = True
         self.running = False
-        self._robot, self._clock, self._latency = robot, clock, latency
+        self._clock, self._latency = clock, latency
         self._rate = 1 + ppm * 1e-6
         self._period_ns = fmt.period_ns / self._rate
         self._origin_ns = clock.now_ns()
         self._first_seq = first_seq
         self._next = 0  # number of the next frame to send
         self._arrival_ns: int | None = None  # of the packet that begins with this frame, once drawn
-        self._frames = np.zeros((0, *fmt.shape), fmt.numpy_type)
-        self._base = 0  # number of the first frame in _frames
+        self._film = Film(fmt, robot)
 
     def frame_ns(self, i: int) -> int:
         """Host time at which frame `i` is taken."""
@@ -208,17 +232,4 @@ class Board:
         self._next, self._arrival_ns = first + n, None
         device_us = round((self.frame_ns(first) - self._origin_ns) * self._rate / 1000)
         flags = packets.Flag.OVERFLOW if late else 0
-        return packets.pack(self._first_seq + first, device_us, self._block(first, n), flags)
-
-    def _block(self, first: int, n: int) -> NDArray[Any]:
-        """Frames `first` to `first + n` of the script [n, R, C] or [n, R, C, A]; after its end all counts are 0."""
-        if self._robot.skipped:
-            begin, end = (i - self._base for i in self._robot.skipped)
-            self._frames, self._robot.skipped = np.delete(self._frames, slice(begin, end), axis=0), None
-        while first + n > self._base + len(self._frames):
-            act = self._robot.next_act(self._base + len(self._frames), self.frame_ns)
-            more = np.zeros((4096, *self._frames.shape[1:]), self._frames.dtype) if act is None else act.frames
-            keep = max(0, min(first - self._base, len(self._frames)))
-            self._frames = np.concatenate([self._frames[keep:], more])
-            self._base += keep
-        return self._frames[first - self._base :][:n]
+        return packets.pack(self._first_seq + first, device_us, self._film.frames(first, n, self.frame_ns), flags)

@@ -7,8 +7,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
 
 from appliance.core.errors import ConfigError, FormatError
 from appliance.core.sweep_set import SweepSet, load_file
@@ -49,24 +52,45 @@ def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
     raise ConfigError(f"--sim {name} is unknown; use skin, rest, or replay:FILE with a sweep set")
 
 
+class SeenTubes(Protocol):
+    """What a skin on the finger sees: the module `skin`, or the view of another skin (`skins.sweeps`)."""
+
+    @property
+    def FORMAT(self) -> SweepFormat:
+        """The form of its frames."""
+        ...
+
+    def idle(self, n: int, rng: Generator, world: skin.World = ...) -> NDArray[Any]:
+        """n frames without contact."""
+        ...
+
+    def sweep(
+        self, material: str, placement: skin.Placement, rng: Generator, world: skin.World = ..., *,
+        rest_s: float = ..., slide_s: float = ..., after_s: float = ...,
+    ) -> NDArray[Any]:  # fmt: skip
+        """A sweep over a tube."""
+        ...
+
+
 def tubes(
-    seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = (), world: skin.World = skin.WORLD
-) -> Iterator[Act]:
+    seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = (), world: skin.World = skin.WORLD,
+    seen: SeenTubes = skin,
+) -> Iterator[Act]:  # fmt: skip
     """Sweeps over the six tubes in random order; each begins at another spot of its tube.
 
     sweeps: their number; None for no end. places: positions of the skin, the next one for each round of six tubes; by
-    default one that is drawn from `seed`.
+    default one that is drawn from `seed`. seen: through which skin.
     """
     rng = np.random.default_rng(seed)
-    rate = skin.FORMAT.rate_hz
+    rate = seen.FORMAT.rate_hz
     rounds = itertools.cycle(places or skin.placements("T-LAB", seed))
     tubes_left: list[str] = []
     for _ in itertools.count() if sweeps is None else range(sweeps):
         if not tubes_left:
             tubes_left, place = [str(m) for m in rng.permutation(skin.MATERIALS)], next(rounds)
         label = tubes_left.pop()
-        off = skin.idle(round(rng.uniform(*PAUSE_S) * rate), rng, world)
-        on = skin.sweep(label, place, rng, world, rest_s=REST_S, slide_s=SLIDE_S, after_s=REST_S)
+        off = seen.idle(round(rng.uniform(*PAUSE_S) * rate), rng, world)
+        on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=SLIDE_S, after_s=REST_S)
         start = len(off) + round(REST_S * rate)
         yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
 

@@ -17,7 +17,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from appliance.core.errors import ConfigError
-from appliance.core.types import SweepFormat
+from appliance.core.types import SweepFormat, shape
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
@@ -71,6 +71,9 @@ class World:
     """
 
     off: frozenset[str] = frozenset()
+    rows: int = FORMAT.rows
+    cols: int = FORMAT.cols
+    pitch_mm: tuple[float, float] = (PITCH_MM, PITCH_MM)  # from taxel to taxel, along sliding and across
     tubes: tuple[Material, ...] = TUBES
     speed: float = 1.0  # of sliding, relative to 3 cm/s; friction vibrations keep their frequency
     force_n: float = 1.0
@@ -102,9 +105,14 @@ class World:
         return known[name]
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one frame."""
+        return shape(self.rows, self.cols, 3 if self.shear else 1)
+
+    @property
     def format(self) -> SweepFormat:
         """Format of the skin's sweeps."""
-        return SHEAR_FORMAT if self.shear else FORMAT
+        return replace(SHEAR_FORMAT if self.shear else FORMAT, rows=self.rows, cols=self.cols)
 
 
 WORLD = World()
@@ -136,23 +144,26 @@ def band(
 
 
 def position(placement: Placement, world: World) -> tuple[Array, Array]:
-    """Effect: positions of the taxels' centres on the pad, x and y [4, 4] in mm; without it the skin is centred."""
+    """Effect: positions of the taxels' centres on the pad, x and y [R, C] in mm; without it the skin is centred."""
     sits = Placement() if "position" in world.off else placement
-    step = (np.arange(4) - 1.5) * PITCH_MM
-    place = complex(sits.dx_mm, sits.dy_mm) + (step[:, None] + 1j * step) * np.exp(1j * np.deg2rad(sits.turn_deg))
+    along, across = (
+        (np.arange(n) - (n - 1) / 2) * pitch for n, pitch in zip((world.rows, world.cols), world.pitch_mm, strict=True)
+    )
+    place = complex(sits.dx_mm, sits.dy_mm) + (along[:, None] + 1j * across) * np.exp(1j * np.deg2rad(sits.turn_deg))
     return place.real, place.imag
 
 
 def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]:
-    """Effect: influence of the attachment: gains [4, 4], bedding height [4, 4] in mm, colour of vibrations [7].
+    """Effect: influence of the attachment: gains [R, C], bedding height [R, C] in mm, colour of vibrations [7].
 
     The colour is the logarithm of the gain at 6 Hz and at each octave above it, up to 375 Hz.
     """
+    grid = world.rows, world.cols
     if "attachment" in world.off:
-        return np.ones((4, 4)), np.zeros((4, 4)), np.zeros(7)
+        return np.ones(grid), np.zeros(grid), np.zeros(7)
     rng = np.random.default_rng(placement.seed)
-    gain = np.exp(world.gain_spread * (rng.standard_normal() + rng.standard_normal((4, 4))))
-    return gain, world.bedding_mm * rng.standard_normal((4, 4)), world.colour_spread * rng.standard_normal(7)
+    gain = np.exp(world.gain_spread * (rng.standard_normal() + rng.standard_normal(grid)))
+    return gain, world.bedding_mm * rng.standard_normal(grid), world.colour_spread * rng.standard_normal(7)
 
 
 def drift(n: int, rng: Generator, world: World) -> Array:
@@ -180,18 +191,18 @@ def spot(tube: Material, rng: Generator, world: World) -> Material:
 
 
 def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World) -> Array:
-    """Effect: height [n, 4, 4] in mm under the taxels, averaged over their length. slid: int64 [n], path in frames.
+    """Effect: height [n, R, C] in mm under the taxels, averaged over their length. slid: int64 [n], path in frames.
 
     Each column moves over its own track, on which the rows follow one another at the speed of sliding. A skin that
     extends beyond the pad is not pressed down there: the further forward it is, the more it follows the relief.
     """
     if "texture" in world.off:
-        return np.zeros((1, 4, 4))
+        return np.zeros((1, 1, 1))
     lead = np.rint((x - x.min()) / STEP_MM).astype(np.int64)
     n = 500 * int(np.ceil((slid[-1] + lead.max() + 1) / 500))  # a length for which the FFT is fast
     blur = np.sinc(np.fft.rfftfreq(n, STEP_MM) * TAXEL_MM)
-    track = tube.texture_mm * band(n, 4, 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM, rng, blur)
-    height: Array = np.exp(world.relief_per_mm * x.mean()) * track[np.arange(4), slid[:, None, None] + lead]
+    track = tube.texture_mm * band(n, world.cols, 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM, rng, blur)
+    height: Array = np.exp(world.relief_per_mm * x.mean()) * track[np.arange(world.cols), slid[:, None, None] + lead]
     return height
 
 
@@ -209,10 +220,10 @@ def vibration(tube: Material, x: Array, colour: Array, moving: Flags, rng: Gener
 
 
 def shear(pressure: Array, height: Array, y: Array, moving: Flags, world: World) -> Array:
-    """Shear along the rows, shear across, pressure: [n, 4, 4, 3] in the unit of `pressure` [n, 4, 4].
+    """Shear along the rows, shear across, pressure: [n, R, C, 3] in the unit of `pressure` [n, R, C].
 
-    Pressure is normal to the surface, which is tilted along the rows by the slope of the relief (`height` [n, 4, 4] in mm)
-    and across by y / radius (`y` [4, 4] in mm from the tube's crest). While the finger is `moving` [n], friction adds
+    Pressure is normal to the surface, which is tilted along the rows by the slope of the relief (`height` [n, R, C] in mm)
+    and across by y / radius (`y` [R, C] in mm from the tube's crest). While the finger is `moving` [n], friction adds
     its share of the pressure, vibrations included, against the motion; at rest there is none.
     """
     slope = np.diff(height, axis=0, prepend=height[:1]) / (STEP_MM * world.speed)  # 0 where the finger rests
@@ -221,8 +232,8 @@ def shear(pressure: Array, height: Array, y: Array, moving: Flags, world: World)
 
 
 def noise(n: int, rng: Generator, world: World) -> Array:
-    """Effect: white noise of the readout, [n, 4, 4] or [n, 4, 4, 3] in counts."""
-    return rng.standard_normal((n, *world.format.shape)) * (0.0 if "noise" in world.off else world.noise_counts)
+    """Effect: white noise of the readout, [n, R, C] or [n, R, C, 3] in counts."""
+    return rng.standard_normal((n, *world.shape)) * (0.0 if "noise" in world.off else world.noise_counts)
 
 
 def gap(x: Array, y: Array | float, world: World) -> Array:
@@ -247,9 +258,12 @@ def digitize(signal: Array, world: World) -> Counts:
     return np.clip(np.rint(signal), least, most).astype(world.format.numpy_type)
 
 
-def _touch(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Counts:
-    """Raw counts [n, 4, 4] or [n, 4, 4, 3] of a finger in contact. slid: path on the tube in frames [n]. moving: [n]."""
-    of_drift, of_spot, of_texture, of_vibration, of_noise = rng.spawn(5)
+def loaded(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Array:
+    """The readout's signal [n, R, C] or [n, R, C, 3] in counts of a finger in contact, before its noise and its converter.
+
+    slid: path along the tube in frames [n]. moving: [n].
+    """
+    of_drift, of_spot, of_texture, of_vibration = rng.spawn(4)
     x, y = position(placement, world)
     gain, bedding, colour = attachment(placement, world)
     tube = spot(tube, of_spot, world)
@@ -258,10 +272,21 @@ def _touch(tube: Material, placement: Placement, rng: Generator, world: World, s
     height = bedding + texture(tube, x, np.rint(world.speed * slid).astype(np.int64), of_texture, world)
     pressure_kpa = kpa_per_mm * np.maximum(depth - gap(x, y, world) + height, 0)
     pressure_kpa *= 1 + vibration(tube, x, colour, moving, of_vibration, world)
-    signal = world.counts_per_kpa * gain * pressure_kpa
-    if world.shear:
-        signal = shear(signal, height, y, moving, world)
-    return digitize(signal + noise(len(slid), of_noise, world), world)
+    signal: Array = world.counts_per_kpa * gain * pressure_kpa
+    return shear(signal, height, y, moving, world) if world.shear else signal
+
+
+def _touch(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Counts:
+    """Raw counts [n, R, C] or [n, R, C, 3] of a finger in contact. slid: path on the tube in frames [n]. moving: [n]."""
+    signal = loaded(tube, placement, rng, world, slid, moving)
+    return digitize(signal + noise(len(slid), rng.spawn(1)[0], world), world)
+
+
+def slide(rest_s: float, slide_s: float, after_s: float) -> tuple[Whole, Flags]:
+    """A finger that rests, slides and rests again: path in frames [n], and whether it moves [n]."""
+    rest, moving, after = (round(s * FORMAT.rate_hz) for s in (rest_s, slide_s, after_s))
+    frame = np.arange(rest + moving + after) - rest
+    return frame.clip(0, moving), (frame >= 0) & (frame < moving)
 
 
 def sweep(
@@ -278,9 +303,7 @@ def sweep(
 
     The slide is in frames [rest_s * 750, (rest_s + slide_s) * 750). Raises ConfigError for an unknown material.
     """
-    rest, slide, after = (round(s * FORMAT.rate_hz) for s in (rest_s, slide_s, after_s))
-    frame = np.arange(rest + slide + after) - rest
-    return _touch(world.tube(material), placement, rng, world, frame.clip(0, slide), (frame >= 0) & (frame < slide))
+    return _touch(world.tube(material), placement, rng, world, *slide(rest_s, slide_s, after_s))
 
 
 def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Counts:

@@ -1,0 +1,70 @@
+"""The makers' and users' own packages read the emulated skins: they see the frames that were played.
+
+The packages block while nothing comes, so each runs in a process of its own that is given a minute.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tests.factories.played_skins import Numbered, played
+
+FRAMES = 20
+READERS = {
+    "flexitac": """
+from flexitac import FlexiTacSensor
+with FlexiTacSensor(port, rows=12, cols=32, baseline=0.0) as sensor:
+    frames = [sensor.read().raw for _ in range(n)]
+""",
+    "anyskin": """
+from anyskin import AnySkinBase
+frames = [sample[1:] for sample in AnySkinBase(num_mags=5, port=port).get_data(n)]
+""",
+    "reskin": """
+from anyskin import AnySkinBase
+frames = [sample[1:] for sample in AnySkinBase(num_mags=5, port=port, burst_mode=False).get_data(n + 1)][1:]
+""",
+    "robotiq-tsf": """
+from pyrobotiqtactile import RobotiqTactileSensor
+sensor = RobotiqTactileSensor().connect(port)
+sensor.configure(update_period_ms=16)
+seen = {}  # by the skin's time: the package returns what it has whenever a byte comes, be it the same again
+while len(seen) < n:
+    frame = sensor.read_frame(timeout=10)
+    seen.update({int(frame.timestamp[0]): frame} if frame.timestamp[0] else {})
+frames = list(seen.values())
+assert all(len(f.pressure) == 2 and f.accelerometer[1].tolist() == [0, 0, 16384] for f in frames)
+frames = [f.pressure for f in frames]
+""",
+}
+"""Each skin's reader, by its own documentation. ReSkin's text has no first frame: a reader joins in the middle of a line."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READERS)
+def test_a_package_that_is_not_ours_reads_what_was_played(name: str) -> None:
+    """Every frame that it reads is one that was played, in order; only text is rounded, to two digits."""
+    end = "\nprint(json.dumps([np.asarray(f).ravel().tolist() for f in frames]))"
+    with played(name) as player:
+        program = f"import json, numpy as np\nport, n = {str(player.path)!r}, {FRAMES}\n{READERS[name]}{end}"
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr[-800:]
+    read = np.array(json.loads(done.stdout.splitlines()[-1]))
+    source = Numbered(name)
+    numbers = [_number(frame, source) for frame in read]
+    assert len(numbers) == FRAMES
+    steps = np.diff(numbers) % 199
+    assert (steps >= 1).all()
+    assert np.median(steps) == 1  # a busy machine may make the reader drop what waited too long
+
+
+def _number(frame: np.ndarray, source: Numbered) -> int:
+    """The number of the frame that was played and looks so."""
+    same = [i for i in range(199) if np.allclose(source.frame(i).ravel(), frame, rtol=0, atol=0.0051)]
+    assert len(same) == 1, f"no such frame was played: {frame[:8]}…"
+    return same[0]
