@@ -12,11 +12,13 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.cli import options
 from train.cli.options import Add
+from train.data import sets
 from train.reports import (
     bench_table,
     chart_report,
     development_experiment,
     development_report,
+    development_times,
     overview_plot,
     paper_experiment,
     plots,
@@ -40,6 +42,7 @@ def register(add: Add) -> None:
     chart.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
                      help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
     chart.add_argument("--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)")
+    chart.add_argument("--draw", action="store_true", help="run nothing: draw the page of chart.json in --out again")
     chart.add_argument("--certainty", type=Path, action="append", default=[], metavar="FILE",
                      help="results.json of palpate-train certainty, for the touch time of its method")  # fmt: skip
     development = _add_development(add)
@@ -71,6 +74,11 @@ def _add_development(add: Add) -> argparse.ArgumentParser:
     command.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
                          help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
     command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)")
+    command.add_argument("--join", type=Path, action="append", default=[], metavar="FILE",
+                         help="results.json of an earlier run, whose methods join those of this one")  # fmt: skip
+    command.add_argument(
+        "--draw", action="store_true", help="run nothing: draw the page of results.json in --out again"
+    )
     return command
 
 
@@ -92,7 +100,13 @@ def run_matrix(args: argparse.Namespace) -> None:
 
 
 def run_chart(args: argparse.Namespace) -> None:
-    """Measure, write the page to --out and print its path. Raises FormatError where nothing is left to draw."""
+    """Measure, write the page to --out and print its path; with --draw write it of what lies there.
+
+    Raises FormatError where nothing is left to draw.
+    """
+    if args.draw:
+        print(chart_report.write(args.out, chart_report.read(args.out), args.quick))
+        return
     chart, effort = (
         (chart_report.QUICK, chart_report.QUICK_EFFORT) if args.quick else (chart_report.FULL, options.effort(args))
     )
@@ -109,19 +123,44 @@ def run_chart(args: argparse.Namespace) -> None:
 
 
 def run_development(args: argparse.Namespace) -> None:
-    """Evaluate, write the page to --out and print its path. Raises FormatError where no result of ours is there."""
+    """Evaluate, time, write the page to --out and print its path; with --draw write it of what lies there.
+
+    Raises FormatError where no result of ours is there.
+    """
     quick: bool = args.quick
+    if args.draw:
+        print(development_report.write(_results(args.out / "results.json"), args.out, quick))
+        return
     names = development_experiment.QUICK_METHODS if quick else development_experiment.usual_methods()
+    cases, timed_on = development_experiment.CASES, (development_times.SET, ())
+    if quick:
+        cases, timed_on = development_experiment.QUICK, (chart_report.QUICK.train, chart_report.QUICK.only)
+    effort = development_experiment.QUICK_EFFORT if quick else options.effort(args)
+    where, log = options.where(args), options.Log()
     run = development_experiment.Development(
-        development_experiment.QUICK if quick else development_experiment.CASES,
-        tuple(args.method.split(",")) if args.method else names,
-        options.where(args), options.Log(), args.data,
-        development_experiment.QUICK_EFFORT if quick else options.effort(args), options.seeds(args),
+        cases, tuple(args.method.split(",")) if args.method else names, where, log, args.data, effort, options.seeds(args)
     )  # fmt: skip
-    figures = run.results()
-    for name, why in run.left_out.items():
+    earlier = [_results(path) for path in args.join]
+    figures = development_experiment.join(run.results(), earlier)
+    for name, why in figures["left_out"].items():
         print(f"left out: {name}: {why}")
+    if not args.kept:
+        train = sets.load(timed_on[0]).select(timed_on[1])
+        figures["times"] = development_times.measured(figures["methods"], train, run.seeds[0], where.cache, log, effort)
     print(development_report.write(figures, args.out, quick))
+
+
+def _results(path: Path) -> dict[str, Any]:
+    """What an earlier run of `development` wrote. Raises FormatError where the file has another content."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_bytes())
+        if {"methods", "runs", "cases", "results", "left_out"} <= found.keys():
+            return found
+    except OSError as e:
+        raise FormatError(f"{path} cannot be read: {e.strerror}; name the results.json of an earlier run") from e
+    except (ValueError, AttributeError):
+        pass
+    raise FormatError(f"{path} is not what palpate-train development wrote; name its results.json")
 
 
 def run_overview(args: argparse.Namespace) -> None:

@@ -28,7 +28,7 @@ from train.export.model_forms import Packed
 from train.metrics import score
 from train.models import methods
 from train.models.compact.architectures import ARCHITECTURES
-from train.models.methods import FULL_EFFORT, Effort
+from train.models.methods import FULL_EFFORT, Effort, Method
 from train.reports import chart_page, scatter
 
 Json = dict[str, Any]
@@ -215,12 +215,7 @@ class Charting:
         order = [name for name in (*self.chart.named, *self.chart.others) if name in names]
         progress = parallel.Progress(len(order), self.log)
         for method in methods.find(order, self.effort):
-            about = [sets.digest(train), method.name, method.effort, self.seeds[0]]
-            folder = (
-                cache
-                / "dots"
-                / fingerprint(about, methods.module_of(method.name), "train.export.model_forms", "train.export.pack")
-            )
+            folder = kept_folder(method, train, self.seeds[0], cache)
             if self.where.kept and not folder.exists():
                 self.left_out[method.name] = "not packed yet"
                 continue
@@ -229,6 +224,13 @@ class Charting:
             except (FormatError, BundleError) as e:
                 self.left_out[method.name] = str(e)
             progress(f"{method.name} packed")
+
+
+def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:
+    """Where the bundles of a method that was trained on these sweeps are kept."""
+    about = [sets.digest(train), method.name, method.effort, seed]
+    modules = methods.module_of(method.name), "train.export.model_forms", "train.export.pack"
+    return cache / "dots" / fingerprint(about, *modules)
 
 
 def joined(results: Sequence[Json]) -> Json:
@@ -285,6 +287,15 @@ def box_on_hard(file: Path) -> Json | None:
     except (OSError, ValueError, KeyError):
         return None
     return point if {"accuracy", "wrong_share", "network"} <= point.keys() else None
+
+
+def read(out: Path) -> list[Json]:
+    """The dots that `write` put into the folder `out`. Raises FormatError where they are not there."""
+    try:
+        dots: list[Json] = json.loads((out / "chart.json").read_bytes())
+    except (OSError, ValueError) as e:
+        raise FormatError(f"{out}/chart.json is not a chart: {e}; run the command without --draw") from e
+    return dots
 
 
 def write(out: Path, found: Sequence[Json], quick: bool = False, left_out: dict[str, str] | None = None) -> Path:

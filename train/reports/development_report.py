@@ -1,4 +1,4 @@
-"""The development page. In: the figures of development_experiment. Out: results.json, two pictures and a page.
+"""The development page. In: the figures of development_experiment. Out: results.json, pictures and a page.
 
 Nothing is computed here but means and differences of what was measured.
 """
@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.reports import html
+from train.reports import html, scatter
 from train.reports.development_experiment import EACH, OURS
-from train.reports.formatting import percent, points
+from train.reports.formatting import points
 from train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -40,6 +40,8 @@ LOOKS: tuple[Mapping[str, Any], ...] = (
     {"color": ACCENT, "linewidth": 2.0},
     {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))},
 )
+PALPATE, PEER, UNIT = scatter.OURS, "peers", "minirocket"
+"""Families of the dots; the method whose time is 1."""
 THIN: Mapping[str, Any] = {"color": GREY, "linewidth": 0.7, "alpha": 0.7}
 
 
@@ -62,19 +64,28 @@ def render(figures: Json, quick: bool = False) -> tuple[str, dict[str, str]]:
     ours = subject(table)
     names = [name for name in figures["methods"] if any(name in row for row in table.values())]
     peers = [name for name in names if name not in OURS]
-    cases = [about["case"] for about in figures["cases"] if ours in table.get(about["case"], {})]
+    there = [about for about in figures["cases"] if ours in table.get(about["case"], {})]
+    cases = [about["case"] for about in there]
+    real = [about["case"] for about in there if not about["simulated"]]
     pictures = {"accuracy": accuracy_picture({case: table[case] for case in cases}, ours, peers)}
     curves = learning_curves(figures["results"])
     if curves:
         pictures["curves"] = curve_picture(curves, ours, _most_accurate(table, peers))
-    rows = [_row(case, table[case], ours, names, peers) for case in cases]
+    means = {"real and published": mean_row(table, real, ours, names, peers)}
+    if len(cases) > len(real):
+        means["all, the simulated ones too"] = mean_row(table, cases, ours, names, peers)
+    times = figures.get("times") or {"entries": [], "left_out": {}}
+    if shown := dots(times["entries"], table, means["real and published"]["shared"]):
+        pictures["front"] = scatter.chart(shown, ("development",))
     page = html.render(
-        "development.html.j2", figures=figures, quick=quick, ours=ours, names=names, rows=rows,
-        mean=mean_row(table, cases, ours, names, peers), curves=_curve_rows(curves, names),
-        pictures={name: html.picture(svg) for name, svg in pictures.items()}, each=EACH,
+        "development.html.j2", figures=figures, quick=quick, ours=ours, names=names, means=means, times=times,
+        rows=[_row(case, table[case], ours, names, peers) for case in cases], within=within(table, cases, ours, peers),
+        curves=_curve_rows(curves, names), relative=relative_times(times["entries"], names), each=EACH,
+        pictures={name: html.picture(svg) for name, svg in pictures.items()},
         about=[[one["case"], f"{one['set']}{', '.join(['', *one['only']])}", one["protocol"], one["sweeps"],
                 one["materials"], one["digest"]] for one in figures["cases"]],
-        costs=[[name, *_costs(table, name)] for name in names],
+        costs=[[one[key] for key in ("method", "precision", "runtime", "ms_p50", "ms_p99")] for one in times["entries"]],
+        fits=[[name, _fit_s(table, name)] for name in names], missing=_missing(table, cases, names),
     )  # fmt: skip
     return page, pictures
 
@@ -105,25 +116,66 @@ def _row(case: str, row: Accuracies, ours: str, names: Sequence[str], peers: Seq
     """A line of the table. difference: ours less the best peer, in points."""
     leader = best(row, peers)
     difference = points(row[ours]["mean"] - row[leader]["mean"], sign=True) if leader else "–"
-    return {"case": case, "cells": [row.get(name) for name in names], "best": leader, "difference": difference}
+    return {"case": case, "cells": [row.get(name) for name in names], "best": leader, "difference": difference,
+            "leader": row.get(leader), "ours": row[ours]}  # fmt: skip
 
 
 def mean_row(
     table: Mapping[str, Accuracies], cases: Sequence[str], ours: str, names: Sequence[str], peers: Sequence[str]
 ) -> Json:
-    """Mean accuracies over the cases that all methods have; of the best peer on that mean, and how often ours is near.
+    """Means over those of the `cases` that ours and all peers have (`shared`); None of a method that lacks one of them.
 
-    within: cases in which ours is no more than one point below the best peer, of `of` that have a peer.
+    best: the peer with the highest of these means.
     """
-    shared = [case for case in cases if all(name in table[case] for name in names)]
-    means = {name: float(np.mean([table[case][name]["mean"] for case in shared])) for name in names if shared}
+    shared = [case for case in cases if all(name in table[case] for name in (ours, *peers))]
+    means = {name: float(np.mean([table[case][name]["mean"] for case in shared])) for name in names
+             if shared and all(name in table[case] for case in shared)}  # fmt: skip
     leader = max((name for name in peers if name in means), key=lambda name: means[name], default="")
-    gaps = [table[c][ours]["mean"] - table[c][b]["mean"] for c in cases if (b := best(table[c], peers))]
     return {
-        "shared": len(shared), "best": leader, "cells": [percent(means[name]) if means else "–" for name in names],
-        "difference": points(means[ours] - means[leader], sign=True) if leader else "–",
-        "within": sum(gap >= -0.01 - 1e-9 for gap in gaps), "of": len(gaps),
+        "shared": shared, "best": leader, "cells": [means.get(name) for name in names], "leader": means.get(leader),
+        "ours": means.get(ours), "difference": points(means[ours] - means[leader], sign=True) if leader else "–",
     }  # fmt: skip
+
+
+def within(table: Mapping[str, Accuracies], cases: Sequence[str], ours: str, peers: Sequence[str]) -> tuple[int, int]:
+    """In how many of the cases ours is no more than one point below the best peer, of those that have a peer."""
+    gaps = [table[c][ours]["mean"] - table[c][b]["mean"] for c in cases if (b := best(table[c], peers))]
+    return sum(gap >= -0.01 - 1e-9 for gap in gaps), len(gaps)
+
+
+def dots(times: Iterable[Json], table: Mapping[str, Accuracies], cases: Sequence[str]) -> list[Json]:
+    """Dots for scatter: the time of each method, and the mean of its accuracies and of the ends of their intervals.
+
+    Of `cases` that it has all; without one there is no dot.
+    """
+    found = []
+    for one in times:
+        entries = [table[case][one["method"]] for case in cases if one["method"] in table[case]]
+        if not entries or len(entries) < len(cases):
+            continue
+        accuracy = {key: float(np.mean([entry[key] for entry in entries])) for key in ("mean", "low", "high")}
+        family = PALPATE if one["method"] in OURS else PEER
+        found.append({**one, "family": family, "accuracy": {"development": accuracy}})
+    return found
+
+
+def relative_times(times: Iterable[Json], names: Sequence[str]) -> dict[str, str]:
+    """Time of a sweep with each method, in those of MiniRocket where it is quickest: "1/94" or "11"."""
+    ms: dict[str, float] = {}
+    for one in times:
+        ms[one["method"]] = min(float(one["ms_p50"]), ms.get(one["method"], np.inf))
+    unit = ms.get(UNIT)
+    return {name: _ratio(ms[name] / unit) for name in names if name in ms} if unit else {}
+
+
+def _ratio(value: float) -> str:
+    return f"1/{1 / value:.0f}" if value < 0.5 else f"{value:.2g}"
+
+
+def _missing(table: Mapping[str, Accuracies], cases: Sequence[str], names: Sequence[str]) -> dict[str, list[str]]:
+    """Of each method the cases in which it has no result."""
+    lacks = {name: [case for case in cases if name not in table[case]] for name in names}
+    return {name: those for name, those in lacks.items() if those}
 
 
 def learning_curves(results: Iterable[Json]) -> dict[str, dict[str, dict[int, Json]]]:
@@ -148,11 +200,9 @@ def _most_accurate(table: Mapping[str, Accuracies], peers: Sequence[str]) -> str
     return max(peers, key=wins.count, default="")
 
 
-def _costs(table: Mapping[str, Accuracies], name: str) -> tuple[str, str]:
-    """Times of a method over all cases: to train a fold in s, and of a sweep in ms; medians."""
-    entries = [row[name] for row in table.values() if name in row]
-    fit_s, ms = (float(np.median([entry[cost] for entry in entries])) for cost in ("fit_s", "ms_p50"))
-    return f"{fit_s:.2f}", f"{ms:.3f}"
+def _fit_s(table: Mapping[str, Accuracies], name: str) -> str:
+    """Time to train a fold in s: the median over all cases."""
+    return f"{float(np.median([row[name]['fit_s'] for row in table.values() if name in row])):.2f}"
 
 
 def accuracy_picture(table: Mapping[str, Accuracies], ours: str, peers: Sequence[str]) -> str:

@@ -38,15 +38,19 @@ LETTER = 0.56
 MARK = 3.2
 """Half of a mark, points."""
 PLACES = [(0, 10, "center"), (6, 0, "left"), (-6, 0, "right"), (0, -10, "center"), (-4, 8, "right"), (5, -8, "left"),
-          (5, 8, "left"), (-5, -8, "right")]  # fmt: skip
+          (5, 8, "left"), (-5, -8, "right"), (0, 20, "center"), (0, -20, "center"), (8, 16, "left"), (8, -16, "left"),
+          (-8, 16, "right"), (-8, -16, "right")]  # fmt: skip
 """Where a name may stand, points from its dot, and its alignment; the best first."""
-SHORT = {"paper-cnn": "paper’s CNN, raw", "paper-cnn-centred": "paper’s CNN", "minirocket": "MiniRocket",
+SHIPPED = "default"
+"""The method that the box ships: marked wherever it stands."""
+SHORT = {SHIPPED: "Palpate, as shipped", "minirocket-augmented": "MiniRocket, augmented", "quant": "QUANT", "ds-cnn": "DS-CNN",
+         "multirocket-hydra": "MultiRocket-Hydra", "paper-cnn": "paper’s CNN, raw", "paper-cnn-centred": "paper’s CNN", "minirocket": "MiniRocket",
          "tactnet2": "TactNet-II", "st-hmp": "ST-HMP"}  # fmt: skip
 Box = tuple[float, float, float, float]
 Spot = tuple[Dot, float, float, bool]
 
 
-def chart(dots: Sequence[Dot], panels: Sequence[str] = ("hard", "speed"), cost: str = "ms_p50") -> str:
+def chart(dots: Sequence[Dot], panels: Sequence[str] = ("speed", "force"), cost: str = "ms_p50") -> str:
     """Accuracy over `cost`, a panel for each of `panels` that some dot has."""
     there = [y for y in panels if placed(dots, cost, y)]
     height = HEIGHT * len(there) + FOOT
@@ -91,13 +95,14 @@ def _panel(axes: Axes, spots: Sequence[Spot], y: str, cost: str) -> None:
 
 def colour(dot: Dot, best: bool) -> str:
     """Of a dot's mark."""
-    return (ACCENT if dot["family"] == OURS else BLACK) if best else GREY
+    ours = dot["family"] == OURS
+    return (ACCENT if ours else BLACK) if best else ACCENT if dot["method"] == SHIPPED else GREY
 
 
 def _mark(axes: Axes, spot: Spot, y: str) -> None:
     dot, at, mean, best = spot
     shade, ends = colour(dot, best), dot["accuracy"][y]
-    strength = 1.0 if best else 0.55
+    strength = 1.0 if best or dot["method"] == SHIPPED else 0.55
     axes.plot([at, at], [ends["low"], ends["high"]], color=shade, linewidth=0.9, alpha=0.45 if best else 0.3)
     axes.plot(at, mean, "s" if dot["precision"] == "int8" else "o", markersize=2 * MARK, markeredgewidth=1.2,
               color=shade, markerfacecolor=shade if dot["runs_on_box"] else WHITE, alpha=strength, zorder=3 + best)  # fmt: skip
@@ -137,13 +142,14 @@ def label(dot: Dot) -> str:
 
 
 def _important(spots: Sequence[Spot]) -> Iterator[int]:
-    """Indices of the dots in the order in which they get names: the front, then the best of each family, then the rest."""
+    """Indices of the dots in the order in which they get names: what ships, the front, the best of each family, the rest."""
     families: dict[str, int] = {}
     for i, (dot, _, mean, _) in enumerate(spots):
         if mean > spots[families.setdefault(dot["family"], i)][2]:
             families[dot["family"]] = i
     front, leading = [i for i, spot in enumerate(spots) if spot[3]], list(families.values())
-    yield from dict.fromkeys([*front, *leading, *sorted(range(len(spots)), key=lambda i: -spots[i][2])])
+    shipped = [i for i, spot in enumerate(spots) if spot[0]["method"] == SHIPPED]
+    yield from dict.fromkeys([*shipped, *front, *leading, *sorted(range(len(spots)), key=lambda i: -spots[i][2])])
 
 
 def _box(x: float, y: float, dx: float, dy: float, side: str, width: float, size: float) -> Box:

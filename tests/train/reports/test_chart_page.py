@@ -92,8 +92,8 @@ def test_it_shows_all_dots_and_the_front(seen: BrowsedChart):
     """As Python found it: further right is dearer, further up more accurate; the still picture gives way."""
     there = seen.places()
     assert len(there) == len(DOTS)
-    assert seen.best() == FRONT["hard"]
-    assert seen.stairs().count("H") == len(FRONT["hard"])
+    assert seen.best() == FRONT["speed"]
+    assert seen.stairs().count("H") == len(FRONT["speed"])
     assert there[0][0] < there[2][0] < there[5][0]
     assert there[4][1] > there[0][1] > there[2][1]
     assert not seen.page.is_visible("#still")
@@ -103,7 +103,7 @@ def test_it_shows_all_dots_and_the_front(seen: BrowsedChart):
 def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: BrowsedChart, cost: str):
     """For every pair of axes the page's front is Python's."""
     before = seen.places(), seen.stairs()
-    for accuracy in ("lopo", "hard"):
+    for accuracy in ("lopo", "speed"):
         seen.page.select_option("#x", cost)
         seen.page.select_option("#y", accuracy)
         spots = pareto.placed(DOTS, cost, accuracy)
@@ -148,7 +148,7 @@ def test_filters_hide_dots_and_the_front_closes_up(seen: BrowsedChart):
     assert sorted(seen.rows()) == sorted(NAMES[i] for i in (1, 3, 4))
     seen.page.check("#precision input[value=int8]")
     seen.page.check("#family input[value=MiniRocket]")
-    assert seen.best() == FRONT["hard"]
+    assert seen.best() == FRONT["speed"]
 
 
 def test_nothing_left_is_no_trouble(seen: BrowsedChart):
@@ -184,7 +184,7 @@ def test_the_choice_is_in_the_address(seen: BrowsedChart):
     assert not seen.page.is_checked("#family input[value='L and H']")
     assert seen.page.get_attribute("th[aria-sort]", "aria-sort") == "ascending"
     seen.open("#x=nothing&y=constructor&sort=cost")
-    assert (seen.page.input_value("#x"), seen.page.input_value("#y")) == ("ms_p50", "hard")
+    assert (seen.page.input_value("#x"), seen.page.input_value("#y")) == ("ms_p50", "speed")
 
 
 def test_the_address_may_change_while_the_page_is_open(seen: BrowsedChart):
@@ -196,7 +196,7 @@ def test_the_address_may_change_while_the_page_is_open(seen: BrowsedChart):
 
 def test_the_keyboard_goes_from_dot_to_dot(seen: BrowsedChart):
     """One stop of Tab; arrows by cost, Home and End; Escape closes the tip."""
-    order = [pareto.name(spot[0]) for spot in pareto.placed(DOTS, "ms_p50", "hard")]
+    order = [pareto.name(spot[0]) for spot in pareto.placed(DOTS, "ms_p50", "speed")]
     seen.page.locator("#family input").last.focus()
     seen.page.keyboard.press("Tab")
     assert seen.tip()
@@ -232,7 +232,7 @@ def test_dots_are_named_for_those_who_do_not_see_them(seen: BrowsedChart):
 @pytest.mark.slow
 def test_the_table_is_sorted_by_what_was_chosen(seen: BrowsedChart):
     """By accuracy first, by cost when asked; the head shows which."""
-    by_accuracy = sorted(DOTS, key=lambda one: (-one["accuracy"]["hard"]["mean"], one["ms_p50"]))
+    by_accuracy = sorted(DOTS, key=lambda one: (-one["accuracy"]["speed"]["mean"], one["ms_p50"]))
     assert seen.rows() == [pareto.name(one) for one in by_accuracy]
     seen.page.locator("button[data-sort=cost]").focus()
     seen.page.keyboard.press("Enter")

@@ -228,11 +228,11 @@ def test_no_name_can_break_out_of_the_data():
 
 def test_the_picture_is_whole_and_names_do_not_collide():
     """Well-formed, twice the same, in roles of colour; no two names overlap; the family is named by size."""
-    svg = scatter.chart(DOTS, ("hard", "lopo"))
-    assert svg == scatter.chart(DOTS, ("hard", "lopo"))
+    svg = scatter.chart(DOTS, ("speed", "lopo"))
+    assert svg == scatter.chart(DOTS, ("speed", "lopo"))
     texts = list(ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text"))
     words = [node.text for node in texts]
-    assert {"1k", "20k", "MiniRocket", "T-HARD, simulated", "T-REAL, simulated"} <= set(words)
+    assert {"1k", "20k", "MiniRocket", "FabricSlide, speed", "T-REAL, simulated"} <= set(words)
     assert "var(--accent" in svg
     crowd = [dot(f"method-{i}", "float", 1 + i / 50, 0.9 + i / 1000, family="L and H") for i in range(12)]
     texts = ElementTree.fromstring(scatter.chart([*crowd, *DOTS])).iter("{http://www.w3.org/2000/svg}text")
@@ -252,7 +252,7 @@ def box(node: ElementTree.Element) -> tuple[float, float, float, float]:
 
 def test_the_front_of_the_picture_is_dark_and_the_rest_grey():
     """Ours is in the accent colour where it is on the front, grey where it is not; others dark."""
-    spots = pareto.placed(DOTS, "ms_p50", "hard")
+    spots = pareto.placed(DOTS, "ms_p50", "speed")
     shown = {pareto.name(spot[0]): scatter.colour(spot[0], spot[3]) for spot in spots}
     assert shown["compact-1k int8"] == scatter.ACCENT
     assert shown["compact-1k float"] == scatter.GREY

@@ -18,7 +18,7 @@ from train.cli.main import main
 from train.evaluation.evaluate import Where
 from train.metrics.score import Score
 from train.models import methods
-from train.reports import development_experiment, development_report
+from train.reports import development_experiment, development_report, development_times, scatter
 from train.reports.chart_report import ChartPart
 from train.reports.development_experiment import Development, DevelopmentCase
 
@@ -27,13 +27,16 @@ def test_the_page_shows_every_figure():
     """Accuracies with intervals, differences to the best peer of each line, the mean of what all have, what was left out."""
     page, pictures = development_report.render(figures())
     read = PageReader(page)
-    facts = ("one +5.0 90.0 % 85.0 – 95.0 % 80.0 % 75.0 – 85.0 % 85.0 % 80.0 – 90.0 %", "two −5.5 70.0 % 65.0 – 75.0 % –",
-             "mean of the 1 that all have +5.0 90.0 % 80.0 % 85.0 %", "in 1 of 2 lines", "quick <b>, two a window of 8 frames",
+    facts = ("one quant 85.0 % 80.0 – 90.0 % 90.0 % 85.0 – 95.0 % +5.0",
+             "one +5.0 90.0 % 85.0 – 95.0 % 80.0 % 75.0 – 85.0 % 85.0 % 80.0 – 90.0 %", "two −5.5 70.0 % 65.0 – 75.0 % –",
+             "mean of 1: real and published quant 85.0 % 90.0 % +5.0", "mean of 1: all, the simulated ones too +5.0 90.0 % 80.0 % 85.0 %",
+             "below the best peer in 1 of 2 lines, and +5.0 points from quant", "quick <b>, two: a window of 8 frames",
+             "time of a sweep of 1500x4x4, MiniRocket’s = 1 quant 2.2 1/100", "quick <b>: two",
              "one default 50.0 % 45.0 – 55.0 % – – 90.0 %", "one.npz, force<=180 leave:force 100 4 digest of one",
-             "Seeds 1, 2; commit 0123abcd; x86_64, 2 cores", "quant 1.50 0.250")  # fmt: skip
+             "default, quick <b>, quant: seeds 1, 2; commit 0123abcd; x86_64, 2 cores", "quant 1.50", "quant float onnx 22.0 44.0")  # fmt: skip
     for fact in facts:
         assert fact in read.text, fact
-    assert set(pictures) == {"accuracy", "curves"}
+    assert set(pictures) == {"front", "accuracy", "curves"}
     assert not re.search(r"[{}]|\bNone\b|\bnan\b|Markup|Undefined|mean nothing", read.text)
     assert (read.wrong, read.open) == ([], [])
     assert all(link.startswith("#") for link in read.links)
@@ -43,26 +46,25 @@ def test_the_page_shows_every_figure():
 def test_the_best_peer_of_each_line_is_bold():
     """Never ours, and another one in another line."""
     page, _ = development_report.render(figures())
-    rows = re.findall(r'<tr><td class="text">(one|two)</td><td>.*?</tr>', page, re.S)
     bold = re.findall(r'<td class="best">([\d.]+)', page)
-    assert (rows[:2], bold) == (["one", "two"], ["85.0", "75.5", "85.0"])
+    assert bold == ["85.0", "75.5", "85.0", "85.0"]  # two lines, two means
 
 
 def test_a_part_of_the_results_makes_a_page():
     """No peers: no difference; no curve: no picture of it; a case without a result of ours is left out of the table."""
-    alone = [entry("one", "compact", 0.9), entry("two", "quant", 0.7)]
-    page, pictures = development_report.render(figures(results=alone, methods=["compact", "quant"]))
+    alone = [entry("one", "compact-50k", 0.9), entry("two", "quant", 0.7)]
+    page, pictures = development_report.render(figures(results=alone, methods=["compact-50k", "quant"], times=None))
     text = PageReader(page).text
-    assert "one – 90.0 %" in text
-    assert "mean of the 0 that all have – – –" in text
+    assert "one – – 90.0 %" in text
+    assert "mean of 0: real and published – – –" in text
     assert set(pictures) == {"accuracy"}
-    assert "lines" not in text
+    assert "in 1 of" not in text
 
 
 def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
     """An error says what to do, and nothing is written."""
     with pytest.raises(
-        FormatError, match="no result of default or compact or filter-bank; run the command without --kept"
+        FormatError, match="no result of default or filter-bank or compact-50k; run the command without --kept"
     ):
         development_report.write(figures(results=[entry("one", "quant", 0.9)]), tmp_path / "page")
     assert not (tmp_path / "page").exists()
@@ -71,8 +73,7 @@ def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
 def experiment(folder: Path, *names: str, **given: Any) -> Development:
     """Two cases on tones, which lie in `folder` as a file of real sweeps; the first with a learning curve."""
     tones().save(folder / "tones.npz")
-    short = replace(tones(), samples=tones().samples[:, :7])
-    short.save(folder / "short.npz")
+    replace(tones(), samples=tones().samples[:, :7]).save(folder / "short.npz")
     cases = [DevelopmentCase("tones", ChartPart(("tones.npz",), "leave:session", real=True), curve=True),
              DevelopmentCase("short", ChartPart(("short.npz",), "split:session=0,1->2", ("material=a,c",), real=True))]  # fmt: skip
     where = Where(jobs=1, cache=folder / "cache")
@@ -121,12 +122,100 @@ def test_other_precisions_of_a_method_are_counted_with_it():
 
 
 def test_the_usual_methods_and_cases_exist():
-    """Every peer by its name; every set and protocol can be read; the page begins with tactile sweeps."""
+    """Every peer by its name; every set and protocol can be read; the page ends with simulated sweeps."""
     assert set(development_experiment.PEERS) < set(development_experiment.usual_methods())
     assert set(development_experiment.usual_methods()) <= set(methods.every())
     names = [case.name for case in development_experiment.CASES]
-    assert len(set(names)) == len(names) == 13
+    assert len(set(names)) == len(names) == 12
+    assert [case.name for case in development_experiment.CASES if case.simulated] == [names[-1]]
     assert sum(case.curve for case in development_experiment.CASES) == 2
+
+
+def test_a_run_is_joined_by_what_it_lacks_of_another():
+    """Methods in the usual order, entries once (its own), reasons only for what is still missing, and who ran when."""
+    run = figures(methods=["default"], results=[entry("one", "default", 0.9)], left_out={}, times=None)
+    others = [entry("one", "default", 0.1), entry("one", "quant", 0.8), entry("two", "minirocket", 0.7)]
+    earlier = figures(methods=["quant", "minirocket", "default"], results=others,
+                      left_out={"default, one": "was too slow", "quant, two": "too short"})  # fmt: skip
+    made = development_experiment.join(run, [earlier])
+    assert made["methods"] == ["default", "minirocket", "quant"]
+    assert [(e["case"], e["method"], e["mean"]) for e in made["results"]] == [
+        ("one", "default", 0.9), ("one", "quant", 0.8), ("two", "minirocket", 0.7)]  # fmt: skip
+    assert made["left_out"] == {"quant, two": "too short"}
+    assert made["runs"] == [*run["runs"], *earlier["runs"]]
+    assert run["methods"] == ["default"]  # as it was
+
+
+def test_a_run_of_other_sweeps_is_not_joined():
+    """The case is named."""
+    earlier = figures()
+    earlier["cases"][1]["digest"] = "other"
+    with pytest.raises(FormatError, match="'two' was of other sweeps in a run that is joined"):
+        development_experiment.join(figures(), [earlier])
+
+
+def test_the_shipped_method_is_named_even_behind_the_front():
+    """In the accent colour; so are all peers; a method that lacks a line of the mean has no dot."""
+    table = development_report.by_case([entry(c, m, a) for c in ("one", "two")
+                                        for m, a in (("default", 0.8), ("minirocket", 0.9), ("ds-cnn", 0.7))])  # fmt: skip
+    table["one"]["quant"] = entry("one", "quant", 0.99)
+    times = [{"method": name, "precision": "float", "runtime": "onnx", "runs_on_box": True, "ms_p50": ms}
+             for name, ms in (("default", 0.5), ("minirocket", 0.05), ("ds-cnn", 0.01), ("quant", 9.0))]  # fmt: skip
+    dots = development_report.dots(times, table, ["one", "two"])
+    assert [(dot["method"], dot["accuracy"]["development"]["mean"]) for dot in dots] == [
+        ("default", 0.8), ("minirocket", 0.9), ("ds-cnn", pytest.approx(0.7))]  # fmt: skip
+    assert dots[0]["accuracy"]["development"]["low"] == pytest.approx(0.75)
+    svg = scatter.chart(dots, ("development",))
+    assert all(name in svg for name in ("Palpate, as shipped", "MiniRocket", "DS-CNN"))
+    shipped = next(part for part in svg.split("<text") if "Palpate, as shipped" in part)
+    assert "--accent" in shipped
+
+
+def test_times_are_told_in_those_of_minirocket():
+    """Where it is quickest; nothing where it was not timed."""
+    times = [{"method": "minirocket", "ms_p50": 12.0}, {"method": "minirocket", "ms_p50": 10.0},
+             {"method": "default", "ms_p50": 0.1}, {"method": "quant", "ms_p50": 22.0}]  # fmt: skip
+    names = ["default", "quant", "ds-cnn"]
+    assert development_report.relative_times(times, names) == {"default": "1/100", "quant": "2.2"}
+    assert development_report.relative_times(times[2:], names) == {}
+
+
+@pytest.mark.slow
+def test_all_methods_are_timed_in_one_run(tmp_path: Path):
+    """A bundle by the box's classifier, a method of aeon in aeon; one that cannot take the sweeps is left out, with why."""
+    found = development_times.measured(
+        ["L-gauss", "quant", "spectrogram-svm"], tones(), 1, tmp_path, lambda line: None, rounds=2
+    )
+    assert [(one["method"], one["runtime"], one["runs_on_box"]) for one in found["entries"]] == [
+        ("L-gauss", "onnx", True), ("quant", "aeon", False)]  # fmt: skip
+    assert all(0 < one["ms_p50"] <= one["ms_p99"] for one in found["entries"])
+    assert list(found["left_out"]) == ["spectrogram-svm"]
+    assert found["format"] == str(tones().format)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"), [(None, "cannot be read"), ("{", "is not what"), ("[]", "is not what"), ("{}", "is not what")]
+)
+def test_what_is_no_result_is_not_joined_or_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str | None, why: str
+):
+    """A missing file, half a file and another file: the error names it, nothing is written."""
+    if text is not None:
+        (tmp_path / "results.json").write_text(text)
+    assert main(["development", "--draw", "--out", str(tmp_path)]) == FormatError.exit_code
+    shown = capsys.readouterr().err
+    assert why in shown
+    assert "results.json" in shown
+    assert not (tmp_path / "index.html").exists()
+
+
+def test_the_page_is_drawn_again_from_what_lies_there(tmp_path: Path):
+    """The same page, and nothing is run."""
+    page = development_report.write(figures(), tmp_path)
+    before = page.read_text()
+    page.unlink()
+    assert main(["development", "--draw", "--out", str(tmp_path)]) == 0
+    assert page.read_text() == before
 
 
 @pytest.mark.slow
@@ -142,10 +231,12 @@ def test_the_quick_form_writes_everything(tmp_path: Path, capsys: pytest.Capture
         "index.html",
         "accuracy.svg",
         "curves.svg",
+        "front.svg",
     }
-    assert {"commit", "machine", "seeds", "effort"} <= found.keys()
+    assert {"commit", "machine", "seeds", "effort"} <= found["runs"][0].keys()
+    assert {one["method"] for one in found["times"]["entries"]} == set(development_experiment.QUICK_METHODS)
     assert "mean nothing" in (tmp_path / "a" / "index.html").read_text()
-    assert main([*args, "--kept", "--method", "compact,L-gauss", "--out", str(tmp_path / "b")]) == 0
+    assert main([*args, "--kept", "--method", "compact-50k,L-gauss", "--out", str(tmp_path / "b")]) == 0
     again = json.loads((tmp_path / "b" / "results.json").read_text())
     assert again["results"] == [r for r in found["results"] if r["method"] != "edge-spectral"]
     assert main([*args, "--kept", "--method", "quant", "--out", str(tmp_path / "c")]) == FormatError.exit_code

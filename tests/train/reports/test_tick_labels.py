@@ -55,7 +55,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
     "long training": lambda: plots.curve([np.array([[1, 1.8], [4000, 1e-4]])], [(2500, 0.002)], "cost"),
     "certainty": lambda: uncertainty_report.render(committed("certainty/results.json")),
     "chart": lambda: scatter.chart(committed("chart/chart.json")),
-    "small chart": lambda: scatter.chart(DOTS, ("hard", "lopo")),
+    "small chart": lambda: scatter.chart(DOTS, ("speed", "lopo")),
     "stress": lambda: plots.robustness(committed("stress/results.json"), ["compact", "minirocket"]),
     "matrix": lambda: plots.matrix(committed("fabricslide/results.json")),
     "alignment": lambda: contact_plot.draw(committed("alignment/place.json")),

@@ -1,0 +1,77 @@
+"""How long a sweep takes with each method, all in turns in one process. In: methods, sweeps. Out: figures for results.json.
+
+What has a graph is packed and timed by the box's classifier, with its checks and features; what runs in a library alone is
+timed there, without checks.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import BundleError, FormatError
+from train.data.sets import Dataset
+from train.export import measure, model_forms
+from train.models import methods
+from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
+from train.reports.chart_report import kept_folder
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+Log = Callable[[str], None]
+SET = "sim:T-REAL:1"
+"""The box's own form of a sweep, on which all methods are trained to be timed."""
+ROUNDS = 20
+"""Of timing: the slowest methods take a hundred times as long as those of the chart."""
+
+
+def measured(
+    names: Sequence[str], sweeps: Dataset, seed: int, cache: Path | None, log: Log,
+    effort: Effort = FULL_EFFORT, rounds: int = ROUNDS,
+) -> Json:  # fmt: skip
+    """`entries` with `method`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep, and what was `left_out`.
+
+    Bundles are kept in `cache`, as those of the chart are.
+    """
+    entries, calls, left_out = [], {}, {}
+    with tempfile.TemporaryDirectory() as work:
+        for method in methods.find(names, effort):
+            log(f"{method.name} is trained for its time")
+            try:
+                for entry, call in _callable(method, sweeps, seed, cache or Path(work)):
+                    calls[str(len(entries))] = call
+                    entries.append(entry)
+            except (FormatError, BundleError) as e:
+                left_out[method.name] = str(e)
+        log(f"{len(calls)} models take turns")
+        some = sweeps.samples[:: max(len(sweeps) // measure.TIMED_SWEEPS, 1)]
+        took = measure.timed(calls, some, rounds)
+    for entry, times in zip(entries, took.values(), strict=True):
+        entry |= {f"ms_p{q}": round(float(np.percentile(times, q)), 4) for q in (50, 99)}
+    return {"set": sweeps.source, "format": str(sweeps.format), "entries": entries, "left_out": left_out}
+
+
+def _callable(method: Method, sweeps: Dataset, seed: int, cache: Path) -> list[tuple[Json, measure.Call]]:
+    """The method as the box runs it, and as its own library does; other precisions are left to the chart."""
+    if method.library:
+        model = method.train(sweeps, model_inputs(method.input, sweeps), seed)
+        entry = {"method": method.name, "precision": "float", "runtime": method.library, "runs_on_box": False}
+        return [(entry, partial(_alone, model))]
+    made = model_forms.packed(method, sweeps, seed, kept_folder(method, sweeps, seed, cache))
+    return [
+        ({"method": one.method, "precision": one.precision, "runtime": one.runtime,
+          "runs_on_box": one.runtime == "onnx"}, measure.load(one.folder))
+        for one in made if not one.form
+    ]  # fmt: skip
+
+
+def _alone(model: Model, counts: Array) -> Array:
+    """Logits [K] of raw counts [T, R, C]."""
+    logits: Array = model.logits(counts[None])[0]
+    return logits
