@@ -32,6 +32,7 @@ def register(add: Add) -> None:
     paper.add_argument(
         "--quick", action="store_true", help="small sets, hardly trained: to try everything out, not for figures"
     )
+    paper.add_argument("--draw", action="store_true", help="run nothing: draw the page of results.json in --out again")
     paper.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
     chart = add("chart", run_chart, "chart accuracy against cost: every method as a bundle, timed as on the box")
     chart.add_argument("--out", type=Path, default=Path("docs/chart"), metavar="DIR", help="where it goes (docs/chart)")
@@ -74,6 +75,8 @@ def _add_development(add: Add) -> argparse.ArgumentParser:
     command.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
                          help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
     command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)")
+    command.add_argument("--leave-out", action="append", default=[], metavar="CASE",
+                         help="a case, or a point of its learning curve, that is not run, as the page names it")  # fmt: skip
     command.add_argument("--join", type=Path, action="append", default=[], metavar="FILE",
                          help="results.json of an earlier run, whose methods join those of this one")  # fmt: skip
     command.add_argument(
@@ -83,7 +86,10 @@ def _add_development(add: Add) -> argparse.ArgumentParser:
 
 
 def run_paper(args: argparse.Namespace) -> None:
-    """Run the experiment; print the page's path."""
+    """Run the experiment; print the page's path. With --draw only write the page of what lies in --out."""
+    if args.draw:
+        print(paper_experiment.draw(args.out))
+        return
     print(paper_experiment.run(args.out, args.quick, options.where(args), options.Log(), options.effort(args)))
 
 
@@ -138,7 +144,8 @@ def run_development(args: argparse.Namespace) -> None:
     effort = development_experiment.QUICK_EFFORT if quick else options.effort(args)
     where, log = options.where(args), options.Log()
     run = development_experiment.Development(
-        cases, tuple(args.method.split(",")) if args.method else names, where, log, args.data, effort, options.seeds(args)
+        cases, tuple(args.method.split(",")) if args.method else names, where, log, args.data, effort, options.seeds(args),
+        args.leave_out,
     )  # fmt: skip
     earlier = [_results(path) for path in args.join]
     figures = development_experiment.join(run.results(), earlier)

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from train.reports import html as pages
 from train.reports.formatting import estimate
 from train.reports.pareto import ACCURACIES, COSTS, Axis, Dot, name
-from train.reports.scatter import label
+from train.reports.scatter import SHIPPED, label
 
 SCRIPT = pages.TEMPLATES / "chart.js"
 
@@ -38,6 +38,7 @@ def html(
         dots=dots,
         picture=pages.picture(picture),
         quick=quick,
+        shipped=any(dot["method"] == SHIPPED for dot in dots),
         head=head,
         rows=rows,
         origin={key: " and ".join(sorted({str(dot[key]) for dot in dots})) for key in ("commit", "machine", "set")},

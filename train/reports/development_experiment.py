@@ -85,7 +85,8 @@ def usual_methods() -> tuple[str, ...]:
 
 @dataclass
 class Development:
-    """One run of the command. left_out: what is missing, and why."""
+    """One run of the command. not_wanted: names of cases, or of points of their curves ("NAME, 5 each"), that are not run.
+    left_out: what is missing, and why."""
 
     cases: Sequence[DevelopmentCase]
     names: Sequence[str]
@@ -94,11 +95,16 @@ class Development:
     data: Path | None = None
     effort: Effort = FULL_EFFORT
     seeds: Sequence[int] = (1,)
+    not_wanted: Sequence[str] = ()
     left_out: dict[str, str] = field(default_factory=dict)
 
     def results(self) -> Json:
-        """All figures: `cases` with what they were run on, and `results` by case, method and training sweeps."""
+        """All figures: `cases` with what they were run on, and `results` by case, method and training sweeps.
+
+        Raises FormatError for an unknown method, and where what is not wanted does not exist.
+        """
         methods.find(self.names)
+        self._require_known(self.not_wanted)
         cases: list[Json] = []
         found: list[Json] = []
         for number, case in enumerate(self.cases, 1):
@@ -107,11 +113,20 @@ class Development:
                 self.left_out[case.name] = "real sweeps; name their folder with --data or PALPATE_DATA"
                 continue
             cases.append(_about(case, sweeps))
-            for each in (0, *(EACH if case.curve else ())):
-                found += self._evaluated(case, sweeps, each, f"{number}/{len(self.cases)} {case.name}")
+            for each, name in _points(case):
+                if name in self.not_wanted or case.name in self.not_wanted:
+                    self.left_out[name] = f"not wanted in the run of {', '.join(self.names)}"
+                else:
+                    found += self._evaluated(case, sweeps, each, f"{number}/{len(self.cases)} {name}")
         known = {"methods": list(self.names), "seeds": list(self.seeds), "effort": self.effort.share}
         runs = [known | score.provenance()]
         return {"methods": list(self.names), "runs": runs, "cases": cases, "results": found, "left_out": self.left_out}
+
+    def _require_known(self, names: Sequence[str]) -> None:
+        known = [name for case in self.cases for _, name in _points(case)]
+        for name in names:
+            if name not in known:
+                raise FormatError(f"{name!r} is no case; leave out some of {'; '.join(known)}")
 
     def _evaluated(self, case: DevelopmentCase, sweeps: Dataset, each: int, what: str) -> Iterator[Json]:
         """One entry for each method that can take the set and is complete with all seeds that were found."""
@@ -119,7 +134,7 @@ class Development:
         by_method: dict[str, list[Json]] = {}
 
         def log(line: str) -> None:
-            self.log(f"{what}{f', {each} each' if each else ''}: {line}")
+            self.log(f"{what}: {line}")
 
         for result in evaluate.evaluate(sweeps, plan, self.where, log):
             if result.refused:
@@ -128,6 +143,11 @@ class Development:
                 by_method.setdefault(result.method, []).append(result.json() | {"seed": result.seed})
         for method, results in by_method.items():
             yield {"case": case.name, "each": each, "method": method} | _entry(results)
+
+
+def _points(case: DevelopmentCase) -> list[tuple[int, str]]:
+    """Training sweeps of each material (0 for all) and name of what is evaluated of a case: it, and points of its curve."""
+    return [(0, case.name), *((each, f"{case.name}, {each} each") for each in EACH if case.curve)]
 
 
 def join(run: Json, earlier: Sequence[Json]) -> Json:

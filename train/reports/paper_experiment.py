@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.inference.classifier import LEAST_PROBABILITY, fuse, softmax
 from train.data import sets
@@ -28,6 +29,7 @@ from train.metrics import score
 from train.models import methods, prior_work
 from train.models.methods import FULL_EFFORT, Effort
 from train.reports import paper_report, paper_values
+from train.reports.chart_report import BOX_ON_HARD, box_on_hard
 
 Array = NDArray[Any]
 Log = Callable[[str], None]
@@ -165,7 +167,16 @@ def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effo
         "took_s": round(time.monotonic() - start),
     }
     put(out / "results.json", _lines(results).encode(), parents=True)
-    page, pictures = paper_report.render(results)
+    return draw(out)
+
+
+def draw(out: Path) -> Path:
+    """The pictures and the page of results.json in `out`; the page's path. Raises FormatError where it is not there."""
+    try:
+        results: dict[str, Any] = json.loads((out / "results.json").read_bytes())
+    except (OSError, ValueError) as e:
+        raise FormatError(f"{out}/results.json is not of the paper's experiment: {e}; run it without --draw") from e
+    page, pictures = paper_report.render(results, box_on_hard(out.parent / BOX_ON_HARD))
     for name, svg in pictures.items():
         put(out / f"{name}.svg", svg.encode(), parents=True)
     put(out / "index.html", page.encode(), parents=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from train.reports import html, plots
 from train.reports.formatting import estimate, exact_percent, seconds
 from train.reports.paper_values import CNNS, CONFUSION, COST, FIGURES, SEVERAL, display_name, short_name
+from train.reports.scatter import SHIPPED
 
 TITLES = {
     "lopo": "T-REAL, leave one position out",
@@ -33,13 +34,16 @@ Key = tuple[str, str]
 """Part and method."""
 
 
-def render(summary: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """The page (HTML) of a summary, as paper_experiment.summary gives it, and its pictures (SVG) by name."""
+def render(summary: Mapping[str, Any], box_on_hard: Mapping[str, Any] | None = None) -> tuple[str, dict[str, str]]:
+    """The page (HTML) of a summary, as paper_experiment.summary gives it, and its pictures (SVG) by name.
+
+    box_on_hard: what the box answers to T-HARD's sweeps, see chart_report.box_on_hard.
+    """
     report = PaperReport(summary)
     pictures = report.pictures()
     drawn = {name: html.picture(svg) for name, svg in pictures.items()}
     return html.render(
-        "paper.html.j2", pictures=drawn, **report.run(), **report.figures(), **report.network()
+        "paper.html.j2", pictures=drawn, box_on_hard=box_on_hard, **report.run(), **report.figures(), **report.network()
     ), pictures
 
 
@@ -86,7 +90,7 @@ class PaperReport:
                  part["protocol"]] for k, part in self._ordered(summary["parts"])]  # fmt: skip
         trained = {row["method"]: row for row in table if row["ran"]}
         return {
-            "quick": summary["quick"], "commit": summary["commit"], "machine": summary["results"][0]["machine"],
+            "quick": summary["quick"], "shipped": any(method == SHIPPED for _, method in self.rows), "commit": summary["commit"], "machine": summary["results"][0]["machine"],
             "took_s": summary["took_s"], "evaluations": len(summary["results"]),
             "method_count": len({method for _, method in self.rows}),
             "world_count": len({world for row in table for world in row["worlds"]}),

@@ -112,6 +112,16 @@ def test_an_unknown_method_ends_it_before_anything_is_trained(tmp_path: Path):
         experiment(tmp_path, "L-gauss", "nobody").results()
 
 
+def test_what_is_not_wanted_is_not_run_and_named(tmp_path: Path):
+    """A case with its curve, or one point of the curve; a name that does not exist is an error, with those that do."""
+    run = experiment(tmp_path, "L-gauss", not_wanted=["short", "tones, 5 each", "tones, 10 each"])
+    assert {(r["case"], r["each"]) for r in run.results()["results"]} == {("tones", 0), ("tones", 20)}
+    why = "not wanted in the run of L-gauss"
+    assert run.left_out == dict.fromkeys(["tones, 5 each", "tones, 10 each", "short"], why)
+    with pytest.raises(FormatError, match="'tone' is no case; leave out some of tones; tones, 5 each"):
+        experiment(tmp_path, "L-gauss", not_wanted=["tone"]).results()
+
+
 def test_other_precisions_of_a_method_are_counted_with_it():
     """Over all seeds, as the method itself."""
     one = {"window": Score(8, 10).json(), "interval": (0.5, 0.9), "fit_s": 1.0, "ms_p50": 2.0}
