@@ -21,7 +21,7 @@ from train.evaluation.corruptions import EvaluationSweeps
 from train.export import contact_positions
 from train.metrics import score
 from train.models import methods
-from train.reports import contact_plot, plots, uncertainty_report
+from train.reports import contact_plot, contact_table, marked_text, plots, uncertainty_report
 
 
 def register(add: Add) -> None:
@@ -213,10 +213,14 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
 
 
 def run_alignment(args: argparse.Namespace) -> None:
-    """Measure, write the figures and the plot, and print a summary."""
+    """Measure, write the figures and the plot, the table into the page where one lies there, and print a summary."""
     box = Classifier(bundle.load(args.bundle), SystemClock())
     result = contact_positions.measure(box, args.unseen, args.seen, args.hard, options.Log())
     args.out.mkdir(parents=True, exist_ok=True)
     put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     put(args.out / "place.svg", (contact_plot.draw(result) + "\n").encode(), parents=True)
+    page = args.out / "README.md"
+    if page.exists():
+        text = marked_text.insert(page.read_text(encoding="utf-8"), "alignment", contact_table.table(result), str(page))
+        put(page, text.encode())
     print("\n".join(contact_positions.lines(result)))

@@ -1,5 +1,5 @@
 """The table of the box's figures in README and manual. In: docs/bench.json, which `palpate bench --json` wrote. Out:
-the table in Markdown, and documents with it between the markers BEGIN and END.
+the table in Markdown, and documents with it between their markers.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
+from train.reports import marked_text
 
 Json = dict[str, Any]
-BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
 
 
 def read(path: Path) -> Json:
@@ -35,11 +35,7 @@ def table(figures: Json) -> str:
 def insert(text: str, figures: Json, name: str) -> str:
     """`text` with the table between its markers. Raises FormatError, naming the document, where they are not there
     once."""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end or BEGIN in after:
-        raise FormatError(f"{name} has not one pair of markers {BEGIN} and {END}; put them where the table belongs")
-    return f"{before}{BEGIN}\n{table(figures)}\n{END}{after}"
+    return marked_text.insert(text, "bench", table(figures), name)
 
 
 def write(figures: Json, documents: list[Path]) -> None:

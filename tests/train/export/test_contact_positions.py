@@ -17,7 +17,7 @@ from tests.factories.contacts import MIDDLE, TARE, counts, patch
 from train.data import sets
 from train.data.sets import Dataset
 from train.export import contact_positions
-from train.reports import contact_plot
+from train.reports import contact_plot, contact_table
 
 
 @pytest.fixture
@@ -101,6 +101,12 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     assert "rows +8.0 mm" in text
     assert "network alone" in text
     assert "flagged" in contact_plot.draw(figures)
+    table = contact_table.table(figures)
+    assert [line.split(" | ")[0] for line in table.splitlines()[4:]] == [
+        "| T-HARD, a row ahead and all else anew",
+        "| not at all",
+    ]
+    assert f"| {home['unsure']} | {home['unknown']} | {100 * home['network'][0]:.1f} % [" in table.splitlines()[-1]
     with pytest.raises(FormatError, match="no positions"):
         contact_positions.measure(
             Classifier(replace(wide, manifest=replace(wide.manifest, place=None, moved=None)), SystemClock()),

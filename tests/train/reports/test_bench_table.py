@@ -15,8 +15,8 @@ from appliance.core.errors import FormatError
 from tests.factories.paths import ROOT
 from train.cli.main import main
 from train.reports import bench_table
-from train.reports.bench_table import BEGIN, END
 
+BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
 FIGURES = ROOT / "docs" / "bench.json"
 DOCUMENTS = [ROOT / "README.md", ROOT / "docs" / "manual.md"]
 MEASURED = {

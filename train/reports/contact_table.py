@@ -1,0 +1,51 @@
+"""What the box answers where the skin has moved. In: what contact_positions measured. Out: a table in Markdown.
+
+What it names by label alone stands beside what it answers, since the two are far apart where a skin has moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from train.reports.formatting import estimate
+
+Json = dict[str, Any]
+HEAD = (
+    "skin moved",
+    "answered rightly",
+    "wrongly",
+    "`unsure`",
+    "`unknown`",
+    "by label alone, rightly",
+    "marked",
+    "wrong and not marked",
+)
+SHOWN = {"rows": ((0.0, "not at all"), (1.0, "1 mm towards row 4"), (2.0, "2 mm"), (2.5, "2.5 mm"), (3.0, "3 mm"),
+                  (4.0, "4 mm, one row"), (5.0, "5 mm"), (-2.5, "2.5 mm towards row 1"), (-4.0, "4 mm")),
+         "columns": ((-2.5, "2.5 mm towards column 1"), (-4.0, "4 mm"), (2.5, "2.5 mm towards column 4"), (4.0, "4 mm"))}  # fmt: skip
+"""Displacements in mm that have a line."""
+
+
+def table(result: Json) -> str:
+    """A line for each displacement of SHOWN and for T-HARD, with 95 % intervals, and what it was measured on."""
+    rows = [("T-HARD, a row ahead and all else anew", result["T-HARD"]), *_moved(result)]
+    caption = (
+        f"Bundle {result['bundle']}, commit {result['commit']}, {result['machine']}: {result['T-HARD']['n']} sweeps of "
+        f"{result['T-HARD']['set']} at {result['T-HARD']['attachments']} attachments; all other lines {result['other positions']['n']} "
+        f"of {result['other positions']['set']} at {result['other positions']['attachments']}, moved. Per cent [95 %], else sweeps."
+    )
+    lines = [f"| {' | '.join(row)} |" for row in (HEAD, ("---",) * len(HEAD), *(_cells(*row) for row in rows))]
+    return "\n".join([caption, "", *lines])
+
+
+def _moved(result: Json) -> Iterator[tuple[str, Json]]:
+    for direction, shown in SHOWN.items():
+        points: Sequence[Json] = result["moved"][direction]
+        for mm, text in shown:
+            yield from ((text, point) for point in points if point["mm"] == mm)
+
+
+def _cells(text: str, point: Json) -> tuple[str, ...]:
+    return (text, estimate(point["accuracy"]), estimate(point["wrong_share"]), str(point["unsure"]), str(point["unknown"]),
+            estimate(point["network"]), estimate(point["moved"], 0), str(point["wrong_unflagged"]))  # fmt: skip

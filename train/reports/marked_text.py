@@ -1,0 +1,18 @@
+"""What a command writes into a document, between two markers. In: the document, a name, text. Out: the document."""
+
+from __future__ import annotations
+
+from appliance.core.errors import FormatError
+
+
+def insert(document: str, name: str, text: str, path: str) -> str:
+    """`document` with `text` between <!-- NAME --> and <!-- /NAME -->.
+
+    Raises FormatError, naming the document's `path`, where these markers are not there once.
+    """
+    begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    before, found, rest = document.partition(begin)
+    _, closed, after = rest.partition(end)
+    if not found or not closed or begin in after:
+        raise FormatError(f"{path} has not one pair of markers {begin} and {end}; put them where the table belongs")
+    return f"{before}{begin}\n{text}\n{end}{after}"
