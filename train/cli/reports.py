@@ -138,9 +138,7 @@ def run_development(args: argparse.Namespace) -> None:
         print(development_report.write(_results(args.out / "results.json"), args.out, quick))
         return
     names = development_experiment.QUICK_METHODS if quick else development_experiment.usual_methods()
-    cases, timed_on = development_experiment.CASES, (development_times.SET, ())
-    if quick:
-        cases, timed_on = development_experiment.QUICK, (chart_report.QUICK.train, chart_report.QUICK.only)
+    cases = development_experiment.QUICK if quick else development_experiment.CASES
     effort = development_experiment.QUICK_EFFORT if quick else options.effort(args)
     where, log = options.where(args), options.Log()
     run = development_experiment.Development(
@@ -152,7 +150,11 @@ def run_development(args: argparse.Namespace) -> None:
     for name, why in figures["left_out"].items():
         print(f"left out: {name}: {why}")
     if not args.kept:
-        train = sets.load(timed_on[0]).select(timed_on[1])
+        train = (
+            sets.load(chart_report.QUICK.train).select(chart_report.QUICK.only)
+            if quick
+            else sets.load(development_times.SET)
+        )
         figures["times"] = development_times.measured(figures["methods"], train, run.seeds[0], where.cache, log, effort)
     print(development_report.write(figures, args.out, quick))
 

@@ -181,7 +181,7 @@ def _about(case: DevelopmentCase, sweeps: Dataset) -> Json:
     """What a case was run on."""
     return {
         "case": case.name, "set": sweeps.source, "only": list(case.part.only), "protocol": case.part.protocol,
-        "means_removed": case.means_removed, "sweeps": len(sweeps), "materials": len(sweeps.materials),
+        "means_removed": case.means_removed, "simulated": case.simulated, "sweeps": len(sweeps), "materials": len(sweeps.materials),
         "format": str(sweeps.format), "digest": digest(sweeps), "curve": case.curve,
     }  # fmt: skip
 

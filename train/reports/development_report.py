@@ -143,7 +143,7 @@ def within(table: Mapping[str, Accuracies], cases: Sequence[str], ours: str, pee
     return sum(gap >= -0.01 - 1e-9 for gap in gaps), len(gaps)
 
 
-def dots(times: Iterable[Json], table: Mapping[str, Accuracies], cases: Sequence[str]) -> list[Json]:
+def dots(times: Iterable[Json], table: Mapping[str, Accuracies], cases: Sequence[str]) -> list[dict[str, Any]]:
     """Dots for scatter: the time of each method, and the mean of its accuracies and of the ends of their intervals.
 
     Of `cases` that it has all; without one there is no dot.

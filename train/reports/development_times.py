@@ -26,7 +26,7 @@ Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
 SET = "sim:T-REAL:1"
-"""The box's own form of a sweep, on which all methods are trained to be timed."""
+"""What all methods are trained on to be timed: sweeps of the packaged bundle's format."""
 ROUNDS = 20
 """Of timing: the slowest methods take a hundred times as long as those of the chart."""
 
@@ -39,7 +39,9 @@ def measured(
 
     Bundles are kept in `cache`, as those of the chart are.
     """
-    entries, calls, left_out = [], {}, {}
+    entries: list[Json] = []
+    calls: dict[str, measure.Call] = {}
+    left_out: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as work:
         for method in methods.find(names, effort):
             log(f"{method.name} is trained for its time")

@@ -93,7 +93,7 @@ def test_all_is_run_kept_and_what_is_refused_is_left_out(tmp_path: Path):
     assert [case["case"] for case in found["cases"]] == ["tones", "short"]
     assert [case["materials"] for case in found["cases"]] == [3, 2]
     assert all(r["seeds"] == [1, 2] and r["low"] <= r["mean"] <= r["high"] for r in found["results"])
-    assert any(line.startswith("2/2 tones, 10 each: ") for line in lines)
+    assert any(line.startswith("1/2 tones, 10 each: ") for line in lines)
     kept = experiment(tmp_path, *run.names, seeds=(1, 2), where=replace(run.where, kept=True))
     assert kept.results() == found
     assert experiment(tmp_path, "L-knn", where=replace(run.where, kept=True)).results()["results"] == []
