@@ -111,7 +111,7 @@ def known() -> str:
     """The sets that can be named, as lines."""
     tubes = len(skin.MATERIALS)
     lines = [
-        "FILE.npz, .h5, .hdf5   samples [N, T, R, C], labels [N], materials [K], rate_hz, group_NAME [N]",
+        "FILE.npz, .h5, .hdf5   samples [N, T, R, C] or [N, T, R, C, A], labels [N], materials [K], rate_hz, group_NAME [N]",
         "FILE.h5, .hdf5         TactMat: samples [materials, repetitions, T, R, C], materials",
         "FOLDER                 what palpate record wrote and palpate-train pull fetched, and the folders in it",
         "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]  simulated; x3: three axes, SWEEPS of a tube at each position, SEED to LAST joined",

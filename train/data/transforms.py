@@ -29,7 +29,7 @@ class Change:
     """What is left out; by default nothing.
 
     window: share of the frames that is kept, the middle. rate: so many frames are averaged into one by the readout
-    board, without any other filter. taxels: those that are kept, numbered row by row; () for all. bits: so many of the
+    board, without any other filter. taxels: those that are kept, with all axes, numbered row by row; () for all. bits: so many of the
     lowest are cut off.
     """
 
@@ -68,11 +68,12 @@ WHOLE = Change()
 
 
 def _kept(x: Array, taxels: tuple[int, ...]) -> Array:
-    n, frames, _, cols = x.shape
+    n, frames, grid_rows, cols, *axes = x.shape
     row, col = np.divmod(np.array(sorted(taxels)), cols)
     rows, columns = np.unique(row), np.unique(col)
     form = (len(rows), len(columns)) if len(rows) * len(columns) == len(taxels) else (len(taxels), 1)
-    return np.ascontiguousarray(x.reshape(n, frames, -1)[:, :, sorted(taxels)]).reshape(n, frames, *form)
+    kept = x.reshape(n, frames, grid_rows * cols, *axes)[:, :, sorted(taxels)]
+    return np.ascontiguousarray(kept).reshape(n, frames, *form, *axes)
 
 
 def _coarse(x: Array, bits: int) -> Array:
@@ -96,11 +97,11 @@ def order(sweeps: Dataset) -> list[int]:
     """Taxels by how well they separate materials, the best first: the last one is the first to be removed.
 
     Backward elimination (Marill and Green 1963) by Fisher's criterion trace(W^-1 B) (Fukunaga 1990, sec. 10.2) of the
-    log powers in BANDS bands of each taxel, scaled to variance 1 and with RIDGE in W, the scatter within materials.
+    log powers in BANDS bands of each taxel, on all its axes, scaled to variance 1 and with RIDGE in W, the scatter within materials.
     Removing one taxel from the inverse is a step in closed form, so that nothing is trained.
     """
-    powers = _powers(sweeps.samples)  # [N, M, BANDS]
-    n, taxels, bands = powers.shape
+    form, powers = sweeps.format, _powers(sweeps.samples)  # [N, M, BANDS]
+    n, taxels, bands = len(powers), form.rows * form.cols, form.axes * BANDS
     x = powers.reshape(n, -1)
     x = (x - x.mean(0)) / np.maximum(x.std(0), 1e-9)
     within, between = x.copy(), np.zeros((x.shape[1],) * 2)
@@ -123,7 +124,7 @@ def order(sweeps: Dataset) -> list[int]:
 
 
 def _powers(samples: Array) -> Array:
-    """Log power [N, M, BANDS] of sweeps [N, T, R, C], each taxel's mean subtracted."""
+    """Log power [N, M, BANDS] of sweeps, the mean of each taxel and axis subtracted; M = R * C * A."""
     n, frames = samples.shape[:2]
     bins = np.geomspace(1, max(frames // 2 + 1, 2), BANDS + 1)
     starts = np.minimum(bins.astype(int)[:-1], frames // 2)

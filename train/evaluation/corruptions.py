@@ -40,26 +40,29 @@ REST_S = 0.1
 class SimulatedScene:
     """Simulated sweeps that can be drawn anew, each from the random stream that it had.
 
-    materials: text [N]. places: where the skin sat in each sweep. worlds: seed of the set that each sweep is of.
+    materials: text [N]. places: where the skin sat in each sweep. worlds: seed of the set that each sweep is of. physics: as
+    they were drawn.
     """
 
     materials: tuple[str, ...]
     places: tuple[skin.Placement, ...]
     worlds: tuple[int, ...]
+    physics: skin.World = skin.WORLD
 
     def draw(
         self,
         place: Callable[[skin.Placement], skin.Placement] = lambda p: p,
-        world: skin.World = skin.WORLD,
+        world: skin.World | None = None,
         late_ms: Array | float = 0.0,
     ) -> Array:
-        """Raw counts uint8 [N, 1500, 4, 4] of the sweeps with changed placements or in a changed world.
+        """Raw counts [N, 1500, 4, 4] or [N, 1500, 4, 4, 3] of the sweeps with changed placements or in a changed world.
 
         late_ms: a number or [N], at most 100 either way: start of the window minus start of the slide.
         """
-        form, rest = skin.FORMAT, round(REST_S * skin.FORMAT.rate_hz)
+        world = world or self.physics
+        form, rest = world.format, round(REST_S * world.format.rate_hz)
         late = np.rint(np.broadcast_to(late_ms, len(self.places)) * form.rate_hz / 1000).astype(int)
-        drawn = np.empty((len(self.places), form.window, form.rows, form.cols), form.numpy_type)
+        drawn = np.empty((len(self.places), form.window, *form.shape), form.numpy_type)
         for i, (material, at, seed) in enumerate(zip(self.materials, self.places, self.worlds, strict=True)):
             rng = np.random.default_rng([seed, i, *b"stress"])
             length_s = {"rest_s": REST_S, "slide_s": form.window / form.rate_hz, "after_s": REST_S}
@@ -87,7 +90,7 @@ class EvaluationSweeps:
 
     @classmethod
     def simulated(cls, spec: str, seed: int = 0) -> EvaluationSweeps:
-        """Sweeps as in the set "sim:NAME[:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest before and after each.
+        """Sweeps as in the set "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest before and after each.
 
         They are drawn at the same places as those of that set, with other noise. Raises FormatError as `sets.load` does.
         """
@@ -100,12 +103,13 @@ class EvaluationSweeps:
         worlds = range(first, int(found["last"] or first) + 1)
         all_places = [(world, place) for world in worlds for place in skin.placements(name, world)]
         own, places = zip(*(all_places[i] for i in base.group("position")), strict=True)
-        scene = SimulatedScene(tuple(base.materials[k] for k in base.labels), places, own)
+        physics = skin.World(shear=bool(found["shear"]))
+        scene = SimulatedScene(tuple(base.materials[k] for k in base.labels), places, own, physics)
         return cls(replace(base, samples=scene.draw()), scene)
 
     @cached_property
     def deviation(self) -> Array:
-        """Standard deviation in raw counts [R, C] within a sweep, root mean square over sweeps."""
+        """Standard deviation in raw counts [R, C] or [R, C, A] within a sweep, root mean square over sweeps."""
         deviation: Array = np.sqrt(self.sweeps.samples.var(axis=1, dtype=np.float64).mean(axis=0))
         return deviation
 
@@ -127,8 +131,8 @@ Change = Callable[[Array, float, Generator, EvaluationSweeps], Array]
 class Corruption:
     """One thing that goes wrong.
 
-    unit: of `severities`, which rise from 0 = none. change: (float32 [N, T, R, C], severity, rng, test) -> the same
-    shape, not yet digitized. only: "simulated" where a scene is needed, "files" for what replaces it without one.
+    unit: of `severities`, which rise from 0 = none. change: (float32 [N, T, R, C] or [N, T, R, C, A], severity, rng, test)
+    -> the same shape, not yet digitized. only: "simulated" where a scene is needed, "files" for what replaces it without one.
     """
 
     name: str
@@ -139,7 +143,7 @@ class Corruption:
     only: str = ""
 
     def apply(self, test: EvaluationSweeps, severity: float, seed: int) -> Array:
-        """The raw counts [N, T, R, C] of `test`, corrupted, of the same type; unchanged at severity 0.
+        """The raw counts of `test`, corrupted, of the same type; unchanged at severity 0.
 
         The same seed draws the same taxels, signs and noise for every severity.
         Raises FormatError for a severity out of range, and where the corruption needs a scene and `test` has none.
@@ -180,7 +184,8 @@ def _turn(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps) -> A
 
 
 def _force(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _scene(test).draw(world=replace(skin.WORLD, force_n=skin.WORLD.force_n * (1 + sign * share)))
+    scene = _scene(test)
+    return scene.draw(world=replace(scene.physics, force_n=scene.physics.force_n * (1 + sign * share)))
 
 
 def _error_ms(x: Array, ms: float, rng: Generator) -> Array:
@@ -195,23 +200,33 @@ def _window(x: Array, ms: float, rng: Generator, test: EvaluationSweeps) -> Arra
 def _window_held(x: Array, ms: float, rng: Generator, test: EvaluationSweeps) -> Array:
     late = np.rint(_error_ms(x, ms, rng) * test.sweeps.rate_hz / 1000).astype(int)
     at = np.clip(np.arange(x.shape[1]) + late[:, None], 0, x.shape[1] - 1)
-    moved: Array = np.take_along_axis(x, at[:, :, None, None], axis=1)
+    moved: Array = np.take_along_axis(x, _over(at, x), axis=1)
     return moved
 
 
+def _over(times: Array, x: Array) -> Array:
+    """`times` [..., T] as it is broadcast over the taxels and axes of `x` [N, T, R, C] or [N, T, R, C, A]."""
+    return times.reshape(*times.shape, *(1,) * (x.ndim - 2))
+
+
 def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator) -> Array:
-    """Taxels read between their neighbours, `rows` further on and turned; beyond its edge the grid is mirrored.
+    """Taxels read between their neighbours, `rows` further on and turned; beyond its edge the grid is mirrored. Of three
+    axes the first two, shear along rows and columns, turn with the skin.
 
     share: of GAIN_LAW, by which their gains spread.
     """
-    r, c = x.shape[2:]
+    r, c = x.shape[2:4]
     i, j = np.indices((r, c)) - (np.array([r, c]) - 1)[:, None, None] / 2
     place = rows + (i + 1j * j) * np.exp(1j * np.deg2rad(degrees))
     at = np.stack([place.real + (r - 1) / 2, place.imag + (c - 1) / 2])
     taxels = np.eye(r * c).reshape(-1, r, c)
     weights = np.stack([map_coordinates(taxel, at, order=1, mode="mirror").ravel() for taxel in taxels])
     gain = np.exp(GAIN_LAW * share * rng.uniform(-1, 1, (len(x), 1, r, c)))
-    read: Array = (x.reshape(*x.shape[:2], -1) @ weights.astype(np.float32)).reshape(x.shape) * gain
+    axes = np.moveaxis(x.reshape(*x.shape[:2], r * c, -1), 3, 0) @ weights.astype(np.float32)  # [A, N, T, R * C]
+    if len(axes) == 3:
+        turned = (axes[0] + 1j * axes[1]) * np.exp(-1j * np.deg2rad(degrees))
+        axes[0], axes[1] = turned.real, turned.imag
+    read: Array = np.moveaxis(axes, 0, 3).reshape(x.shape) * gain.reshape(*gain.shape, *(1,) * (x.ndim - 4))
     return read
 
 
@@ -224,9 +239,10 @@ def _turn_grid(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps)
 
 
 def _some(x: Array, n: float, rng: Generator) -> Array:
-    """`n` taxels of each sweep, or all where there are fewer: bool [N, 1, R, C]."""
-    order = rng.permuted(np.tile(np.arange(x[0, 0].size), (len(x), 1)), axis=1)
-    chosen: Array = (order < n).reshape(len(x), 1, *x.shape[2:])
+    """`n` taxels of each sweep, or all where there are fewer: bool [N, 1, R, C] or [N, 1, R, C, 1]."""
+    r, c, *axes = x.shape[2:]
+    order = rng.permuted(np.tile(np.arange(r * c), (len(x), 1)), axis=1)
+    chosen: Array = (order < n).reshape(len(x), 1, r, c, *(1,) * len(axes))
     return chosen
 
 
@@ -252,7 +268,8 @@ def _gain(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSwe
 
 
 def _speed(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _scene(test).draw(world=replace(skin.WORLD, speed=1 + sign * share))
+    scene = _scene(test)
+    return scene.draw(world=replace(scene.physics, speed=1 + sign * share))
 
 
 def _stretch(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
@@ -267,7 +284,7 @@ def _stretch(sign: int, x: Array, share: float, rng: Generator, test: Evaluation
 
 def _drift(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
     start, end = share * test.load * rng.uniform(-1, 1, (2, len(x), 1, *x.shape[2:]))
-    drifted: Array = x + start + (end - start) * np.linspace(0, 1, x.shape[1])[:, None, None]
+    drifted: Array = x + start + (end - start) * _over(np.linspace(0, 1, x.shape[1]), x)
     return drifted
 
 
@@ -297,7 +314,7 @@ def _saturation(x: Array, share: float, rng: Generator, test: EvaluationSweeps) 
 
 def _hum(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Array:
     turns = HUM_HZ * np.arange(x.shape[1]) / test.sweeps.rate_hz + rng.random((len(x), 1))
-    return x + ratio * test.rms * np.sin(2 * np.pi * turns)[:, :, None, None]
+    return x + ratio * test.rms * np.sin(2 * np.pi * _over(turns, x))
 
 
 def _noise(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Array:

@@ -264,12 +264,13 @@ def _cell(curve: Json | None) -> str:
 
 
 def _uninformative(form: SweepFormat, top: float) -> dict[str, Array]:
-    """Windows [T, R, C] without information, one of a single frame. top: the highest count where their type sets none."""
-    level = np.full((form.window, form.rows, form.cols), top / 2).astype(form.numpy_type)
+    """Windows [T, R, C] or [T, R, C, A] without information, one of a single frame. top: the highest count where their type sets none."""
+    level = np.full((form.window, *form.shape), top / 2).astype(form.numpy_type)
     whole = form.numpy_type.kind != "f"
     found = {"silent": 0 * level, "constant": level, "one-frame": level[:1],
              "saturated": np.full_like(level, np.iinfo(form.numpy_type).max if whole else top)}  # fmt: skip
     for name, value in () if whole else (("nan", np.nan), ("inf", np.inf)):
-        found[name] = level * (1 + np.arange(len(level)).reshape(-1, 1, 1) % 2 / 8).astype(level.dtype)  # not constant
-        found[name][len(level) // 2, 0, 0] = value
+        found[name] = level.copy()
+        found[name][::2] *= 1.125  # not constant
+        found[name][len(level) // 2].flat[0] = value
     return found

@@ -105,7 +105,7 @@ def _save_torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
 def _save_aeon(model: Any, train: Dataset, seed: int, folder: Path) -> None:
     """aeon's parameters, fitted to the same sweeps once more, and the head that was trained on its features."""
     arrays: dict[str, Any] = {f"p{i}": p for i, p in enumerate(minirocket.fitted(train.samples, seed))}
-    arrays["silence"] = np.zeros((1, train.format.rows * train.format.cols, train.format.window), np.float32)
+    arrays["silence"] = np.zeros((1, train.format.channels, train.format.window), np.float32)
     np.savez_compressed(folder / measure.AEON, weight=model.weight, bias=model.bias, **arrays)
 
 

@@ -26,7 +26,7 @@ from appliance.bundle.manifest import UNSURE as LEAST_SURE
 from appliance.core import provenance, storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
-from appliance.core.types import Frames, Status, Sweep
+from appliance.core.types import Frames, Status, Sweep, normal
 from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, softmax
 from train.calibration.posthoc import HeldOut, calibrate
 from train.data.sets import Dataset
@@ -224,8 +224,9 @@ def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> byt
 
 
 def thresholds(sweeps: Dataset, full_scale: float | None) -> bundle.Thresholds:
-    """The thresholds for a window. contact: a tenth of the weakest contact in training, by the strongest taxel's mean."""
-    weakest = float(sweeps.samples.mean(axis=1, dtype=np.float64).max(axis=(1, 2)).min())
+    """The thresholds for a window. contact: a tenth of the weakest contact in training, by the strongest taxel's mean on
+    the normal axis."""
+    weakest = float(normal(sweeps.samples, 2).mean(axis=1, dtype=np.float64).max(axis=(1, 2)).min())
     kind = sweeps.samples.dtype
     top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
     # below the weakest also where a tared skin was pulled, so that its counts are negative

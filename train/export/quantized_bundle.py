@@ -173,7 +173,7 @@ def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     from train.models.paper_cnn import INT8_NODES, random_paper_cnn  # here: it imports PyTorch
 
     rng, form, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
-    counts = rng.integers(0, 256, (4, form.window, form.rows, form.cols), np.uint8)
+    counts = rng.integers(0, 256, (4, form.window, *form.shape), np.uint8)
     sweeps = Dataset(counts, np.arange(4) % classes, skin.MATERIALS, form.rate_hz, {}, "random counts")
     trunk = recipe.fixed_trunk(sweeps, seed)
     architecture = replace(trunk.architecture, pools=1)

@@ -2,7 +2,8 @@
 
 Static features (Hoelscher et al. 2015), spectrogram (Sinapov et al. 2011), correlation features (Kaboli et al. 2015,
 Chathuranga et al. 2015). The papers used other sensors (BioTac, accelerometers, three magnetic axes); each function says
-how it was adapted to a pressure skin. Any grid, rate and data type is accepted; the functions are pure.
+how it was adapted to a pressure skin. Any grid, rate and data type is accepted; the functions are pure. Raw counts are
+[T, R, C], or [T, R, C, A] where a taxel has several axes: each axis is a series, load and place are those of the normal one.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.signal import time_series
+from appliance.signal.features import axes
 
 Array = NDArray[np.float64]
 
@@ -25,27 +27,29 @@ TIME_BINS, FREQUENCY_BINS = 5, 25
 
 
 def static(taxels: NDArray[Any], rate_hz: float) -> Array:
-    """Features that do not depend on the order of the frames (Hoelscher et al. 2015), [2 M + 7] with M = R * C.
+    """Features that do not depend on the order of the frames (Hoelscher et al. 2015), [2 M + 7] with M = R * C * A.
 
-    taxels: raw counts [T, R, C]; rate_hz is not used. Each taxel's mean [M] and standard deviation over time [M]; mean,
+    taxels: raw counts; rate_hz is not used. Each series' mean [M] and standard deviation over time [M]; mean,
     standard deviation, minimum and maximum of the pressure, which is the mean count of a frame; the centre of pressure
     (row, column; in taxels from the middle of the grid, weights by eq. 4); the share of taxels in contact. The choice is
     ours: a pressure skin has none of their best features, temperature and thermal flow. One frame is enough.
     Raises FormatError for an array that is not a sweep.
     """
     x = time_series.of(taxels)
-    mean, pressure = time_series.means(x), x.mean(axis=0)
-    rows, cols = taxels.shape[1:]
+    load = x[axes(taxels) - 1 :: axes(taxels)]
+    mean, pressure = time_series.means(load), load.mean(axis=0)
+    rows, cols = taxels.shape[1:3]
     position = np.indices((rows, cols)).reshape(2, -1) - (np.array([[rows], [cols]]) - 1) / 2
     area = np.mean(mean > LOADED * mean.max())
     whole = [time_series.means(pressure[None])[0], pressure.std(), pressure.min(), pressure.max()]
-    return np.concatenate([mean, x.std(axis=1), whole, position @ time_series.weights(x), [area]])
+    centre = position @ time_series.weights(load)
+    return np.concatenate([time_series.means(x), x.std(axis=1), whole, centre, [area]])
 
 
 def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
     """Log power in 5 parts of the sweep x 25 bands of frequency (Sinapov et al. 2011), [125], log(counts^2).
 
-    taxels: raw counts [T, R, C]; rate_hz is not used. The number of bins is theirs, the rest our interpretation: equal
+    taxels: raw counts; rate_hz is not used. The number of bins is theirs, the rest our interpretation: equal
     parts of the sweep, equal bands from 0 to Nyquist. Each part loses its mean and is weighted with a Hann window; the
     power of its bins without DC is averaged within each band, and the taxels are added by eq. 4 as the paper does for H.
     The spectrum of a part shorter than 50 frames has fewer than 25 bins and is interpolated (zeros are appended). Power
@@ -55,7 +59,7 @@ def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
     x = time_series.of(taxels)
     if x.shape[1] < 4 * TIME_BINS:
         raise FormatError(f"{x.shape[1]} frames are too few for a spectrogram; use at least {4 * TIME_BINS}, or L")
-    weights = time_series.weights(x)
+    weights = time_series.weights(x, axes(taxels))
     parts = []
     for part in np.array_split(x, TIME_BINS, axis=1):
         frames = part.shape[1]
@@ -69,7 +73,7 @@ def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
 
 
 def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
-    """Nine numbers for any grid: how each taxel varies, and how taxels vary together. taxels: raw counts [T, R, C].
+    """Nine numbers for any grid: how each taxel varies, and how taxels vary together. taxels: raw counts.
 
     Of Kaboli et al. 2015: Hjorth's activity (log of the variance, in log(counts^2)), mobility (deviation of the change
     per second over that of the counts, in 1/s) and complexity (mobility of the change over mobility), each summed over
@@ -88,7 +92,7 @@ def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
     covariance = np.sqrt(_sum_of_squared_products(centred)) / x.shape[1]
     together = [*_pairs(varying), *_pairs(np.array([_ranks(one) for one in varying]))]
     last = [np.log(max(covariance, time_series.FLOOR)), time_series.means(x.mean(axis=0)[None])[0]]
-    return np.concatenate([_hjorth(x, rate_hz) @ time_series.weights(x), together, last])
+    return np.concatenate([_hjorth(x, rate_hz) @ time_series.weights(x, axes(taxels)), together, last])
 
 
 def _hjorth(x: Array, rate_hz: float) -> Array:

@@ -39,7 +39,7 @@ class DepthwiseSeparable(Network):
         super().__init__(form, scale)
         self.stride = max(form.window // STEPS, 1)
         kernel = min(max(FIRST_TAPS, 2 * self.stride), form.window)
-        layers = [nn.Conv1d(form.rows * form.cols, CHANNELS, kernel, self.stride)]
+        layers = [nn.Conv1d(form.channels, CHANNELS, kernel, self.stride)]
         for _ in range(BLOCKS):
             layers.append(nn.Conv1d(CHANNELS, CHANNELS, TAPS, padding=TAPS // 2, groups=CHANNELS))
             layers.append(nn.Conv1d(CHANNELS, CHANNELS, 1))

@@ -55,7 +55,7 @@ class SpectralNetwork(Network):
         angle = 2 * np.pi * np.arange(1, self.bins + 1)[:, None] * np.arange(length) / length
         hann = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
         waves = np.concatenate([np.cos(angle), np.sin(angle)]) * hann / np.linalg.norm(hann)
-        size = form.rows * form.cols * (self.bins + 3)
+        size = form.channels * (self.bins + 3)
         self.register_buffer("waves", torch.from_numpy(waves[:, None].astype(np.float32)))
         self.register_buffer("centre", torch.zeros(size))
         self.register_buffer("spread", torch.ones(size))
@@ -88,7 +88,7 @@ class SpectralNetwork(Network):
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]."""
-        g, taxels = GraphBuilder(), self.form.rows * self.form.cols
+        g, taxels = GraphBuilder(), self.form.channels
         x = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
         square = g("Mul", x, x)
         variance = g("Add", g("ReduceMean", square, axes=[2], keepdims=0), g.constant(FLOOR))

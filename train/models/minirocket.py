@@ -70,7 +70,7 @@ def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelPro
     dilation number plus kernel number is even, the window is padded with zeros; else the kernel stays within it.
     """
     counts, taxels, dilations, per_kernel, biases = parameters
-    g, size, at = GraphBuilder(), form.rows * form.cols, 0
+    g, size, at = GraphBuilder(), form.channels, 0
     chosen = iter(np.split(taxels, np.cumsum(counts)[:-1]))
     x = g("Cast", g("Reshape", "sweep", g.constant([1, form.window, size], "int64")), to=TensorProto.FLOAT)
     x, parts = g("Transpose", x, perm=[0, 2, 1]), []

@@ -76,7 +76,7 @@ class ImageNetwork(Network):
         self, form: SweepFormat, classes: int, scale: float, offset: float | None, layers: ImageLayers
     ) -> None:
         super().__init__(form, scale, offset)
-        self.layers, steps, taxels = layers, form.window, form.rows * form.cols
+        self.layers, steps, taxels = layers, form.window, form.channels
         self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
         for before, after, by in zip((1, *layers.channels), layers.channels, layers.strides, strict=False):
             self.convs.append(nn.Conv2d(before, after, KERNEL, by, padding=(KERNEL[0] // 2, KERNEL[1] // 2)))
@@ -106,7 +106,7 @@ class ImageNetwork(Network):
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; the batch norms are folded into the convolutions."""
         g, form, classes = GraphBuilder(), self.form, self.head.out_features
-        steps, taxels, pool = form.window, form.rows * form.cols, self.layers.pool
+        steps, taxels, pool = form.window, form.channels, self.layers.pool
         if self.offset is None:
             x = g("Transpose", centred(g, form)[0], perm=[0, 2, 1])
         else:

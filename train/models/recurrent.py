@@ -34,7 +34,7 @@ class Recurrent(Network):
         super().__init__(form, scale)
         self.stride = max(form.window // PATCHES, 1)
         kernel = min(max(2 * self.stride, MIN_PATCH), form.window)
-        self.patches = nn.Conv1d(form.rows * form.cols, STATE, kernel, self.stride)
+        self.patches = nn.Conv1d(form.channels, STATE, kernel, self.stride)
         self.unit = nn.GRU(STATE, STATE)
         self.head = nn.Linear(STATE, classes)
 

@@ -6,7 +6,7 @@ matching pursuit with a fixed number of atoms, codes split by sign, the largest 
 and in time, each cell divided by its length (contrast normalisation), a linear SVM. Our adaptation to a skin that slides
 instead of a hand that closes: texture is in time, so a patch has several frames as well as taxels; its taxels are its
 channels, and each loses its own mean, as colours do in their work; the grid is hardly larger than one patch, so there is
-one layer.
+one layer. Several axes of a taxel are columns beside each other, which a patch holds together.
 """
 
 from __future__ import annotations
@@ -61,13 +61,14 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
 
 
 def sample_patches(inputs: Array, rng: np.random.Generator) -> Array:
-    """Patches drawn from raw counts [N, T, R, C]: float64 [SAMPLED, frames, r, c], each taxel less its mean there."""
-    frames, (rows, cols) = min(FRAMES, inputs.shape[1] // 2), (min(SIDE, n) for n in inputs.shape[2:])
-    margins = np.array(inputs.shape) - (1, frames, rows, cols) + 1
+    """Patches drawn from raw counts [N, T, R, C] or [N, T, R, C, A]: float64 [SAMPLED, frames, r, c * A], each column less
+    its mean there."""
+    frames, (rows, cols) = min(FRAMES, inputs.shape[1] // 2), (min(SIDE, n) for n in inputs.shape[2:4])
+    margins = np.array(inputs.shape[:4]) - (1, frames, rows, cols) + 1
     corners = rng.integers(0, margins, (SAMPLED, 4))
     cut = np.stack([inputs[i, t : t + frames, r : r + rows, c : c + cols] for i, t, r, c in corners]).astype(np.float64)
     centred: Array = cut - cut.mean(axis=1, keepdims=True)
-    return centred
+    return centred.reshape(*centred.shape[:3], -1)
 
 
 def learn_dictionary(patches: Array, rng: np.random.Generator) -> Array:
@@ -107,10 +108,10 @@ def encode(patches: Array, atoms: Array) -> Array:
 def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
     """`sweep` -> `features` float32 [1, F]: the largest codes of each cell of the pyramids, above zero and below.
 
-    atoms: [ATOMS, frames, r, c]. scale: from raw counts to the scale of the patches that the atoms were learned from.
+    atoms: [ATOMS, frames, r, c * A]. scale: from raw counts to the scale of the patches that the atoms were learned from.
     """
     g, steps = GraphBuilder(), (form.window - atoms.shape[1]) // STEP + 1
-    rows, cols = (n - size + 1 for n, size in zip((form.rows, form.cols), atoms.shape[2:], strict=True))
+    rows, cols = form.rows - atoms.shape[2] + 1, form.cols - atoms.shape[3] // form.axes + 1
     codes = g("Reshape", _codes(g, form, atoms, STEP, scale), g.constant([steps, rows, cols, -1], "int64"))
     both = g("Concat", codes, g("Neg", codes), axis=3)
     times = [part for level in LEVELS if level <= steps for part in _parts(steps, level)]
@@ -144,9 +145,9 @@ def _codes(g: GraphBuilder, form: SweepFormat, atoms: Array, step: int, scale: f
     2008).
     """
     flat = atoms.reshape(len(atoms), -1)
-    shape = [1, 1, form.window, form.rows, form.cols]
+    shape = [1, 1, form.window, form.rows, form.cols * form.axes]
     x = g("Cast", g("Reshape", "sweep", g.constant(shape, "int64")), to=TensorProto.FLOAT)
-    products = g("Conv", x, g.constant(atoms[:, None] * scale), strides=[step, 1, 1])
+    products = g("Conv", x, g.constant(atoms[:, None] * scale), strides=[step, 1, form.axes])
     left = g("Transpose", g("Reshape", products, g.constant([len(atoms), -1], "int64")), perm=[1, 0])
     return _pursuit(g, left, flat @ flat.T)
 

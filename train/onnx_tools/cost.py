@@ -96,7 +96,7 @@ def feature_macs(kind: str, form: SweepFormat) -> int:
         return power(x, frames)
 
     rng = np.random.default_rng(0)  # no transform may be computed for a silent sweep
-    counts = rng.integers(0, 100, (form.window, form.rows, form.cols)).astype(form.numpy_type)
+    counts = rng.integers(0, 100, (form.window, *form.shape)).astype(form.numpy_type)
     with mock.patch.object(time_series, "power", counted):
         kinds.compute(kind, counts, form.rate_hz)
     return sum(transforms)

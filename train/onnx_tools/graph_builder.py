@@ -47,8 +47,8 @@ class GraphBuilder:
         return output
 
     def model(self, form: SweepFormat, output: str, *size: int) -> onnx.ModelProto:
-        """The finished, checked model: `sweep` [1, T, R, C] -> `output` float32 [1, *size]."""
-        sweep = helper.make_tensor_value_info("sweep", TENSOR[form.dtype], [1, form.window, form.rows, form.cols])
+        """The finished, checked model: `sweep` [1, T, R, C] or [1, T, R, C, A] -> `output` float32 [1, *size]."""
+        sweep = helper.make_tensor_value_info("sweep", TENSOR[form.dtype], [1, form.window, *form.shape])
         out = helper.make_tensor_value_info(output, TensorProto.FLOAT, [1, *size])
         graph = helper.make_graph(self.nodes, "palpate", [sweep], [out], self.constants)
         model = helper.make_model(
@@ -59,12 +59,12 @@ class GraphBuilder:
 
 
 def centred(g: GraphBuilder, form: SweepFormat) -> tuple[str, str]:
-    """Nodes that subtract each taxel's mean: `sweep` -> ([1, R * C, T], sums over time [1, R * C]), float32.
+    """Nodes that subtract the mean of each taxel and axis: `sweep` -> ([1, R * C * A, T], sums over time [1, R * C * A]), float32.
 
     Matrix products do it, five times as fast in onnxruntime as ReduceMean and Sub along time, and exactly for whole
     counts, in whatever order a processor adds them.
     """
-    taxels = form.rows * form.cols
+    taxels = form.channels
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
     ones = g("ConstantOfShape", g.constant([form.window, 1], "int64"), value=one)
     x = g("Cast", g("Reshape", "sweep", g.constant([form.window, taxels], "int64")), to=TensorProto.FLOAT)

@@ -1,7 +1,7 @@
 """The picture of one sweep. In: a recording or a sweep of a set. Out: SVG text, twice as wide as a phone.
 
 Each taxel over time where it lies on the skin, all on one scale of raw counts; below, the spectrum of all. A skin of more
-than MOST rows or columns is one image, a line for each taxel, row after row.
+than MOST rows or columns is one image, a line for each taxel, row after row. Several axes of a taxel share its plot.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ SHADES = LinearSegmentedColormap.from_list("shades", [WHITE, ACCENT, BLACK])
 class ShownSweep:
     """One sweep with its title and notes.
 
-    taxels: raw counts [T, R, C]. time_s: float [T], since what `since` says. tare: raw counts [R, C] of the skin at rest,
-    where known. gaps: int [n], the frames after which some are missing.
+    taxels: raw counts [T, R, C] or [T, R, C, A]. time_s: float [T], since what `since` says. tare: raw counts [R, C] or
+    [R, C, A] of the skin at rest, where known. gaps: int [n], the frames after which some are missing.
     """
 
     taxels: Array
@@ -138,13 +138,13 @@ def _of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
 
 
 def _grid(path: Path, tare: Any, grid: tuple[int, ...]) -> Array:
-    """The tare as float [R, C]. Raises FormatError where the sidecar's has another shape."""
+    """The tare as float [R, C] or [R, C, A]. Raises FormatError where the sidecar's has another shape."""
     try:
         made = np.array(tare, float)
     except (ValueError, TypeError):
         made = np.empty(0)
     if made.shape != grid or not np.isfinite(made).all():
-        raise FormatError(f"{path}: the tare in its .json is no {grid[0]} x {grid[1]} numbers; write null there")
+        raise FormatError(f"{path}: the tare in its .json is no {' x '.join(map(str, grid))} numbers; write null there")
     return made
 
 
@@ -165,7 +165,7 @@ def draw(sweep: ShownSweep) -> str:
     page.set_axis_off()
     _head(page, sweep)
     taxels = sweep.taxels.reshape(len(sweep.taxels), -1).astype(float)
-    if max(sweep.taxels.shape[1:]) > MOST:
+    if max(sweep.taxels.shape[1:3]) > MOST:
         shades = _image(add_axes(figure, LEFT, RIGHT, *_ends(SKIN)), sweep, taxels)
     else:
         shades = _skin(figure, sweep, taxels)
@@ -209,8 +209,10 @@ def _head(page: Axes, sweep: ShownSweep) -> None:
 
 
 def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
-    """A plot for each taxel where it lies on the skin; nothing to add to the caption. taxels: float [T, R * C]."""
-    rows, columns = sweep.taxels.shape[1:]
+    """A plot for each taxel where it lies on the skin; what the caption adds. taxels: float [T, R * C * A]."""
+    rows, columns = sweep.taxels.shape[1:3]
+    lines = taxels.reshape(len(taxels), rows, columns, -1)
+    tare = None if sweep.tare is None else sweep.tare.reshape(lines.shape[1:])
     top, bottom = _ends(SKIN)
     high, wide = (top - bottom) / rows, (RIGHT - LEFT) / columns
     shown = taxels if sweep.tare is None else np.append(taxels, sweep.tare)
@@ -223,31 +225,34 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
         axes = add_axes(figure, left, left + 0.94 * wide, above, above - 0.88 * high)
         sweep.span(axes)
         axes.set_ylim(low - margins[0], up + margins[1])
-        if sweep.tare is not None:
-            axes.axhline(float(sweep.tare[row, column]), color=GREY, linewidth=0.8)
-        axes.plot(*_thinned(sweep.time_s, taxels[:, row * columns + column]), color=ACCENT, linewidth=0.7)
+        for k in range(sweep.format.axes):
+            if tare is not None:
+                axes.axhline(float(tare[row, column, k]), color=GREY, linewidth=0.8)
+            normal, line = k == sweep.format.axes - 1, _thinned(sweep.time_s, lines[:, row, column, k])
+            axes.plot(*line, color=ACCENT, linewidth=0.7, alpha=None if normal else 0.4)
         axes.grid(color=FAINT, linewidth=0.6)
         write(axes, 1, 1 - head / 2, f"{row + 1},{column + 1}", GREY, SMALL - 1, ha="right", xycoords="axes fraction")
         for axis, ticks, outer in ((axes.xaxis, times, row == rows - 1), (axes.yaxis, counts, column == 0)):
             set_ticks(axis, ticks, bare=not outer)
-    return ""
+    return f"; {sweep.format.axes} axes, the normal one dark" if sweep.format.axes > 1 else ""
 
 
 def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
     """All taxels as lines of one image, darker where the counts are higher; what the caption adds."""
-    rows, columns = sweep.taxels.shape[1:]
+    rows, columns = sweep.taxels.shape[1:3]
+    each = f", of each its {sweep.format.axes} axes" if sweep.format.axes > 1 else ""
     times, lines = (_edges(n, most) for n, most in zip(taxels.shape, PIXELS, strict=True))
     means = np.add.reduceat(np.add.reduceat(taxels, times[:-1]), lines[:-1], axis=1) / np.outer(
         *map(np.diff, (times, lines))
     )
     ends_s = np.append(sweep.time_s[times[:-1]], sweep.time_s[-1] + 1 / sweep.format.rate_hz)
-    axes.pcolormesh(ends_s, lines / columns, means.T, cmap=SHADES, rasterized=True)
+    axes.pcolormesh(ends_s, lines / (columns * sweep.format.axes), means.T, cmap=SHADES, rasterized=True)
     sweep.span(axes)
     axes.set_ylim(rows, 0)
     set_ticks(axes.xaxis, _ticks(ends_s[0], ends_s[-1], 8))
     first = np.arange(0, rows, -(-rows // 10))
     set_categories(axes.yaxis, first + 0.5, [f"row {row + 1}" for row in first])
-    return f", from light, {means.min():.4g}, to dark, {means.max():.4g}; in each row its {columns} taxels"
+    return f", from light, {means.min():.4g}, to dark, {means.max():.4g}; in each row its {columns} taxels{each}"
 
 
 def _spectrum(axes: Axes, taxels: Array, form: SweepFormat) -> None:

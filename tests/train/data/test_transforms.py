@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,6 +67,21 @@ def test_rows_and_columns_stay_a_grid():
     line = Change(taxels=(4, 0, 2)).of(counting()).samples
     assert line.shape == (2, 12, 3, 1)
     assert line[0, 0, :, 0].tolist() == [0, 2, 4]
+
+
+def test_a_taxel_goes_with_all_its_axes():
+    """The grid that is left has the axes that it had; a taxel whose shear alone tells materials apart comes first."""
+    flat = counting()
+    sheared = replace(flat, samples=np.stack([flat.samples, -flat.samples], axis=-1))
+    grid = Change(taxels=(5, 3, 0, 2)).of(sheared)
+    assert str(grid.format).startswith("2x2x2 int16")
+    np.testing.assert_array_equal(grid.samples[..., 1], -Change(taxels=(5, 3, 0, 2)).of(flat).samples)
+    told = textured({7: [1, 3, 1, 3], 2: [1, 1, 3, 3]})
+    plain = textured({0: [1, 1, 1, 1]})
+    three = replace(told, samples=np.stack([plain.samples, told.samples, plain.samples], axis=-1))
+    found = transforms.order(three)
+    assert set(found[:2]) == {2, 7}
+    assert sorted(found) == list(range(9))
 
 
 def test_changes_add_up():

@@ -32,8 +32,9 @@ DIGITAL = [s.name for s in corruptions.CORRUPTIONS if s.only != "simulated"]
 def small(kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0) -> Dataset:
     """Sweeps of two materials: the second is stronger and rougher."""
     labels = np.arange(shape[0]) % 2
-    rough = np.random.default_rng(7).standard_normal(shape) * (3 + 3 * labels)[:, None, None, None]
-    samples = (rough + (60 + 10 * labels)[:, None, None, None]).astype(kind)
+    each = labels.reshape(-1, *(1,) * (len(shape) - 1))
+    rough = np.random.default_rng(7).standard_normal(shape) * (3 + 3 * each)
+    samples = (rough + 60 + 10 * each).astype(kind)
     return Dataset(samples, labels, ("smooth", "rough"), rate_hz, {}, "small")
 
 
@@ -75,7 +76,13 @@ FAKE = Method("fake", "two figures, nearest mean", "raw", learn)
 
 
 @pytest.mark.parametrize(
-    "sweeps", [small(), small("float32", (4, 128, 16, 1), 35.6), small("uint8", (2, 40, 1, 1), 10)]
+    "sweeps",
+    [
+        small(),
+        small("float32", (4, 128, 16, 1), 35.6),
+        small("uint8", (2, 40, 1, 1), 10),
+        small(shape=(4, 120, 3, 2, 3)),
+    ],
 )
 @pytest.mark.parametrize("name", DIGITAL)
 def test_counts_stay_counts(name: str, sweeps: Dataset):
@@ -198,6 +205,34 @@ def test_dead_stuck_and_noisy_taxels():
     assert ((dead == 0).all(axis=1).sum(axis=(1, 2)) == 3).all()
     stuck = BY_NAME["stuck"].apply(trial, 3, 5)
     assert ((np.ptp(stuck, axis=1) == 0).sum(axis=(1, 2)) == 3).all()
+
+
+def test_a_taxel_is_dead_on_all_its_axes():
+    """As many taxels as the severity says, each on every axis."""
+    trial = EvaluationSweeps(small(shape=(12, 120, 3, 3, 3)))
+    changed = (BY_NAME["dead"].apply(trial, 3, 5) != trial.sweeps.samples).any(axis=1)
+    assert (changed.any(axis=3).sum(axis=(1, 2)) == 3).all()
+    assert (changed.all(axis=3) == changed.any(axis=3)).all()
+
+
+def test_shear_turns_with_the_skin():
+    """A quarter turn: the grid as that of one axis, and shear along the rows becomes shear across; the normal axis stays."""
+    flat = np.random.default_rng(0).uniform(10, 90, (2, 5, 3, 3)).astype(np.float32)
+    along, normal = np.arange(90, dtype=np.float32).reshape(flat.shape), flat
+    x = np.stack([along, 0 * along, normal], axis=-1)
+    turned = corruptions._regrid(x, 0.0, 90.0, 0.0, np.random.default_rng(0))
+    read = [corruptions._regrid(of, 0.0, 90.0, 0.0, np.random.default_rng(0)) for of in (along, normal)]
+    np.testing.assert_allclose(turned, np.stack([0 * along, -read[0], read[1]], axis=-1), atol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_scene_with_shear_is_drawn_anew():
+    """Its own skin stays: format, sweeps without a corruption, and one with half the force."""
+    trial = EvaluationSweeps.simulated("sim:T-LABx3:1001:1")
+    assert str(trial.sweeps.format) == "4x4x3 int16 at 750 Hz, window 1500"
+    drawn = BY_NAME["force-down"].apply(trial, 0.5, 0)
+    assert drawn.shape == trial.sweeps.samples.shape
+    np.testing.assert_array_equal(drawn, trial.scene.draw(world=skin.World(shear=True, force_n=0.5)))
 
 
 def test_lost_frames_lie_on_the_line():
@@ -456,6 +491,8 @@ def test_each_answer_to_an_uninformative_sweep_has_a_name():
         def logits(self, given: np.ndarray) -> np.ndarray:
             raise ZeroDivisionError("no contact")
 
+    for name, window in robustness._uninformative(SweepFormat(2, 2, 100.0, 40, "float32", 3), 90.0).items():
+        assert window.shape[1:] == (2, 2, 3), name
     crashed = robustness.uninformative_answers(FAKE, Crash(), EvaluationSweeps(small()))
     assert crashed["silent"] == "crashed: ZeroDivisionError: no contact"
     assert set(crashed) == {"silent", "constant", "one-frame", "saturated"}

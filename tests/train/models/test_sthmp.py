@@ -95,6 +95,24 @@ def test_the_features_are_largest_codes_of_each_cell(dtype: str):
     np.testing.assert_allclose(graph_builder.run(graph, sweep[None])[0], by_loops(sweep, d, 0.1), rtol=0, atol=1e-3)
 
 
+def test_a_patch_holds_all_axes_of_its_taxels():
+    """The codes are those of the taxels one by one, each with its axes beside each other; never half of one taxel."""
+    sweep = np.random.default_rng(2).standard_normal((64, 3, 2, 3)).astype(np.float32)
+    d = atoms(7, 2, 6)
+    graph = sthmp.pooled(SweepFormat(3, 2, 50.0, 64, "float32", 3), d, 0.1)
+    seen = []
+    for r in (0, 1):
+        alone = sthmp.pooled(SweepFormat(2, 6, 50.0, 64, "float32"), d, 0.1)
+        seen.append(graph_builder.run(alone, sweep[:, r : r + 2].reshape(1, 64, 2, 6))[0].reshape(7, -1))
+    whole = graph_builder.run(graph, sweep[None])[0].reshape(7, 3, -1)  # per time: the grid, its upper and lower half
+    np.testing.assert_allclose(whole[:, 1:].swapaxes(0, 1), seen, rtol=0, atol=1e-3)
+    patch = sthmp.sample_patches(sweep[None], np.random.default_rng(0))
+    assert patch.shape[1:] == (16, 2, 6)
+    cut = np.stack([sweep[t : t + 16, r : r + 2] for t in range(49) for r in (0, 1)]).reshape(-1, 16, 2, 6)
+    cut = cut - cut.mean(axis=1, keepdims=True)
+    assert all(np.abs(cut - one).max(axis=(1, 2, 3)).min() < 1e-5 for one in patch[:20])
+
+
 def test_an_offset_changes_nothing():
     """What rests on a taxel is not its texture."""
     rng = np.random.default_rng(3)

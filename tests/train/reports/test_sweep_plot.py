@@ -28,7 +28,7 @@ ABOUT = {
 def sweep(path: Path, fmt: SweepFormat, about: dict | None = None, seq: np.ndarray | None = None, **more) -> str:
     """A recording of noise, a second after its start edge; its last taxel is silent."""
     seq = np.arange(fmt.window) if seq is None else seq
-    taxels = np.random.default_rng(0).integers(0, 99, (len(seq), fmt.rows, fmt.cols)).astype(fmt.numpy_type)
+    taxels = np.random.default_rng(0).integers(0, 99, (len(seq), *fmt.shape)).astype(fmt.numpy_type)
     taxels[:, -1, -1] = 0
     t_ns = (1e9 + seq * fmt.period_ns).astype(np.int64)
     made = Sweep(7, 0, int(t_ns[-1]) + 1, Status.OK, Frames(t_ns, seq, taxels), **{"material": "cork"} | more)
@@ -140,6 +140,25 @@ def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: i
     assert len(svg) < 2_000_000
     assert ("no spectrum" in words(svg)) == (window < 8 or rows * cols == 1)
     assert ("1,1" in words(svg).split("\n")) == (rows <= 8 and cols <= 8)
+
+
+@pytest.mark.parametrize("grid", [(2, 3), (9, 2)])
+def test_axes_share_the_plot_of_their_taxel(tmp_path: Path, grid: tuple[int, int]):
+    """A line for each axis, the normal one dark; a larger skin is an image of all. A tare of another shape is refused."""
+    fmt = SweepFormat(*grid, 100.0, 100, "int16", 3)
+    shown = words(drawn(tmp_path / "a.npy", fmt, {"tare": np.ones(fmt.shape).tolist()}))
+    small = max(grid) <= 8
+    wanted = "; 3 axes, the normal one dark" if small else "in each row its 2 taxels, of each its 3 axes"
+    assert wanted in shown
+    assert f"{grid[0]}x{grid[1]}x3 int16 at 100 Hz, window 100" in shown
+    seen = sweep_plot.load(sweep(tmp_path / "b.npy", fmt))
+    figure = sweep_plot.Figure((5, 5))
+    if small:
+        sweep_plot._skin(figure, seen, seen.taxels.reshape(100, -1).astype(float))
+        assert [len(axes.lines) for axes in figure.axes] == [3] * 6
+        np.testing.assert_array_equal(figure.axes[1].lines[2].get_ydata(), seen.taxels[:, 0, 1, 2])
+    with pytest.raises(FormatError, match=f"no {grid[0]} x {grid[1]} x 3 numbers"):
+        sweep_plot.load(sweep(tmp_path / "c.npy", fmt, {"tare": np.ones(grid).tolist()}))
 
 
 @pytest.mark.parametrize("count", [0, 255])

@@ -103,7 +103,7 @@ class Architecture:
     def cost(self, form: SweepFormat, classes: int) -> Cost:
         """Of convolutions and head, as they are in the graph."""
         head = sum(self.channels) * classes
-        weights, macs, inputs = head + classes, head, form.rows * form.cols
+        weights, macs, inputs = head + classes, head, form.channels
         for stage, outputs in zip(self.stages(form.window), self.channels, strict=True):
             taps = inputs * stage.kernel * outputs
             weights, macs, inputs = weights + taps + outputs, macs + taps * stage.steps, outputs

@@ -78,8 +78,9 @@ def default_augmentation(zero_sum: bool) -> Augmentation:
 
 
 def augment(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
-    """Sweeps float32 [B, R * C, T], varied as `augmentation` says, R being `rows`; the same for the same state of `rng`.
+    """Sweeps float32 [B, R * C * A, T], varied as `augmentation` says, R being `rows`; the same for the same state of `rng`.
 
+    rows: 1 where the taxels stand in a line, which is not moved.
     x: what `Network.prepare` gives, about 1 and, where something is drawn that shows it, around 0. It is not changed.
     """
     x = _attached(x, rows, augmentation, rng)  # new memory: what follows may write to it

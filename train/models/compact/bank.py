@@ -80,7 +80,7 @@ class Bank:
 
 def count(form: SweepFormat) -> int:
     """Filters of one kind for `form`."""
-    return int(np.clip(MOST_TAPS // (form.rows * form.cols * TAPS), LEAST_FILTERS, MOST_FILTERS))
+    return int(np.clip(MOST_TAPS // (form.channels * TAPS), LEAST_FILTERS, MOST_FILTERS))
 
 
 def draw(form: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -> Bank:
@@ -91,7 +91,7 @@ def draw(form: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -> 
     fitting = [d for d in DILATIONS if (TAPS - 1) * d < form.window]
     if not fitting:
         raise FormatError(f"a window of {form.window} frames is too short for a filter; record at least {TAPS}")
-    taxels, filters = form.rows * form.cols, count(form)
+    taxels, filters = form.channels, count(form)
     free = np.repeat(kinds, filters)
     across = np.rint(SPREAD * rng.standard_normal((len(free), taxels))).clip(-LARGEST, LARGEST)
     across[across == 0] = 1
@@ -131,7 +131,7 @@ def fitted(drawn: Bank, seen: Sequence[Array], rng: np.random.Generator) -> Bank
 
 def stage(form: SweepFormat, dilation: int) -> Stage:
     """The responses of a filter of this dilation."""
-    macs = count(form) * form.rows * form.cols * TAPS * form.window
+    macs = count(form) * form.channels * TAPS * form.window
     stride = max(1, form.window // MOST_STEPS, -(-macs // MOST_MACS))
     reach = (TAPS - 1) * dilation + 1
     return Stage(TAPS, stride, (form.window - reach) // stride + 1, reach, stride)

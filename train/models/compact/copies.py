@@ -35,11 +35,11 @@ def copies(sweeps: Dataset, augmentation: Augmentation, seed: int, count: int) -
 
 
 def _changed(counts: NDArray[Any], scale: float, augmentation: Augmentation, rng: Generator) -> NDArray[np.float32]:
-    """Raw counts [B, T, R, C], changed; where they are integers rounded and clipped to what their data type holds."""
-    n, frames, rows, cols = counts.shape
-    x = np.ascontiguousarray(counts.reshape(n, frames, rows * cols).transpose(0, 2, 1), np.float32)
+    """Raw counts [B, T, R, C] or [B, T, R, C, A], changed; where they are integers rounded and clipped to what their data type holds."""
+    n, frames, rows, cols = counts.shape[:4]
+    x = np.ascontiguousarray(counts.reshape(n, frames, -1).transpose(0, 2, 1), np.float32)
     means = x.mean(axis=2, keepdims=True)
-    x = augment((x - means) * scale, rows, augmentation, rng) / scale + means
+    x = augment((x - means) * scale, rows if cols > 1 else 1, augmentation, rng) / scale + means
     if counts.dtype.kind != "f":
         limits = np.iinfo(counts.dtype)
         x = np.rint(x).clip(limits.min, limits.max)

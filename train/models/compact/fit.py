@@ -169,10 +169,11 @@ def _select_depth(
 
 def augmenter(form: SweepFormat, augmentation: Augmentation) -> Augment:
     """`augment` for sweeps of `form`, as the training loop calls it: in PyTorch, seeded by its generator."""
+    rows = form.rows if form.cols > 1 else 1
 
     def change(x: Tensor, rng: Generator) -> Tensor:
         seed = int(torch.randint(2**63 - 1, (), generator=rng))
-        return torch.from_numpy(augment(x.numpy(), form.rows, augmentation, np.random.default_rng(seed)))
+        return torch.from_numpy(augment(x.numpy(), rows, augmentation, np.random.default_rng(seed)))
 
     return change
 

@@ -60,7 +60,7 @@ def trunk_graph(
     The bands of the spectrum are the last features, in float.
     """
     g, parts = GraphBuilder(), []
-    raw = g("Reshape", "sweep", g.constant([1, form.window, form.rows * form.cols], "int64"))
+    raw = g("Reshape", "sweep", g.constant([1, form.window, form.channels], "int64"))
     attenuation = _attenuation(g, raw, form)
     if architecture.channels or architecture.pools:
         x, step = _prepared(g, form, scale, architecture, raw, attenuation, ranges, tenths)
@@ -92,7 +92,7 @@ def layout(
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
         "stages": sum(architecture.channels), "sizes": filters, "shares": filters * (architecture.pools > 1),
-        "means": keep_means * form.rows * form.cols, "bands": architecture.spectrum * spectrum.count(form),
+        "means": keep_means * form.channels, "bands": architecture.spectrum * spectrum.count(form),
     }  # fmt: skip
     ends = np.cumsum(list(counts.values())).tolist()
     return {name: slice(end - n, end) for (name, n), end in zip(counts.items(), ends, strict=True) if n}
@@ -161,7 +161,7 @@ def _prepared(
 
 def _attenuation(g: GraphBuilder, raw: str, form: SweepFormat) -> str:
     """Raw counts [1, T, R * C] -> the factor of each taxel [1, 1, R * C]; see architectures.NoiseLimit."""
-    step, ranked = NOISE_LIMIT.step(form.window), NOISE_LIMIT.rank(form.rows * form.cols) + 1
+    step, ranked = NOISE_LIMIT.step(form.window), NOISE_LIMIT.rank(form.channels) + 1
     older, newer = (
         g("Cast", g("Slice", raw, *(g.constant([n], "int64") for n in (at, form.window - 1 + at, 1, step))), to=FLOAT)
         for at in (0, 1)
@@ -176,7 +176,7 @@ def _attenuation(g: GraphBuilder, raw: str, form: SweepFormat) -> str:
 def _attenuated_bytes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale: float) -> str:
     """Bytes [1, T, R * C] times `attenuation` [1, 1, R * C], as bytes; exact where that is 1."""
     quantized = nodes.quantized(g, attenuation, 1 / 255)
-    expanded = g("Expand", quantized, g.constant([1, form.window, form.rows * form.cols], "int64"))
+    expanded = g("Expand", quantized, g.constant([1, form.window, form.channels], "int64"))
     factors = g("DequantizeLinear", expanded, g.constant(1 / 255), g.constant(0, "uint8"))
     counts = g("DequantizeLinear", raw, g.constant(scale), g.constant(0, "uint8"))
     return nodes.quantized(g, g("Mul", counts, factors), scale)
@@ -185,7 +185,7 @@ def _attenuated_bytes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFo
 def _levels(g: GraphBuilder, x: str, form: SweepFormat, counts: list[int], rowwise: bool = False) -> str:
     """Raw counts [1, T, R * C] -> means over the first `counts` frames, [1, len(counts), R * C] or, rowwise, with a row
     each."""
-    taxels = form.rows * form.cols
+    taxels = form.channels
     sums = nodes.sums(g, x, form.window, counts, rowwise=rowwise)
     return g("Mul", sums, nodes.mean_factors(g, 1.0, counts, taxels, rowwise))
 
@@ -197,7 +197,7 @@ def bank_responses(
     [1, steps, filters]."""
     for numbers, _ in bank.groups(filters):
         g = GraphBuilder()
-        raw = g("Reshape", "sweep", g.constant([1, form.window, form.rows * form.cols], "int64"))
+        raw = g("Reshape", "sweep", g.constant([1, form.window, form.channels], "int64"))
         x, step = _prepared(g, form, scale, architecture, raw, _attenuation(g, raw, form), None, False)
         ((y, stage),) = bank.responses(g, form, filters.take(numbers), x, step, False)
         g("Identity", y, output="responses")

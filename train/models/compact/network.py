@@ -59,11 +59,12 @@ def limit_noise(x: Tensor) -> Tensor:
 
 
 def band_powers(x: Tensor, form: SweepFormat) -> Tensor:
-    """Scaled taxels [B, R * C, T] -> log band powers [B, count(form)]."""
+    """Scaled taxels [B, R * C * A, T] -> log band powers [B, count(form)], those of the first axis first."""
     length = form.window // spectrum.SEGMENTS
     waves, averaging = (torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(form)))
-    cut = x.mean(1)[:, : length * spectrum.SEGMENTS].unflatten(1, (spectrum.SEGMENTS, length))
-    return torch.log(((cut @ waves).square() @ averaging).mean(1) + spectrum.QUIET)
+    mean = x.unflatten(1, (-1, form.axes)).mean(1)[:, :, : length * spectrum.SEGMENTS]
+    cut = mean.unflatten(2, (spectrum.SEGMENTS, length))
+    return torch.log(((cut @ waves).square() @ averaging).mean(2) + spectrum.QUIET).flatten(1)
 
 
 class Compact(Network):
@@ -86,7 +87,7 @@ class Compact(Network):
     ) -> None:
         super().__init__(form, scale)
         self.keep_means, self.architecture = keep_means, architecture
-        stages, inputs = architecture.stages(form.window), (form.rows * form.cols, *architecture.channels)
+        stages, inputs = architecture.stages(form.window), (form.channels, *architecture.channels)
         self.convs = nn.ModuleList(
             nn.Conv1d(before, after, stage.kernel, stage.stride)
             for before, after, stage in zip(inputs, architecture.channels, stages, strict=False)

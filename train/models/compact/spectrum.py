@@ -1,8 +1,8 @@
 """The spectrum that all taxels share. In: the form of a sweep. Out: log band powers, in PyTorch and as ONNX nodes.
 
 Fixed features beside the learned ones. What is trained to separate materials discards what does not help it: it hardly
-sees that a material is none of them, and it fits its training sweeps too closely. Here the taxels' mean over the grid is
-cut into tenths of the window, and the power in bands of each tenth's spectrum is taken (Welch 1967), as logarithms. Each
+sees that a material is none of them, and it fits its training sweeps too closely. Here the taxels' mean over the grid, on
+each axis by itself, is cut into tenths of the window, and the power in bands of each tenth's spectrum is taken (Welch 1967), as logarithms. Each
 tenth is processed by itself, so that no offset and no later frame matters; the hum of the mains is removed.
 """
 
@@ -31,29 +31,36 @@ MIN_SEGMENT = 4
 
 
 def count(form: SweepFormat) -> int:
-    """How many bands there are; 0 where a tenth of the window has fewer frames than MIN_SEGMENT."""
+    """How many bands of all axes there are; 0 where a tenth of the window has fewer frames than MIN_SEGMENT."""
     length = form.window // SEGMENTS
-    return len(_edges(length)) - 1 if length >= MIN_SEGMENT else 0
+    return form.axes * (len(_edges(length)) - 1) if length >= MIN_SEGMENT else 0
 
 
 def nodes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale: float, tenths: bool) -> str:
-    """Raw counts [1, T, R * C] and the factor of each taxel [1, 1, R * C] -> log band powers [1, rows, bands].
+    """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1, rows, bands], those of the
+    first axis first.
 
     One row for the whole window; with `tenths` one for each of the first tenth, the first two tenths, and so on.
     """
-    length, taxels = form.window // SEGMENTS, form.rows * form.cols
-    share = g("Mul", g("Reshape", attenuation, g.constant([taxels, 1], "int64")), g.constant(scale / taxels))
+    length, axes, taxels = form.window // SEGMENTS, form.axes, form.rows * form.cols
+    mean = scale / taxels * (np.tile(np.eye(axes), (taxels, 1)) if axes > 1 else 1)  # [M, A]
+    share = g("Mul", g("Reshape", attenuation, g.constant([form.channels, 1], "int64")), g.constant(mean))
     x = g("MatMul", g("Cast", raw, to=TensorProto.FLOAT), share)
     if form.window % SEGMENTS:
         x = g("Slice", x, *(g.constant([n], "int64") for n in (0, length * SEGMENTS, 1)))
-    x = g("MatMul", g("Reshape", x, g.constant([SEGMENTS, length], "int64")), _wave_nodes(g, length, mains(form)))
+    if axes > 1:
+        x = g("Transpose", g("Reshape", x, g.constant([SEGMENTS, length, axes], "int64")), perm=[0, 2, 1])
+    x = g("Reshape", x, g.constant([SEGMENTS * axes, length], "int64"))
+    x = g("MatMul", x, _wave_nodes(g, length, mains(form)))
     power = g("MatMul", g("Mul", x, x), _averaging_nodes(g, _edges(length)))
+    if axes > 1:
+        power = g("Reshape", power, g.constant([SEGMENTS, count(form)], "int64"))
     if tenths:
         power = g("MatMul", g.constant(np.tri(SEGMENTS) / np.arange(1, SEGMENTS + 1)[:, None]), power)
     else:
         power = g("ReduceMean", power, axes=[0])
     power = g("Log", g("Add", power, g.constant(QUIET)))
-    return g("Reshape", power, g.constant([1, SEGMENTS if tenths else 1, len(_edges(length)) - 1], "int64"))
+    return g("Reshape", power, g.constant([1, SEGMENTS if tenths else 1, count(form)], "int64"))
 
 
 def _edges(length: int) -> Array:

@@ -23,6 +23,7 @@ FORMS = [
     SweepFormat(1, 1, 10.0, 16, "uint16"),
     SweepFormat(4, 4, 750.0, 600, "uint8"),
     SweepFormat(4, 2, 750.0, 600, "float32"),
+    SweepFormat(2, 2, 750.0, 600, "int16", 3),
 ]
 forms = pytest.mark.parametrize("form", FORMS, ids=str)
 BANK = replace(FIXED, pools=2)
@@ -30,7 +31,7 @@ BANK = replace(FIXED, pools=2)
 
 def counts(form: SweepFormat, n: int = 3) -> np.ndarray:
     """Random walks [n, T, R, C] of raw counts."""
-    walk = np.random.default_rng(7).integers(-3, 4, (n, form.window, form.rows, form.cols)).cumsum(axis=1)
+    walk = np.random.default_rng(7).integers(-3, 4, (n, form.window, *form.shape)).cumsum(axis=1)
     return (
         1000 * (form.dtype != "uint8") + np.clip(100 + walk - walk.mean(axis=1, keepdims=True).astype(int), 0, 255)
     ).astype(form.dtype)
@@ -110,8 +111,8 @@ def test_filters_fit_the_window(form: SweepFormat):
         np.testing.assert_allclose(np.linalg.norm(drawn.taps(), axis=(1, 2)), 1, atol=1e-5)
         assert set(drawn.dilations) == {d for d in DILATIONS if 8 * d < form.window}
         seen = (drawn.across != 0).sum(axis=1)
-        assert (seen.min(), seen.max()) == (1, form.rows * form.cols)
-        assert len(drawn) * form.rows * form.cols * TAPS <= bank.MOST_TAPS
+        assert (seen.min(), seen.max()) == (1, form.channels)
+        assert len(drawn) * form.channels * TAPS <= bank.MOST_TAPS
         last = bank.stage(form, int(drawn.dilations.max()))
         assert (last.steps - 1) * last.hop + last.reach <= form.window
 

@@ -37,10 +37,10 @@ CONVOLUTIONAL = {name: shape for name, shape in ARCHITECTURES.items() if shape.c
 
 def drawn(form: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
     """Raw counts of n sweeps: every taxel with an offset of its own, a tone and noise; none is much noisier than others."""
-    rng, t = np.random.default_rng(seed), np.arange(form.window)[:, None, None]
-    taxels = (n, 1, form.rows, form.cols)
+    rng, t = np.random.default_rng(seed), np.arange(form.window).reshape(-1, *(1,) * len(form.shape))
+    taxels = (n, 1, *form.shape)
     x = rng.uniform(80, 120, taxels) + rng.uniform(8, 14, taxels) * np.sin(t * rng.uniform(0.6, 1.2, taxels))
-    return (x + rng.standard_normal((n, form.window, form.rows, form.cols))).astype(form.dtype)
+    return (x + rng.standard_normal((n, form.window, *form.shape))).astype(form.dtype)
 
 
 def trunks(
@@ -69,11 +69,12 @@ def fitted() -> Fit:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rows", "cols", "window", "dtype"),
-                         [(4, 4, 1500, "uint8"), (3, 3, 150, "int16"), (1, 1, 20, "uint16"), (16, 1, 128, "float32")])  # fmt: skip
-def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str):
+@pytest.mark.parametrize(("rows", "cols", "window", "dtype", "axes"),
+                         [(4, 4, 1500, "uint8", 1), (3, 3, 150, "int16", 1), (1, 1, 20, "uint16", 1), (16, 1, 128, "float32", 1),
+                          (3, 3, 600, "float32", 3), (2, 1, 150, "uint8", 2)])  # fmt: skip
+def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str, axes: int):
     """Any data type and window: float up to rounding, int8 close to it; a silent sweep gives the same as one at another level."""
-    form = SweepFormat(rows, cols, 100.0, window, dtype)
+    form = SweepFormat(rows, cols, 100.0, window, dtype, axes)
     model, plain, int8 = trunks(form)
     counts = drawn(form, seed=1)
     want = seen(model, counts)

@@ -36,6 +36,7 @@ FORMS = {
     "odd": (ODD, False),
     "line": (SweepFormat(16, 1, 35.6, 128, "float32"), False),
     "shortest": (SweepFormat(2, 2, 100.0, 40, "uint8"), False),
+    "three axes": (SweepFormat(3, 2, 750.0, 303, "int16", 3), True),
 }
 """Forms, and whether the mains are taken away there."""
 
@@ -43,8 +44,8 @@ FORMS = {
 def drawn(form: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
     """Raw counts of n sweeps: noise that all taxels feel, and some of their own; none is much noisier than others."""
     rng = np.random.default_rng(seed)
-    own = rng.standard_normal((n, form.window, form.rows, form.cols))
-    x = 90 + 8 * rng.standard_normal((n, form.window, 1, 1)) + 4 * own
+    own = rng.standard_normal((n, form.window, *form.shape))
+    x = 90 + 8 * rng.standard_normal((n, form.window, *(1,) * len(form.shape))) + 4 * own
     return x.astype(form.dtype)
 
 
@@ -61,7 +62,7 @@ def heard(form: SweepFormat, counts: np.ndarray, scale: float = 0.1) -> np.ndarr
 
 
 def turned(x: np.ndarray) -> np.ndarray:
-    """What each taxel of [n, T, R * C] is multiplied with: more than three times the fifth of sixteen is turned down."""
+    """What each series of [n, T, R * C * A] is multiplied with: more than three times the fifth of sixteen is turned down."""
     step = max(x.shape[1] // 150, 1)
     noise = np.abs(x[:, 1::step] - x[:, :-1:step]).mean(1, keepdims=True)
     limit = 3 * -np.sort(-noise, axis=2)[:, :, [x.shape[2] // 4]]
@@ -69,20 +70,22 @@ def turned(x: np.ndarray) -> np.ndarray:
 
 
 def defined(form: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0.1, limited: bool = True) -> np.ndarray:
-    """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128.
+    """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128; those of one axis after the other.
 
     Of each tenth of the taxels' mean what offset and mains fit best is taken away; Hann's window, a transform at half
     bins, the mean of each band.
     """
     x, length = counts.reshape(len(counts), form.window, -1).astype(np.float64), form.window // 10
-    wave = scale * (x * turned(x) if limited else x).mean(2)[:, : 10 * length].reshape(-1, length)
+    each = (x * turned(x) if limited else x).reshape(len(x), form.window, -1, form.axes).mean(2)
+    wave = scale * each.swapaxes(1, 2)[:, :, : 10 * length].reshape(-1, length)
     turn = 2 * np.pi * 50 / form.rate_hz * np.arange(length)
     fits = np.stack([np.ones(length), np.sin(turn), np.cos(turn)][: 3 if mains else 1], axis=1)
     wave = wave - (fits @ np.linalg.lstsq(fits, wave.T, rcond=None)[0]).T
     window = np.hanning(length + 2)[1:-1]
     power = np.abs(np.fft.fft(wave * window, 2 * length)) ** 2 / (window**2).sum()
     edges = sorted({round(2 * ((length + 1) / 2) ** (i / 24)) for i in range(25)})
-    bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(len(counts), 10, -1)
+    bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(len(counts), form.axes, 10, -1)
+    bands = bands.swapaxes(1, 2).reshape(len(counts), 10, -1)
     return np.log(bands.cumsum(1) / np.arange(1, 11)[:, None] + 1e-4)
 
 
@@ -156,7 +159,7 @@ def test_later_frames_and_offsets_do_not_matter():
 def test_silence_is_finite(name: str):
     """No power at all but what is added to each band, whatever the offset."""
     form, _ = FORMS[name]
-    quiet = np.stack([np.full((form.window, form.rows, form.cols), level, form.dtype) for level in (0, 90)])
+    quiet = np.stack([np.full((form.window, *form.shape), level, form.dtype) for level in (0, 90)])
     for have in (
         heard(form, quiet),
         graph_builder.run(trunk(form), quiet),

@@ -1,0 +1,17 @@
+"""Simulated sweeps of a skin of 2x2 taxels with three axes, for tests."""
+
+from __future__ import annotations
+
+from appliance.sim import skin
+from train.data.sets import Dataset
+
+PITCH_MM = 6.0
+WORLD = skin.World(rows=2, cols=2, pitch_mm=(PITCH_MM, PITCH_MM), shear=True)
+FRAMES = 600
+
+
+def sheared(each: int = 2, seed: int = 5, frames: int = FRAMES) -> Dataset:
+    """Six tubes at nine positions, `each` sweeps [frames, 2, 2, 3] of each tube at each."""
+    samples, labels, position = skin.sweep_set("T-REAL", seed, each, WORLD)
+    first = (samples.shape[1] - frames) // 2
+    return Dataset(samples[:, first:][:, :frames], labels, skin.MATERIALS, 750.0, {"position": position}, "sheared")

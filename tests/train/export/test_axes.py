@@ -1,0 +1,62 @@
+"""A skin with three axes from a set to the box: fit, export, the same answers there and in a replay of what it received."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.cli.main import main as palpate
+from appliance.core.clock import SystemClock
+from appliance.inference.classifier import Classifier
+from appliance.recording.black_box import BlackBox
+from appliance.recording.capture import CaptureWriter
+from appliance.sim import devices, rig, script
+from tests.factories.sheared import PITCH_MM, sheared
+from tests.factories.simulated_box import Rigged
+from train.cli.main import main
+from train.export import pack
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(), ("--size", "10k", "--steps", "60")], ids=["chosen", "stages"])
+def test_from_a_set_to_the_answers_of_the_box(
+    rigged: Callable[..., Rigged], size: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """fit and export by command; unseen sweeps over the wire get the labels that the bundle gives on the desktop, and again
+    when they are replayed; the bundle knows positions by the normal axis."""
+    sheared().save(tmp_path / "set.npz")
+    fit, out = str(tmp_path / "fit.npz"), tmp_path / "bundle"
+    steps = size or ("--steps", "0")
+    assert main(["fit", "--set", str(tmp_path / "set.npz"), "--seed", "1", "--out", fit, *steps]) == 0
+    export = ["export", fit, "--out", str(out), "--name", "sheared", "--version", "1", "--full-scale", "2047"]
+    assert main([*export, "--pitch-mm", str(PITCH_MM)]) == 0
+    model = bundle.load(out)
+    assert str(model.format) == "2x2x3 int16 at 750 Hz, window 600"
+    assert model.manifest.thresholds.full_scale == 2047
+    assert model.manifest.place
+    assert np.abs(np.array(model.manifest.place.cols_mm) - PITCH_MM / 2).max() < 2
+    unseen = sheared(1, seed=6).take(np.arange(0, 54, 3))
+    unseen.save(tmp_path / "unseen.npz")
+    answers, _ = pack.score(Classifier(model, SystemClock()), unseen)
+    labels = [model.manifest.labels[k] if k >= 0 else "" for k in answers]
+    assert np.mean([a == unseen.materials[k] for a, k in zip(labels, unseen.labels, strict=True)]) > 0.7
+    acts = list(script.replay(tmp_path / "unseen.npz", model.format))
+    simulated = devices.build(model.format, acts, rig.VirtualClock(), "replay")
+    kept = BlackBox(tmp_path / "kept", model.format, len(acts))
+    capture = CaptureWriter(tmp_path / "capture", model.format)
+    box = rigged(simulated, model=model, observers=[kept], capture=capture)
+    verdicts = box.until(lambda: simulated.finished(box.box.answered), limit_s=300)
+    kept.close()
+    capture.close()
+    assert [v.label for v in verdicts] == labels
+    capsys.readouterr()
+    choose = ["--set", f"classifier.bundle={out}"]
+    assert palpate(["replay", str(tmp_path / "capture"), *choose]) == 0
+    sentences = [line.split(",") for line in capsys.readouterr().out.splitlines() if ",RES," in line]
+    assert [fields[5] for fields in sentences] == labels
+    assert palpate(["replay", str(tmp_path / "kept"), *choose]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"{len(acts)} sweeps: {len(acts)} the same"
