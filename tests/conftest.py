@@ -36,7 +36,8 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             sets: tuple[str, ...] = (),
             model=default_bundle,
             observers=(),
-            **more,
+            commands=None,
+            capture=None,
         ) -> Rigged:
             simulated = simulated or devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
             settings = config.load(None, sets, site=NO_SITE)
@@ -44,7 +45,12 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             port = SerialSink(replace(settings.serial, port=name), simulated.clock, simulated.source)
             kept: list[Sweep] = []
             watching = [OnSweep(lambda sweep, verdict: kept.append(sweep)), *observers]
-            box = assembly.box(settings, model, simulated, port, stack, observers=watching, **more)
+            if commands is None:
+                box = assembly.box(settings, model, simulated, port, stack, observers=watching, capture=capture)
+            else:  # a box that records
+                box = assembly.recorder(
+                    settings, skin.FORMAT, simulated, port, stack, observers=watching, commands=commands
+                )
             return Rigged(box, simulated, far_end, port, kept=kept)
 
         yield make

@@ -64,7 +64,7 @@ class Screen:
 def line(view: View) -> str:
     """A View in one line, the message first."""
     at = f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {view.unit}" if view.centre else ""
-    return f"{'SIMULATED  ' * (view.source != 'usb')}{view.message}{at}  ({view.hint})"
+    return f"{view.origin and f'{view.origin}  '}{view.message}{at}  ({view.hint})"
 
 
 class Canvas:
@@ -101,7 +101,7 @@ class Canvas:
 
     def _words(self, address: str) -> None:
         view, (rows, _) = self._view, self._view.shape
-        simulated = "   SIMULATED" * (view.source != "usb")
+        simulated = view.origin and f"   {view.origin}"
         self._put(0, 1, f"palpate align   skin {view.skin}   bundle {view.bundle}{simulated}")
         self._put(2, 1, view.message, BOLD)
         self._put(3, 1, view.hint)

@@ -34,6 +34,11 @@ class View:
     place: ContactPositions | None = None
 
     @property
+    def origin(self) -> str:
+        """That the skin is not a real one, "" if it is."""
+        return {"usb": "", "replay": "REPLAYED"}.get(self.source, "SIMULATED")
+
+    @property
     def unit(self) -> str:
         """Unit of centre and nearest."""
         return "mm" if self.place else "taxels"

@@ -22,11 +22,13 @@ from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
-from appliance.core.errors import ApplianceError
+from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError, SensorError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
+from appliance.io import skins
 from appliance.io.robot_link import Port
+from appliance.io.usb_sensor import fits
 from appliance.recording.capture import CaptureWriter
 from appliance.runtime import assembly
 from appliance.runtime.selftest import check
@@ -34,16 +36,26 @@ from appliance.service.status import StatusFile
 from appliance.service.systemd import Notifier, VerdictLog
 
 if TYPE_CHECKING:
+    from appliance.alignment.live import Expected
     from appliance.deployment.shadow import Shadow
-    from appliance.recording.recording import Labels, RecordingSession
+    from appliance.runtime.loop import Box
 
-OpenDevices = Callable[[Callable[[], SweepFormat]], Devices]
-"""Opens the devices. Its argument gives the format that a simulated skin has to send."""
+OpenDevices = Callable[[Callable[[], SweepFormat] | None], Devices]
+"""Opens the devices. Its argument gives the format that a simulated skin has to send; None for whatever its script has."""
 
 
 def load_settings(args: argparse.Namespace) -> Config:
-    """The settings that a command's options ask for."""
-    return config.load(args.board, args.set, folder=args.config_dir)
+    """The settings that a command's options ask for. --every and --sweep are settings of the trigger by the clock."""
+    sets = list(args.set)
+    every, sweep = getattr(args, "every", None), getattr(args, "sweep", None)
+    mode = getattr(args, "trigger", None)
+    if every is not None or sweep is not None:
+        if mode not in (None, "timed"):
+            raise ConfigError(f"--every and --sweep are for --trigger timed, not for {mode}; leave them out")
+        mode = "timed"
+    for key, value in (("mode", mode), ("every_s", every), ("sweep_s", sweep)):
+        sets += [f"trigger.{key}={value}"] if value is not None else []
+    return config.load(args.board, sets, folder=args.config_dir)
 
 
 def load_bundle(settings: Config) -> Bundle:
@@ -63,27 +75,13 @@ def stop_flag() -> Callable[[], bool]:
 
 def run(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     """`palpate run`: until SIGTERM, or with --sim until the script has ended and everything was answered."""
-    return _serve(args, load_settings(args), open_devices)
-
-
-def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
-    """`palpate record`: as `run`, and each sweep is kept with its label; only whole windows, so no early answers."""
-    from appliance.recording.recording import Labels
-
-    labels = Labels(args.material, args.position, args.session)
-    return _serve(args, _without_early_answers(load_settings(args)), open_devices, labels)
-
-
-def _serve(args: argparse.Namespace, settings: Config, open_devices: OpenDevices, labels: Labels | None = None) -> int:
-    """Run the box. labels: those with which a recording begins; None where nothing is recorded."""
-    stopped = stop_flag()
+    settings, stopped = load_settings(args), stop_flag()
     choice = None if settings.classifier.bundle else assembly.store(settings).choose()
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
         current = choice.bundle if choice else load_bundle(settings)
         devices = open_devices(lambda: current.format)
         port = assembly.port(settings, devices)
-        recording = _recording(args, settings, current, devices, port, labels, stack) if labels else None
         # not beside a trial: where the program dies, it must be clear which bundle it was
         shadow = None if trial else _shadow(settings, current, devices, args.shadow)
         facts = {
@@ -91,39 +89,77 @@ def _serve(args: argparse.Namespace, settings: Config, open_devices: OpenDevices
             "shadow": lambda: shadow.agreement.text if shadow else "",
         }
         observers: list[Observer | None] = [
-            Notifier(SystemClock()), trial, recording, shadow, *_reports(settings, current, facts, stack),
+            Notifier(SystemClock()), trial, shadow, *_reports(settings, current, facts, stack),
         ]  # fmt: skip
-        capture = CaptureWriter(args.capture, current.format) if args.capture else None
-        if capture:
-            stack.callback(capture.close)
         box = assembly.box(
-            settings, current, devices, port, stack, capture=capture, observers=[o for o in observers if o],
-            commands=recording.commands if recording else {},
+            settings, current, devices, port, stack, capture=_capture(args, current.format, stack),
+            observers=[o for o in observers if o],
         )  # fmt: skip
-
-        def done() -> bool:
-            enough = args.sweeps is not None and box.answered >= args.sweeps
-            return enough or stopped() or devices.finished(box.answered)
-
-        box.run(done)
+        box.run(_done(args, box, devices, stopped))
     return 0
 
 
-def _without_early_answers(settings: Config) -> Config:
-    return replace(settings, classifier=replace(settings.classifier, early=False))
+def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
+    """`palpate record`: each sweep is kept with its label. No bundle is needed: the skin says what it sends."""
+    from appliance.recording.recording import Labels, RecordingSession
+
+    labels = Labels(args.material, args.position, args.session)
+    settings, stopped = load_settings(args), stop_flag()
+    with ExitStack() as stack:
+        asked = skins.described(args.format) if args.format else None
+        devices = open_devices((lambda: asked) if asked else None)
+        fmt = asked or devices.format or _announced(devices.wire(settings), devices)
+        if args.window is not None:
+            fmt = replace(fmt, window=round(args.window * fmt.rate_hz))
+        _check_length(fmt, settings)
+        # a person at a terminal reads the log; sentences are for a robot, or for a program that reads the output
+        port = assembly.port(settings, devices) if settings.serial.port or not sys.stdout.isatty() else None
+        folder = args.out or Path(settings.store.folder) / "sweeps"
+        recording = RecordingSession(folder, fmt, labels, devices.clock, _sentences(port), args.target)
+        stack.callback(recording.close)
+        log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:g} s")
+        status = _status(settings, {"model": lambda: "none: sweeps are recorded"})
+        box = assembly.recorder(
+            settings, fmt, devices, port, stack, capture=_capture(args, fmt, stack),
+            observers=[Notifier(SystemClock()), recording, *status], commands=recording.commands,
+        )  # fmt: skip
+        box.run(_done(args, box, devices, stopped))
+    return 0
 
 
-def _recording(
-    args: argparse.Namespace, settings: Config, current: Bundle, devices: Devices, port: Port | None, labels: Labels,
-    stack: ExitStack,
-) -> RecordingSession:  # fmt: skip
-    from appliance.recording.recording import RecordingSession
+def _announced(settings: Config, devices: Devices) -> SweepFormat:
+    """The form that the skin announces. Raises SensorError, with what else would do."""
+    try:
+        return skins.announced(settings.sensor, devices)
+    except SensorError as e:
+        raise type(e)(f"{e}; or say what it sends, with --format 4x4:uint8:750, and it is waited for") from e
 
-    folder = args.out or Path(settings.store.folder) / "sweeps"
-    send = port.say if port else lambda line: None
-    recording = RecordingSession(folder, current.format, labels, devices.clock, send)
-    stack.callback(recording.close)
-    return recording
+
+def _check_length(fmt: SweepFormat, settings: Config) -> None:
+    """Raises ConfigError if no sweep could be as long as the window."""
+    if fmt.window * fmt.period_ns > settings.sweep.max_duration_s * 1e9:
+        raise ConfigError(
+            f"a window of {fmt.window / fmt.rate_hz:g} s is longer than any sweep may last "
+            f"({settings.sweep.max_duration_s:g} s); use a shorter --window, or raise sweep.max_duration_s"
+        )
+
+
+def _sentences(port: Port | None) -> Callable[[bytes], None]:
+    return port.say if port else lambda line: None
+
+
+def _capture(args: argparse.Namespace, fmt: SweepFormat, stack: ExitStack) -> CaptureWriter | None:
+    capture = CaptureWriter(args.capture, fmt) if args.capture else None
+    if capture:
+        stack.callback(capture.close)
+    return capture
+
+
+def _done(args: argparse.Namespace, box: Box, devices: Devices, stopped: Callable[[], bool]) -> Callable[[], bool]:
+    """True when the loop is to end: by a signal, after --sweeps answers, at the end of a script."""
+    return lambda: (
+        (args.sweeps is not None and box.answered >= args.sweeps) or stopped() or devices.finished(box.answered)
+    )
 
 
 def _reports(
@@ -137,14 +173,17 @@ def _reports(
         black_box = BlackBox(Path(settings.store.folder) / "black-box", current.format, settings.store.black_box)
         stack.callback(black_box.close)
         observers.append(black_box)
-    status = Path(settings.store.status)
-    if settings.store.status and os.access(status.parent, os.W_OK):
-        m = current.manifest
-        model = f"{m.name} {m.version}, {len(m.labels)} labels"
-        observers.append(
-            StatusFile(status, SystemClock(), lambda: {"model": model} | {name: text() for name, text in facts.items()})
-        )
-    return observers
+    m = current.manifest
+    model = f"{m.name} {m.version}, {len(m.labels)} labels"
+    return observers + _status(settings, {"model": lambda: model, **facts})
+
+
+def _status(settings: Config, facts: Mapping[str, Callable[[], str]]) -> list[Observer]:
+    """The file that `palpate status` reads, where the settings name one that can be written."""
+    path = Path(settings.store.status)
+    if not settings.store.status or not os.access(path.parent, os.W_OK):
+        return []
+    return [StatusFile(path, SystemClock(), lambda: {name: text() for name, text in facts.items()})]
 
 
 def _shadow(settings: Config, current: Bundle, devices: Devices, named: str | None) -> Shadow | None:
@@ -166,10 +205,18 @@ def _shadow(settings: Config, current: Bundle, devices: Devices, named: str | No
         return None
 
 
+def _open_any(open_devices: OpenDevices, settings: Config) -> Devices:
+    """The devices; a simulated skin sends what the bundle wants, where there is one and the skin can."""
+    try:
+        return open_devices(lambda: load_bundle(settings).format)
+    except (BundleError, FormatError):
+        return open_devices(None)
+
+
 def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     """`palpate check`: each component by itself, one line each; 1 where any fails."""
     settings = load_settings(args)
-    devices = open_devices(lambda: load_bundle(settings).format)
+    devices = _open_any(open_devices, settings)
     failed = 0
     for result in check(devices.wire(settings), lambda: load_bundle(settings), devices):
         print(f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}", flush=True)
@@ -181,7 +228,8 @@ def run_enrol(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     """`palpate enrol`: the box takes sweeps as always; of the good ones it makes a bundle with one label more."""
     from appliance.inference import enrolment
 
-    settings = _without_early_answers(load_settings(args))
+    settings = load_settings(args)
+    settings = replace(settings, classifier=replace(settings.classifier, early=False))
     current = load_bundle(settings)
     enrolment.admit(current, args.label)
     enrolment.check_target(args.out, args.replace)
@@ -210,15 +258,36 @@ def run_align(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     from appliance.alignment.view import Display
     from appliance.alignment.web import Page
 
+    if args.sim == "skin":  # its sweeps lift the finger for a tenth of a second; for this it rests
+        args.sim = "rest"
     settings = load_settings(args)
-    current = load_bundle(settings)
-    devices, stopped = open_devices(lambda: current.format), stop_flag()  # before anybody can read the page's address
+    devices = _open_any(open_devices, settings)
+    expected = _expected(devices.wire(settings), devices)
+    stopped = stop_flag()  # before anybody can read the page's address
     with ExitStack() as stack:
         pages = [stack.enter_context(Page(args.web, devices.clock))] if args.web is not None else []
         screen = stack.enter_context(Screen(sys.stdout, devices.clock, *(page.address for page in pages)))
         displays: list[Display] = [screen, *pages]
-        live.run(devices.wire(settings).sensor, current, devices, displays, stopped)
+        live.run(devices.wire(settings).sensor, expected, devices, displays, stopped)
     return 0
+
+
+def _expected(settings: Config, devices: Devices) -> Expected:
+    """What is known of the skin: by the bundle, where there is one that fits it or no skin yet."""
+    from appliance.alignment.live import Expected
+
+    current = None
+    try:
+        current = load_bundle(settings)
+    except BundleError as e:
+        log.warning(f"no bundle: {e}")
+    try:
+        fmt = devices.format or skins.announced(settings.sensor, devices)
+    except SensorError:
+        if not current:
+            raise
+        return Expected.by(current)  # the skin is waited for
+    return Expected.by(current) if current and fits(fmt, current.format) else Expected(fmt)
 
 
 def run_replay(args: argparse.Namespace) -> int:

@@ -20,6 +20,7 @@ from appliance.cli import bundle_commands, commands
 from appliance.cli.commands import OpenDevices, load_bundle, load_settings, stop_flag
 from appliance.cli.parser import parser
 from appliance.core.clock import SystemClock
+from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.log import to_stderr
@@ -59,21 +60,21 @@ def _with_devices(run: Callable[[argparse.Namespace, OpenDevices], int], args: a
     return run(args, partial(_open_devices, args))
 
 
-def _open_devices(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> Devices:
+def _open_devices(args: argparse.Namespace, fmt: Callable[[], SweepFormat] | None) -> Devices:
     """The real devices, or simulated ones where `--sim` names them; `fmt` gives what the simulated skin has to send."""
     if args.sim:
-        return _simulated(args.sim, fmt(), args, remember=False)
+        return _simulated(args.sim, fmt() if fmt else None, args, remember=False)
     if args.virtual:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
-    import gpiod
-
-    return Devices(SystemClock(), gpiod)
+    return Devices(SystemClock())
 
 
-def _simulated(name: str, fmt: SweepFormat, args: argparse.Namespace, *, remember: bool = True) -> SimDevices:
+def _simulated(
+    name: str, fmt: SweepFormat | None, args: argparse.Namespace, *, remember: bool = True, spread: bool = False
+) -> SimDevices:
     from appliance.sim import devices, rig, script
 
-    acts, source = script.named(name, fmt, args.seed)
+    acts, source, fmt = script.named(name, fmt, args.seed, spread=spread)
     clock = rig.VirtualClock() if args.virtual else SystemClock()
     return devices.build(fmt, islice(acts, args.sweeps), clock, source, remember=remember)
 
@@ -85,14 +86,14 @@ def run_demo(args: argparse.Namespace) -> int:
     settings = load_settings(args)
     bundle = load_bundle(settings)
     args.sweeps = args.sweeps or 12
-    devices = _simulated(args.sim or "skin", bundle.format, args)
+    devices = _simulated(args.sim or "skin", bundle.format, args, spread=True)
     stopped = stop_flag()
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
         show = demo.Demo(devices.robot.played, far_end, devices.clock, sys.stdout, raw=args.raw)
-        box = assembly.box(settings, bundle, devices, port, stack)
-        show.run(box, args.sweeps, stopped)
+        box = assembly.box(_on_lines(settings), bundle, devices, port, stack)
+        show.run(box, args.sweeps, lambda: stopped() or devices.finished(box.answered))
     return 0
 
 
@@ -106,7 +107,7 @@ def run_bench(args: argparse.Namespace) -> int:
     def build(devices: SimDevices, stack: ExitStack, observers: Iterable[Observer] = ()) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
-        return assembly.box(settings, bundle, devices, port, stack, observers=observers), far_end
+        return assembly.box(_on_lines(settings), bundle, devices, port, stack, observers=observers), far_end
 
     if args.part:
         print(json.dumps(bench_process.measure(args.part, bundle.format, build, args.acts)))
@@ -117,6 +118,11 @@ def run_bench(args: argparse.Namespace) -> int:
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
     return 0
+
+
+def _on_lines(settings: Config) -> Config:
+    """The settings with the trigger on lines, which the simulated robot drives."""
+    return replace(settings, trigger=replace(settings.trigger, mode="two-lines"))
 
 
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from appliance import __version__
+from appliance.core.config import TriggerConfig
 
 EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments; 65 a file of
 another form; 69 hardware is not there; 78 configuration or bundle; 130 interrupted. `run` waits for
@@ -38,8 +39,27 @@ def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argpars
     devices.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
     devices.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
     answers = argparse.ArgumentParser(add_help=False)
-    answers.add_argument("--sweeps", type=int, metavar="N", help="stop after N answers")
+    answers.add_argument("--sweeps", type=_count, metavar="N", help="stop after N answers")
     return common, devices, answers
+
+
+def _trigger() -> argparse.ArgumentParser:
+    """The options that say what starts and stops sweeps where there are no lines."""
+    trigger = argparse.ArgumentParser(add_help=False)
+    trigger.add_argument(
+        "--trigger", choices=get_args(get_type_hints(TriggerConfig)["mode"]), metavar="MODE",
+        help="trigger.mode: two-lines or one-line; serial: commands START and STOP; key: the space bar; timed",
+    )  # fmt: skip
+    trigger.add_argument("--every", type=float, metavar="S", help="timed: seconds from one start to the next (5)")
+    trigger.add_argument("--sweep", type=float, metavar="S", help="timed: seconds from start to stop (3)")
+    return trigger
+
+
+def _count(text: str) -> int:
+    """A number of sweeps, for argparse."""
+    if not text.isdecimal() or not 1 <= (number := int(text)) <= 1_000_000_000:
+        raise argparse.ArgumentTypeError(f"{text} is no number of sweeps; use a whole number from 1 on")
+    return number
 
 
 def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.ArgumentParser:
@@ -66,14 +86,15 @@ def _service_commands(
     add: Callable[..., Any], devices: argparse.ArgumentParser, answers: argparse.ArgumentParser
 ) -> None:
     """The commands that answer a robot."""
-    run = add("run", "classify sweeps until SIGTERM", devices, answers)
-    record = add("record", "the same, and keep each sweep with its label, for training", devices, answers)
+    trigger = _trigger()
+    run = add("run", "classify sweeps until SIGTERM", devices, answers, trigger)
+    run.add_argument(
+        "--shadow", nargs="?", const="", metavar="DIR",
+        help="also classify with the bundle in DIR, by default the candidate of the store; its answers are only compared",
+    )  # fmt: skip
+    record = add("record", "keep each sweep with its label, for training; needs no bundle", devices, answers, trigger)
     for command in (run, record):
         command.add_argument("--capture", type=Path, metavar="FILE", help="write all input to FILE, for replay")
-        command.add_argument(
-            "--shadow", nargs="?", const="", metavar="DIR",
-            help="also classify with the bundle in DIR, by default the candidate of the store; its answers are only compared",
-        )  # fmt: skip
     record.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the sweeps (default: sweeps/ in the store's folder)"
     )
@@ -81,7 +102,16 @@ def _service_commands(
         record.add_argument(
             f"--{name}", default="", metavar="TEXT", help="until a command on the serial line changes it"
         )
-    enrol = add("enrol", "learn one more material from a few sweeps, without training; write a new bundle", devices)
+    record.add_argument(
+        "--format", metavar="RxC:TYPE:HZ", help="what the skin sends, e.g. 5x3:float32:100 (default: what it announces)"
+    )
+    record.add_argument("--window", type=float, metavar="S", help="seconds of each sweep that are kept (default 2)")
+    record.add_argument(
+        "--target", type=_count, default=10, metavar="N", help="sweeps wanted per material and position (default 10)"
+    )
+    enrol = add(
+        "enrol", "learn one more material from a few sweeps, without training; write a new bundle", devices, trigger
+    )
     enrol.add_argument("label", metavar="LABEL", help="its name; all sweeps from now on are of this material")
     enrol.add_argument("--out", type=Path, required=True, metavar="DIR", help="the new bundle's folder")
     enrol.add_argument("--replace", action="store_true", help="replace a bundle at DIR")

@@ -47,15 +47,17 @@ class SensorConfig:
 
 @dataclass(frozen=True, slots=True)
 class TriggerConfig:
-    """The robot's lines into the box, by the kernel's names (`gpioinfo`); "" means not wired.
+    """What starts and stops a sweep: the robot's lines, by the kernel's names (`gpioinfo`; "" means not wired), or not a
+    line.
 
     mode: "two-lines": rising edges of `start` and `stop`. "one-line": `start` rises and falls, `stop` is not used.
+    "serial": commands on the serial line. "key": the space bar. "timed": a sweep of `sweep_s` every `every_s`.
     new_object: its rising edge announces another object. active_low: inverts all three lines.
     bias: the inputs' resistor. glitch_us: time for which a level must hold to count. storm_edges: largest number of
     edges in one burst; more are taken for a broken wire.
     """
 
-    mode: Literal["two-lines", "one-line"] = "two-lines"
+    mode: Literal["two-lines", "one-line", "serial", "key", "timed"] = "two-lines"
     start: str = gpio_line()
     stop: str = gpio_line()
     new_object: str = gpio_line()
@@ -63,6 +65,13 @@ class TriggerConfig:
     bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     glitch_us: int = number(500, 1, 1_000_000)
     storm_edges: int = number(2000, 2, 1_000_000)
+    every_s: float = number(5.0, 0.1, 3600.0)
+    sweep_s: float = number(3.0, 0.1, 3600.0)
+
+    @property
+    def by_lines(self) -> bool:
+        """Whether GPIO lines start and stop sweeps."""
+        return self.mode in ("two-lines", "one-line")
 
 
 @dataclass(frozen=True, slots=True)

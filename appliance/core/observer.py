@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from appliance.core.health import Health
-from appliance.core.types import Edge, Sweep, Verdict
+from appliance.core.types import Edge, Frames, Sweep, Verdict
 
 
 class Observer:
@@ -15,6 +15,9 @@ class Observer:
     No method may raise or wait: a full disk costs the record, never the classifying. What takes time belongs into
     `sweep` or `turn`, where all answers of the turn are out.
     """
+
+    def frames(self, frames: Frames) -> None:
+        """Frames have come, at least one."""
 
     def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
         """Edges have settled, by `t_ns`."""

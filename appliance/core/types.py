@@ -57,11 +57,17 @@ class Status(StrEnum):
     NOT_READY = "not-ready"
     EDGES_LOST = "edges-lost"
     ABORTED = "aborted"
+    RECORDED = "recorded"
 
     @property
     def classified(self) -> bool:
         """True if a label was computed."""
         return self in (Status.OK, Status.UNSURE, Status.UNDECIDED)
+
+    @property
+    def faulty(self) -> bool:
+        """True if there is a window, but its counts show that the skin did not measure a contact as it should."""
+        return self in (Status.NO_CONTACT, Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from appliance.bundle.bundle import GOLDEN_TOLERANCE, Bundle
 from appliance.bundle.manifest import MEANS
 from appliance.core.errors import BundleError
-from appliance.core.types import Status, Sweep, Verdict
+from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.novelty import Means
 from appliance.inference.session import ModelRunner
 from appliance.signal import features
@@ -93,6 +93,29 @@ class Classifier:
         """The constructor's settings, for sidecars, so that a replay classifies a recorded sweep by the same rule."""
         return {"how": self._fusion, "sure": self.min_probability, "most_sweeps": self._max_sweeps}
 
+    @property
+    def format(self) -> SweepFormat:
+        """The format of the sweeps that it takes."""
+        return self.bundle.format
+
+    @property
+    def model(self) -> str:
+        """The bundle's id."""
+        return self.bundle.id
+
+    def about(self) -> dict[str, Any]:
+        """For sidecars, so that a replay judges by the same rule. tare: [R, C] raw counts."""
+        return {"tare": self.tare.tolist(), "bundle": self.bundle.id, "rule": self.rule}
+
+    def tell(self) -> list[object]:
+        """The bundle's name, version, id and format."""
+        return [self.bundle.manifest.name, self.bundle.manifest.version, self.bundle.id, self.bundle.format]
+
+    def set_tare(self, taxels: NDArray[Any]) -> str:
+        """Take the mean of frames [n, R, C] as the unloaded skin, for the checks of contact."""
+        self.tare = taxels.mean(axis=0, dtype=np.float64)
+        return f"largest {self.tare.max():.1f} digits"
+
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window of raw counts [T, R, C] or [T, R, C, A]."""
         return self._classify(taxels)[0]
@@ -112,6 +135,10 @@ class Classifier:
     def embedding(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Embedding float32 [r] of one window of raw counts [T, R, C] or [T, R, C, A]; the model must have this output."""
         return self._run(("embedding",), taxels)[0]
+
+    def test(self) -> str:
+        """The result of `self_test` in words."""
+        return f"{len(self.bundle.golden)} golden sweeps differ by {self.self_test():.2g}"
 
     def self_test(self) -> float:
         """Run the golden sweeps; returns the largest difference of a probability. Raises BundleError if a label differs

@@ -24,7 +24,9 @@ from appliance.core.types import Verdict
 from appliance.io import serial_port
 
 TALKER = "PPLP"
-COMMANDS = ("ID", "STATE", "TEST", "TARE", "NEW", "ABORT", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD")
+COMMANDS = (
+    "ID", "STATE", "TEST", "TARE", "NEW", "ABORT", "START", "STOP", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD",
+)  # fmt: skip
 LABEL_COMMANDS = ("MATERIAL", "POSITION", "SESSION")
 """The commands that have a text after a comma."""
 MAX_LINE = 128
@@ -32,6 +34,9 @@ MAX_LINE = 128
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
 _UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
+_SENTENCE = re.compile(
+    rb"(?s:.*\$)?(?P<body>PPLP[, ](?P<name>[A-Za-z]{0,16})(?:[, ](?P<text>[ -#%-)+-~]*))?)(?:\*(?P<sum>[0-9A-Fa-f]{2}))?"
+)
 
 
 class Port(Protocol):
@@ -100,7 +105,7 @@ def result(v: Verdict, source: str) -> bytes:
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
     """The commands in `data`, which continues `rest`, and the new unfinished rest.
 
-    A checksum may be missing, so that a person can type commands, but not wrong. Each line gives one Command, however
+    A checksum may be missing, and commas be spaces, so that a person can type commands; no checksum may be wrong. Each line gives one Command, however
     it is split. A line of over MAX_LINE characters is reported once; the rest then holds one character more than these,
     so that the end of the line is not taken for a command.
     """
@@ -117,12 +122,11 @@ def _command(line: bytes) -> Command:
         return Command("", error=f"line of over {MAX_LINE} characters without an end")
     # the name holds letters only: it is sent back, and noise in its place could displace the fields of the answer
     # a sentence begins at its $: noise or a break may have left bytes before it
-    match = re.fullmatch(rb"(?s:.*\$)?PPLP,([A-Za-z]{0,16})(?:,([ -#%-)+-~]*))?(?:\*([0-9A-Fa-f]{2}))?", line.strip())
-    if not match:
-        return Command("", error=f"not a command; send for example $PPLP,ID*{checksum('PPLP,ID')}")
-    name = match[1].decode()
-    text, given = (None if group is None else group.decode() for group in match.group(2, 3))
-    body = f"{TALKER},{name}" + ("" if text is None else f",{text}")
+    match = _SENTENCE.fullmatch(line.strip())
+    if not match:  # examples are given without what a sentence cannot hold
+        return Command("", error=f"not a command; send for example {TALKER} ID")
+    name, body = match["name"].decode(), match["body"].decode()
+    text, given = (None if group is None else group.decode() for group in match.group("text", "sum"))
     if given and given.upper() != checksum(body):
         return Command(name, error=f"checksum {given} should be {checksum(body)}")
     return command(name, text)
@@ -133,8 +137,7 @@ def command(name: str, text: str | None = None) -> Command:
     if name not in COMMANDS or _UNSAFE.search(text or ""):
         return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
     if (name in LABEL_COMMANDS) != (text is not None):
-        want = f"{TALKER},{name}" + (",TEXT" if name in LABEL_COMMANDS else "")
-        return Command(name, error=f"send it as ${want}")
+        return Command(name, error=f"send it as {TALKER} {name}" + " TEXT" * (name in LABEL_COMMANDS))
     return Command(name, text or "")
 
 

@@ -45,6 +45,11 @@ class Trigger(Protocol):
         ...
 
     @property
+    def about(self) -> dict[str, str]:
+        """For the sidecar of a recorded sweep. mode: `trigger.mode`. times: what the time of an edge is."""
+        ...
+
+    @property
     def blind(self) -> bool:
         """True after LOST, until the levels are known again."""
         ...
@@ -88,6 +93,7 @@ class GpioTrigger:
         self._glitch_ns = config.glitch_us * 1000
         self._storm_edges = config.storm_edges
         self.edge_counters = EdgeCounters()
+        self.about = {"mode": config.mode, "times": "edge, stamped by the kernel"}
         self._pending: list[Edge] = []
         self._blind_ns: int | None  # newest edge since the levels became unknown; None: they are known
         roles = _roles(config)

@@ -236,7 +236,7 @@ class UsbSensor:
             self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
             return False
         try:
-            self._link = _open_link(self._config, self._backend, self._clock)
+            self._link = open_link(self._config, self._backend, self._clock)
             self.identity = self._check(self._link)
             self._link.request(packets.Request.START, 0)
         except SensorError as e:
@@ -249,18 +249,9 @@ class UsbSensor:
 
     def _check(self, board: SkinLink) -> packets.Identity:
         """Compare the board's identity and format with what this box and its bundle can use."""
-        try:
-            who = packets.unpack_identity(board.request(packets.Request.IDENTITY, 64))
-            if who.protocol != packets.VERSION:
-                raise SensorMismatch(
-                    f"the skin's firmware {'.'.join(map(str, who.firmware))} speaks protocol {who.protocol}, "
-                    f"this box speaks {packets.VERSION}; update the older of them"
-                )
-            skin = packets.unpack_format(board.request(packets.Request.FORMAT, 64))
-        except FormatError as e:
-            raise SensorMismatch(f"the skin does not answer as PROTOCOL.md says: {e}") from e
+        who, skin = ask(board)
         f = self._format
-        if (skin.shape, skin.dtype) != f.skin or abs(skin.rate_hz / f.rate_hz - 1) > RATE_TOLERANCE:
+        if not fits(skin, f):
             raise SensorMismatch(
                 f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, the bundle wants {f}; "
                 "plug in the skin that it was trained for, or deploy a bundle for this one"
@@ -303,7 +294,27 @@ class UsbSensor:
         self.state, self.trouble = state, trouble
 
 
-def _open_link(config: SensorConfig, backend: Any, clock: Clock) -> SkinLink:
+def fits(skin: packets.SkinFormat | SweepFormat, wanted: SweepFormat) -> bool:
+    """Whether a skin sends what a bundle or a recording wants; the length of a window is no matter of the skin."""
+    same_rate = abs(skin.rate_hz / wanted.rate_hz - 1) <= RATE_TOLERANCE
+    return (skin.shape, skin.dtype) == wanted.skin and same_rate
+
+
+def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
+    """What a board says about itself. Raises SensorMismatch if it is not as PROTOCOL.md says, or of another version."""
+    try:
+        who = packets.unpack_identity(board.request(packets.Request.IDENTITY, 64))
+        if who.protocol != packets.VERSION:
+            raise SensorMismatch(
+                f"the skin's firmware {'.'.join(map(str, who.firmware))} speaks protocol {who.protocol}, "
+                f"this box speaks {packets.VERSION}; update the older of them"
+            )
+        return who, packets.unpack_format(board.request(packets.Request.FORMAT, 64))
+    except FormatError as e:
+        raise SensorMismatch(f"the skin does not answer as PROTOCOL.md says: {e}") from e
+
+
+def open_link(config: SensorConfig, backend: Any, clock: Clock) -> SkinLink:
     """Find and open the configured board. Raises SensorError if it is absent, held, refused or of another kind."""
     # each kind is imported when it is used: most boxes use one of them for ever
     if config.link == "serial":

@@ -111,6 +111,7 @@ class Playback:
         self.trouble: SensorError | None = None
         self.identity: Identity | None = None
         self.counters = SensorCounters()
+        self.about = {"mode": "capture", "times": "as captured"}
         self.edge_counters = EdgeCounters()  # a capture holds the edges that were reported, none of the others
         self._stream = Stream(self.format, self.counters)
         self._records = deque(_records(path, data, begin))

@@ -20,17 +20,21 @@ from typing import Any
 from appliance.bundle.manifest import LABEL
 from appliance.core import storage
 from appliance.core.clock import Clock
-from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.errors import ApplianceError, ConfigError, FormatError
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
-from appliance.core.types import Status, Sweep, SweepFormat, Verdict, save
+from appliance.core.types import Status, Sweep, SweepFormat, Verdict, save, sidecar
 from appliance.io.robot_link import sentence
+from appliance.recording.progress import RecordingProgress
+from appliance.service.systemd import words
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errnos of a full disk."""
 LEAST_FREE = 64 << 20, 20
 """Space that is left free for the system: this many bytes, or on a small disk one part in this many. A card that is
 completely full can stop more than a recording."""
+TARGET = 10
+"""Sweeps that are wanted of each material at each position, where nothing else is asked for."""
 MOST_CHANGES = 1024
 """Number of label changes that are kept until the sweeps before them are answered; far more than a person makes."""
 _KEPT = re.compile(rf"sweep-([0-9]+)\.(?:npy|json)({re.escape(storage.PART)})?")
@@ -117,22 +121,26 @@ class Labels:
 
 
 class RecordingSession(Observer):
-    """Records each sweep that has a window, with the labels that applied at its start edge.
+    """Records each sweep that has a window, with the labels that applied at its start edge, and logs what is missing.
 
-    say: takes REC sentences. Raises ConfigError if the folder cannot be used.
+    say: takes REC sentences. target: sweeps that are wanted of each material at each position; sweeps of earlier runs in
+    the folder count. Raises ConfigError if the folder cannot be used, or holds sweeps of another form.
     """
 
     def __init__(
-        self, folder: Path, fmt: SweepFormat, labels: Labels, clock: Clock, say: Callable[[bytes], None]
-    ) -> None:
+        self, folder: Path, fmt: SweepFormat, labels: Labels, clock: Clock, say: Callable[[bytes], None],
+        target: int = TARGET,
+    ) -> None:  # fmt: skip
         try:
             self._folder = SweepFolder(folder, fmt)
         except OSError as e:
             raise ConfigError(f"--out {folder}: {e.strerror}; name a folder that can be written") from e
+        self._progress = RecordingProgress(target)
+        self._count_earlier(fmt)
         self._clock, self._say = clock, say
         # (valid from, labels): a command that comes during a sweep does not apply to it
         self._labels = deque([(0, labels)], MOST_CHANGES)
-        self._stored: list[int] = []
+        self._stored: list[tuple[int, Labels, Status]] = []
         self._log = TroubleLog("record")
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
             "MATERIAL": partial(self._change, "material"), "POSITION": partial(self._change, "position"),
@@ -153,6 +161,7 @@ class RecordingSession(Observer):
             outcome, detail = self._store(sweep, verdict, circumstances)
             trouble = "" if outcome == "stored" else outcome
             self._log.update(trouble, _report(outcome, sweep.id, detail, self._folder.folder))
+        self._tell(verdict, outcome, labels)
         self._say(
             sentence("REC", sweep.id, outcome, self.stored, labels.material, labels.position, labels.session, detail)
         )
@@ -160,7 +169,37 @@ class RecordingSession(Observer):
     def close(self) -> None:
         """Release the folder, and log how many sweeps were stored."""
         self._folder.close()
-        log.info(f"record: sweeps of this run in {self._folder.folder}: {self.stored}")
+        log.info(f"record: sweeps of this run in {self._folder.folder}: {self.stored}; {self._progress.missing()}")
+
+    def _count_earlier(self, fmt: SweepFormat) -> None:
+        """Count the sweeps that the folder holds already. Raises ConfigError for one of another form."""
+        for number in self._folder.numbers:
+            path = self._folder.path(number)
+            try:
+                about = sidecar(path)
+                form, status, labels = about["format"], Status(about["verdict"]["status"]), _labels(about)
+            except (FormatError, ConfigError, KeyError, TypeError, ValueError):
+                continue  # not one of ours, or damaged: train names it
+            if form != fmt.json():
+                self._folder.close()
+                raise ConfigError(
+                    f"{path} holds another form of sweeps than {fmt}, and a model is trained on one form; "
+                    "name another folder with --out"
+                )
+            self._count(labels, status)
+
+    def _count(self, labels: Labels, status: Status, sweeps: int = 1) -> None:
+        if not status.faulty:  # such a sweep is not trained on
+            self._progress.add(labels.material, labels.position, sweeps)
+
+    def _tell(self, verdict: Verdict, outcome: str, labels: Labels) -> None:
+        """Log what became of a sweep: for a person beside the robot, and for one at a terminal."""
+        if outcome in ("full", "failed"):
+            return  # that was logged when it began
+        if verdict.status.faulty or outcome != "stored":
+            log.warning(words(verdict) + "; it is not counted")
+        else:
+            log.info(f"{words(verdict)}; {self._progress.line(labels.material, labels.position)}")
 
     def _store(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> tuple[str, str]:
         """The outcome ("stored", "full" or "failed") and details for a person."""
@@ -173,9 +212,10 @@ class RecordingSession(Observer):
             number = self._folder.put(sweep, verdict, circumstances)
         except OSError as e:
             return "full" if e.errno in FULL else "failed", str(e.strerror)
-        self._stored.append(number)
-        # unknown materials are the purpose of a recording; a sweep with a faulty window should be discarded
-        fault = "" if verdict.status.classified or verdict.status is Status.UNKNOWN else f" {verdict.status}"
+        labels = Labels(sweep.material, sweep.position, sweep.session)
+        self._stored.append((number, labels, verdict.status))
+        self._count(labels, verdict.status)
+        fault = f" {verdict.status}" if verdict.status.faulty else ""
         return "stored", self._folder.path(number).stem + fault + " no material" * (not sweep.material)
 
     def _change(self, name: str, text: str) -> list[object]:
@@ -187,20 +227,26 @@ class RecordingSession(Observer):
     def _next(self, _: str) -> list[object]:
         position = self._labels[-1][1].position
         if not position.isdecimal():
-            raise ApplianceError(f"position {position!r} has no next one; begin with $PPLP,POSITION,1")
+            raise ApplianceError(f"position {position!r} has no next one; begin with PPLP POSITION 1")
         return self._change("position", str(int(position) + 1).zfill(len(position)))
 
     def _discard(self, _: str) -> list[object]:
         """Remove the last stored sweep of this run; returns its number, how many are left, and its file name."""
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
-        number = self._stored[-1]
+        number, labels, status = self._stored[-1]
         try:
             self._folder.remove(number)
         except OSError as e:
             raise ApplianceError(f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}") from e
         self._stored.pop()
+        self._count(labels, status, -1)
         return [number - self._folder.run, self.stored, self._folder.path(number).stem]
+
+
+def _labels(about: Mapping[str, Any]) -> Labels:
+    """The labels in a sidecar. Raises ConfigError or KeyError if they are none."""
+    return Labels(*(str(about[name]) for name in Labels.__slots__))
 
 
 def _report(outcome: str, sweep: int, detail: str, folder: Path) -> str:
@@ -208,4 +254,4 @@ def _report(outcome: str, sweep: int, detail: str, folder: Path) -> str:
     if outcome == "stored":
         return f"record: sweeps are stored again, from sweep {sweep} on"
     advice = f"make room in {folder}" if outcome == "full" else f"see that {folder} may be written"
-    return f"record: sweep {sweep} is not stored: {detail}; {advice}; classifying goes on"
+    return f"record: sweep {sweep} is not stored: {detail}; {advice}; the answers go on"

@@ -1,62 +1,133 @@
-"""How a box is put together. In: settings, a bundle, devices. Out: a Box; the simulator is not known here."""
+"""How a box is put together. In: settings, a bundle or none, devices. Out: a Box; the simulator is not known here."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from types import MappingProxyType
+from typing import Any
 
 from appliance.bundle.bundle import Bundle
 from appliance.core.clock import Clock, SystemClock
-from appliance.core.config import Config
+from appliance.core.config import Config, TriggerConfig
 from appliance.core.devices import Devices
 from appliance.core.errors import ConfigError
-from appliance.core.log import in_journal
+from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
+from appliance.core.types import SweepFormat
 from appliance.deployment.store import Store
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.io.gpio_lines import Lines
+from appliance.io.lineless_triggers import AnswerWatch, CommandTrigger, KeyTrigger, TimedTrigger, standard_input
 from appliance.io.robot_link import Port, SerialSink, StdoutPort
-from appliance.io.trigger import GpioTrigger
+from appliance.io.trigger import GpioTrigger, Trigger
 from appliance.io.usb_sensor import UsbSensor
 from appliance.io.verdict_lines import LineSink, check_bits
 from appliance.recording.capture import CaptureWriter
+from appliance.recording.sweep_check import SweepCheck
 from appliance.recording.sweep_window import SweepCutter
-from appliance.runtime.loop import Box, CommandHandler, Pipeline
+from appliance.runtime.loop import Answerer, Box, CommandHandler, Pipeline
+
+NO_COMMANDS: Mapping[str, CommandHandler] = MappingProxyType({})
 
 
 def box(
     settings: Config, bundle: Bundle, devices: Devices, port: Port | None, stack: ExitStack, *,
     capture: CaptureWriter | None = None, observers: Iterable[Observer] = (), labels: tuple[str, ...] = (),
-    commands: Mapping[str, CommandHandler] = MappingProxyType({}),
 ) -> Box:  # fmt: skip
-    """Put the components together; `stack` closes them again.
+    """The box that classifies; `stack` closes it again.
 
     capture: of all that comes in. labels: what the class bits must hold beside the bundle's labels.
     """
-    settings = devices.wire(settings)
-    missing = next((k for k in ("start", "stop") if not getattr(settings.trigger, k)), None)
-    if missing == "start" or (missing and settings.trigger.mode == "two-lines"):
-        raise ConfigError(
-            f"trigger.{missing} names no line, so no sweep can be cut; choose a board with --board, or use --sim"
-        )
     run = classifier(settings, bundle, devices.clock)
     run.self_test()
-    trigger = stack.enter_context(GpioTrigger(settings.trigger, devices.gpio))
-    lines = stack.enter_context(Lines(settings.output, devices.gpio, devices.clock))
-    sensor = UsbSensor(settings.sensor, bundle.format, devices.clock, devices.backend, capture)
+    return _assembled(
+        devices.wire(settings), run, devices, port, stack, capture, observers, NO_COMMANDS,
+        codes=(*bundle.manifest.labels, *labels), early=early_exit(settings, run),
+    )  # fmt: skip
+
+
+def recorder(
+    settings: Config, fmt: SweepFormat, devices: Devices, port: Port | None, stack: ExitStack, *,
+    capture: CaptureWriter | None = None, observers: Iterable[Observer] = (),
+    commands: Mapping[str, CommandHandler] = NO_COMMANDS,
+) -> Box:  # fmt: skip
+    """The box that records sweeps of a form and needs no bundle; the class bits stay 0. Other parameters as for `box`."""
+    check = SweepCheck(fmt, devices.clock)
+    watching = [check, *observers]
+    return _assembled(devices.wire(settings), check, devices, port, stack, capture, watching, commands)
+
+
+def _assembled(
+    settings: Config, answerer: Answerer, devices: Devices, port: Port | None, stack: ExitStack,
+    capture: CaptureWriter | None, observers: Iterable[Observer], commands: Mapping[str, CommandHandler], *,
+    codes: tuple[str, ...] = (), early: Decider | None = None,
+) -> Box:  # fmt: skip
+    """Put the components together. codes: labels that the class bits hold."""
+    watching = [*observers, *([capture] if capture else [])]
+    trigger = _trigger(settings.trigger, answerer.format, devices, port, stack)
+    if isinstance(trigger, KeyTrigger):
+        watching.append(AnswerWatch(trigger))
+    if isinstance(trigger, CommandTrigger):
+        commands = {**commands, **trigger.commands}
+    lines = _outputs(settings, devices, stack)
+    sensor = UsbSensor(settings.sensor, answerer.format, devices.clock, devices.backend, capture)
     stack.callback(sensor.close)
     if port:
         stack.callback(port.close)
-    watching = [*observers, *([capture] if capture else [])]
-    if settings.output.class_bits:  # last: it waits for output.settle_us
-        watching.append(LineSink(lines, (*bundle.manifest.labels, *labels)))
-    cutter = SweepCutter(bundle.format, settings.sweep)
+    if lines and settings.output.class_bits:  # last: it waits for output.settle_us
+        watching.append(LineSink(lines, codes))
+    cutter = SweepCutter(answerer.format, settings.sweep)
     return Box(
-        Pipeline(sensor, trigger, cutter, run, early_exit(settings, run)), devices.clock, port=port, panel=lines,
+        Pipeline(sensor, trigger, cutter, answerer, early), devices.clock, port=port, panel=lines,
         observers=watching, commands=commands, source=devices.source, state_s=settings.serial.state_s,
     )  # fmt: skip
+
+
+def _trigger(config: TriggerConfig, fmt: SweepFormat, devices: Devices, port: Port | None, stack: ExitStack) -> Trigger:
+    """What starts and stops sweeps. Raises ConfigError where the settings leave nothing that could."""
+    if config.mode == "serial":
+        if port is None or isinstance(port, StdoutPort):
+            raise ConfigError(
+                'trigger.mode = "serial" takes START and STOP from the serial line, but serial.port names none; '
+                "set it, or use --trigger key"
+            )
+        return CommandTrigger(devices.clock)
+    if config.mode == "key":
+        return stack.enter_context(KeyTrigger(standard_input(), devices.clock, log.info))
+    if config.mode == "timed":
+        window_s = fmt.window / fmt.rate_hz
+        if config.sweep_s < window_s:
+            raise ConfigError(
+                f"a sweep of {config.sweep_s:g} s is shorter than the window of {window_s:g} s; "
+                "use a longer --sweep (trigger.sweep_s)"
+            )
+        return TimedTrigger(config, devices.clock, log.info)
+    missing = next((k for k in ("start", "stop") if not getattr(config, k)), None)
+    if missing == "start" or (missing and config.mode == "two-lines"):
+        raise ConfigError(
+            f"trigger.{missing} names no line, so no sweep can be cut; choose a board with --board, "
+            "or do without lines: --trigger serial, key or timed"
+        )
+    return stack.enter_context(GpioTrigger(config, gpio(devices)))
+
+
+def _outputs(settings: Config, devices: Devices, stack: ExitStack) -> Lines | None:
+    """The lines to the robot, None where none is wired."""
+    out = settings.output
+    if not any((out.ready, out.busy, out.result_valid, out.fault, out.decided, *out.class_bits)):
+        return None
+    return stack.enter_context(Lines(out, gpio(devices), devices.clock))
+
+
+def gpio(devices: Devices) -> Any:
+    """The module gpiod, or its simulated double; imported only where a line is wired."""
+    if devices.gpio is not None:
+        return devices.gpio
+    import gpiod
+
+    return gpiod
 
 
 def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:

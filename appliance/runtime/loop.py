@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.clock import Clock
@@ -18,8 +17,7 @@ from appliance.core.errors import ApplianceError
 from appliance.core.health import Health
 from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
-from appliance.core.types import Status, Sweep, SweepFormat, Verdict, normal
-from appliance.inference.classifier import Classifier
+from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.early_exit import Decider
 from appliance.io.robot_link import Command, Port, sentence
 from appliance.io.trigger import Trigger
@@ -41,6 +39,40 @@ class Panel(Protocol):
         ...
 
 
+class Answerer(Protocol):
+    """Gives each sweep its verdict: the classifier, or while sweeps are only recorded what checks them."""
+
+    @property
+    def format(self) -> SweepFormat:
+        """The format of the sweeps."""
+        ...
+
+    @property
+    def model(self) -> str:
+        """The id of the bundle, "" without one."""
+        ...
+
+    def __call__(self, sweep: Sweep) -> Verdict:
+        """The verdict on one sweep."""
+        ...
+
+    def about(self) -> dict[str, Any]:
+        """What belongs into the sidecar of a recorded sweep, for JSON."""
+        ...
+
+    def tell(self) -> list[object]:
+        """The first fields of the answer to ID: name, version, id, format."""
+        ...
+
+    def test(self) -> str:
+        """What a self-test has found. Raises ApplianceError if it fails."""
+        ...
+
+    def set_tare(self, taxels: NDArray[Any]) -> str:
+        """Take frames [n, R, C] as the unloaded skin; what they show, for a person."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Pipeline:
     """What a sweep passes on its way to a verdict. early: answers sweeps that still go on, or None."""
@@ -48,7 +80,7 @@ class Pipeline:
     sensor: Sensor
     trigger: Trigger
     cutter: SweepCutter
-    classifier: Classifier
+    answerer: Answerer
     early: Decider | None = None
 
 
@@ -67,10 +99,11 @@ class Box:
     ) -> None:  # fmt: skip
         self.answered = 0
         self._sensor, self._trigger, self._cutter = pipeline.sensor, pipeline.trigger, pipeline.cutter
-        self._classifier, self._early = pipeline.classifier, pipeline.early
+        self._answerer, self._early = pipeline.answerer, pipeline.early
         self._clock, self._port, self._panel, self._commands = clock, port, panel, commands
         self._source, self._state_ns = source, round(state_s * 1e9)
         # only what an observer overrides is called, so nothing is computed that nobody wants
+        self._on_frames = [o.frames for o in observers if type(o).frames is not Observer.frames]
         self._on_edges = [o.edges for o in observers if type(o).edges is not Observer.edges]
         self._on_command = [o.command for o in observers if type(o).command is not Observer.command]
         self._on_answered = [o.answered for o in observers if type(o).answered is not Observer.answered]
@@ -90,7 +123,7 @@ class Box:
     @property
     def format(self) -> SweepFormat:
         """The format of the sweeps that it takes."""
-        return self._classifier.bundle.format
+        return self._answerer.format
 
     def newest_frame(self) -> NDArray[Any] | None:
         """The newest frame [R, C] or [R, C, A] of raw counts, None before the first."""
@@ -111,6 +144,9 @@ class Box:
         frames = self._sensor.read()
         now = self._clock.now_ns()
         self._cutter.put(frames, now)
+        if len(frames):
+            for come in self._on_frames:
+                come(frames)
         # before the edges of this turn: a capture gives frames and edges in turns of their own
         verdicts = self._decide(now)
         edges = self._trigger.edges(now)
@@ -155,7 +191,7 @@ class Box:
         return []
 
     def _answer(self, sweeps: list[Sweep]) -> list[Verdict]:
-        verdicts = [self._classifier(sweep) for sweep in sweeps]
+        verdicts = [self._answerer(sweep) for sweep in sweeps]
         for verdict in verdicts:
             self._send(verdict)
         self._pass_on(sweeps, verdicts)
@@ -201,7 +237,7 @@ class Box:
             streams=sensor.state == "streaming" and counters.frames > 0, sweeping=self._cutter.sweeping,
             answered=self.answered, frames=counters.frames, lost_frames=counters.lost_frames,
             garbage_bytes=counters.garbage_bytes, enumerations=counters.enumerations,
-            dropped=self._port.dropped if self._port else 0, bundle=self._classifier.bundle.id, source=self._source,
+            dropped=self._port.dropped if self._port else 0, bundle=self._answerer.model, source=self._source,
             stale_frames=counters.stale_frames, overflows=counters.overflows, fifo_overflows=counters.fifo_overflows,
             glitches=edges.glitches, lost_edges=edges.lost_edges, storms=edges.storms,
         )  # fmt: skip
@@ -210,16 +246,15 @@ class Box:
         """What belongs into the sidecar of a recorded sweep beside its frames, as it is now: for JSON.
 
         device: the board's name, serial number and firmware, None before it was asked. clock: see DeviceClock.quality.
-        tare: [R, C] or [R, C, A] raw counts.
+        trigger: see Trigger.about.
         """
         who = self._sensor.identity
         return {
             "device": asdict(who) if who else None,
             "clock": self._sensor.clock,
-            "tare": self._classifier.tare.tolist(),
-            "bundle": self._classifier.bundle.id,
-            "rule": self._classifier.rule,
+            "trigger": self._trigger.about,
             "source": self._source,
+            **self._answerer.about(),
         }
 
     def _state(self) -> list[object]:
@@ -243,25 +278,26 @@ class Box:
     def _carried_out(self, command: Command) -> list[object]:
         if command.name in self._commands:
             return self._commands[command.name](command.text)
+        if command.name in ("START", "STOP"):
+            raise ApplianceError("sweeps are triggered otherwise; set trigger.mode to serial")
         if command.name not in _COMMANDS:
             raise ApplianceError("nothing is recorded now; use palpate record")
         return _COMMANDS[command.name](self)
 
     def _identity(self) -> list[object]:
-        m, who = self._classifier.bundle.manifest, self._sensor.identity
+        who = self._sensor.identity
         skin = f"{who.board} {who.serial} {'.'.join(map(str, who.firmware))}" if who else "none"
-        return [m.name, m.version, self._classifier.bundle.id, m.format, skin]
+        return [*self._answerer.tell(), skin]
 
     def _self_test(self) -> list[object]:
-        return [f"{len(self._classifier.bundle.golden)} golden sweeps differ by {self._classifier.self_test():.2g}"]
+        return [self._answerer.test()]
 
     def _tare(self) -> list[object]:
         """Take the mean of the latest signal as the unloaded skin."""
-        frames = self._cutter.latest(max(1, round(TARE_S * self._classifier.bundle.format.rate_hz)))
+        frames = self._cutter.latest(max(1, round(TARE_S * self.format.rate_hz)))
         if frames is None or self._cutter.sweeping or self._sensor.state != "streaming":
             raise ApplianceError(f"tare needs {TARE_S} s of signal without loss and outside a sweep; try again")
-        self._classifier.tare = frames.mean(axis=0, dtype=np.float64)
-        return [f"largest {normal(self._classifier.tare, 0).max():.1f} digits"]
+        return [self._answerer.set_tare(frames)]
 
     def _new_object(self) -> list[object]:
         self._cutter.new_object()

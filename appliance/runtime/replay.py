@@ -156,7 +156,7 @@ class Judge:
             return ReplayResult(verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there")
         if verdict is None:
             return ReplayResult(verdict, DIFFERENT, "it was answered early, which this bundle does not do")
-        if not was:
+        if not (was and kept.bundle):  # recorded without a bundle
             return ReplayResult(verdict, SILENT)
         now = verdict.as_dict()
         changed = [_change(name, was[name], now.get(name)) for name in was if was[name] != now.get(name)]

@@ -11,13 +11,16 @@ from dataclasses import dataclass
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import Config
 from appliance.core.devices import Devices
-from appliance.core.errors import ApplianceError, PortError, SensorError
+from appliance.core.errors import ApplianceError, PortError, SensorError, SensorMismatch
+from appliance.core.types import SweepFormat, shown
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.io.gpio_lines import Lines
 from appliance.io.robot_link import SerialSink
+from appliance.io.skins import announced
 from appliance.io.trigger import GpioTrigger
-from appliance.io.usb_sensor import UsbSensor
+from appliance.io.usb_sensor import UsbSensor, fits
+from appliance.runtime.assembly import gpio
 
 LISTEN_S = 1.0
 """How long frames of the skin are counted."""
@@ -33,7 +36,7 @@ class CheckResult:
 
 
 def check(settings: Config, load: Callable[[], Bundle], devices: Devices) -> Iterator[CheckResult]:
-    """Check one component after another; the check goes on after one that fails."""
+    """Check one component after another; the check goes on after one that fails. The skin needs no bundle."""
     loaded: list[Bundle] = []
 
     def bundle() -> str:
@@ -52,11 +55,8 @@ def check(settings: Config, load: Callable[[], Bundle], devices: Devices) -> Ite
     yield _try("bundle", bundle)
     if loaded:
         yield _try("golden sweeps", golden)
-        yield _try("skin", lambda: _skin(settings, loaded[0], devices))
-    if settings.trigger.start:
-        yield _try("gpio lines", lambda: _lines(settings, devices))
-    else:
-        yield CheckResult("gpio lines", False, "trigger.start names no line; choose a board with --board")
+    yield _try("skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices))
+    yield from _triggered(settings, devices)
     if settings.serial.port:
         yield _try("serial port", lambda: _port(settings, devices))
 
@@ -68,8 +68,20 @@ def _try(component: str, look: Callable[[], str]) -> CheckResult:
         return CheckResult(component, False, str(e))
 
 
-def _skin(settings: Config, bundle: Bundle, devices: Devices) -> str:
-    sensor = UsbSensor(settings.sensor, bundle.format, devices.clock, devices.backend)
+def _skin(settings: Config, wanted: SweepFormat | None, devices: Devices) -> str:
+    """What the skin is and sends. wanted: by the bundle. Raises SensorError, also if the bundle is for another skin."""
+    fmt = announced(settings.sensor, devices)
+    sends = _listened(settings, fmt, devices)
+    if wanted and not fits(fmt, wanted):
+        raise SensorMismatch(
+            f"{sends}; the bundle wants {wanted}: record sweeps of this skin and train one (palpate record needs none), "
+            "or deploy a bundle for this skin"
+        )
+    return sends
+
+
+def _listened(settings: Config, fmt: SweepFormat, devices: Devices) -> str:
+    sensor = UsbSensor(settings.sensor, fmt, devices.clock, devices.backend)
     until_ns = devices.clock.now_ns() + round(LISTEN_S * 1e9)
     try:
         while devices.clock.now_ns() < until_ns:
@@ -79,13 +91,25 @@ def _skin(settings: Config, bundle: Bundle, devices: Devices) -> str:
         who = sensor.identity
         counters = sensor.counters
         name = f"{who.board} {who.serial}" if who else ""
-        return f"{name}, {counters.frames} frames in {LISTEN_S} s, {counters.lost_frames} lost"
+        form = f"{shown(fmt.shape)} {fmt.dtype} at {fmt.rate_hz:g} Hz"
+        return f"{name}, {form}, {counters.frames} frames in {LISTEN_S} s, {counters.lost_frames} lost"
     finally:
         sensor.close()
 
 
+def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:
+    if not settings.trigger.by_lines:
+        yield CheckResult("trigger", True, f"{settings.trigger.mode}, no lines")
+    elif settings.trigger.start:
+        yield _try("gpio lines", lambda: _lines(settings, devices))
+    else:
+        hint = "choose a board with --board, or set trigger.mode to serial, key or timed"
+        yield CheckResult("gpio lines", False, f"trigger.start names no line; {hint}")
+
+
 def _lines(settings: Config, devices: Devices) -> str:
-    with GpioTrigger(settings.trigger, devices.gpio), Lines(settings.output, devices.gpio, devices.clock) as lines:
+    module = gpio(devices)
+    with GpioTrigger(settings.trigger, module), Lines(settings.output, module, devices.clock) as lines:
         codes = lines.capacity
     inputs = [n for n in (settings.trigger.start, settings.trigger.stop, settings.trigger.new_object) if n]
     return f"inputs {' '.join(inputs)}, outputs for {codes} codes"

@@ -35,6 +35,7 @@ REASONS: Mapping[Status, str] = MappingProxyType(
         Status.NOT_READY: "a start edge while READY was low; the robot must wait for READY",
         Status.EDGES_LOST: "trigger edges were lost; look at the trigger lines",
         Status.ABORTED: "by command, or because the box was stopping",
+        Status.RECORDED: "sweeps are recorded, not classified",
     }
 )
 """Why a sweep has no label, and what to check; PROTOCOL.md has the details."""
@@ -102,6 +103,9 @@ def _watchdog_us(environ: Mapping[str, str]) -> int:
 
 def words(v: Verdict) -> str:
     """A verdict in words: "sweep 7: plastic rough, 98.7 % (1.2 ms)"."""
+    if v.status is Status.RECORDED:
+        filled = f"{v.lost} lost frames filled in" if v.lost else ""
+        return "; ".join(filter(None, (f"sweep {v.sweep}: recorded", filled, v.detail)))
     if not v.status.classified:
         why = "; ".join(filter(None, (REASONS[v.status], v.detail)))
         return f"sweep {v.sweep}: no answer, {v.status}: {why}"

@@ -1,6 +1,6 @@
 """Checks a window without a model: contact, saturation, stuck and dead taxels. In: raw counts. Out: a Finding.
 
-Pure functions, for the classifier and for recordings.
+Pure functions. `inspect` has the limits of a bundle; `inspect_bare` finds limits by what the unloaded skin gave.
 """
 
 from __future__ import annotations
@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.types import Status
+from appliance.core.types import Status, normal
+from appliance.signal.unloaded import UnloadedSkin
+
+FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
+"""Highest counts of usual converters; that of a skin is not announced."""
+SHARE = 0.1
+"""A loaded taxel has at least this share of the strongest one's load, as in the limits of a bundle (train/export/pack)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,19 +51,23 @@ def _taxels(mask: NDArray[np.bool_]) -> str:
     return "taxel " + (" " if mask.shape[2] == 1 else " and ").join(named)
 
 
-def inspect(taxels: NDArray[Any], tare: NDArray[np.float64], limits: WindowLimits) -> Finding:
+def inspect(
+    taxels: NDArray[Any], tare: NDArray[np.float64], limits: WindowLimits, *, either_way: bool = False
+) -> Finding:
     """Check a window before it is classified. taxels: raw counts [T, R, C] or [T, R, C, A]; tare: counts [R, C] or
     [R, C, A] of the unloaded skin.
 
     A taxel is loaded by its normal axis. A loaded taxel always varies, on each axis, so that a constant one is stuck. A
     constant unloaded taxel is dead if all its direct neighbours are loaded; at the edge of the contact it may be unloaded.
     One that gives no numbers is always dead. Shear has a sign, so that its axes are saturated at both ends.
+    either_way: a load may also lower the counts.
     """
     form = (*tare.shape, 1)[:3]  # [R, C, A]
     series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # [R * C * A, T]: three times as fast to reduce
     highest, lowest = series.max(axis=1), series.min(axis=1)
     still = (lowest == highest).reshape(form)
     load = series.mean(axis=1, dtype=np.float64).reshape(form) - tare.reshape(form)
+    load = np.abs(load) if either_way else load
     if not np.isfinite(load).all():  # possible with float32 counts; no output of the network is an answer then
         return Finding(Status.DEAD_TAXEL, _taxels(~np.isfinite(load)))
     loaded = load[..., -1:] >= limits.contact  # [R, C, 1]
@@ -95,3 +105,17 @@ def _enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
     padded[1:-1, 1:-1] = loaded
     enclosed: NDArray[np.bool_] = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     return enclosed
+
+
+def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:
+    """As `inspect`, for a skin of which no bundle says how strong a contact is, nor which count is the highest.
+
+    It refuses only what is certain: `no-contact` if no taxel differs from the unloaded skin, in either direction, and
+    `saturated` if the highest count is one of FULL_SCALES.
+    """
+    load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - unloaded.level, 0))
+    strongest = float(load.max(initial=0, where=np.isfinite(load)))
+    highest = float(taxels.max())
+    full_scale = highest if highest in FULL_SCALES else np.inf
+    limits = WindowLimits(max(unloaded.contact, SHARE * strongest), full_scale)
+    return inspect(taxels, unloaded.level, limits, either_way=True)

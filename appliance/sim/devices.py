@@ -29,12 +29,13 @@ class SimDevices(Devices):
     robot: rig.Robot
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the simulated lines and skin."""
+        """The settings with the simulated lines and skin; a trigger without lines stays."""
         ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": ""}
         sensor = replace(settings.sensor, **ids, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
-        trigger = replace(
-            settings.trigger, mode="two-lines", start=START, stop=STOP, new_object=NEW_OBJECT, active_low=False
-        )
+        wires = {"start": START, "stop": STOP, "new_object": NEW_OBJECT}
+        trigger = replace(settings.trigger, **wires, active_low=False)  # type: ignore[arg-type]
+        if trigger.by_lines:
+            trigger = replace(trigger, mode="two-lines")
         output = replace(
             settings.output, ready=READY, busy=BUSY, result_valid=RESULT_VALID, fault=FAULT, decided=DECIDED,
             class_bits=BITS,
@@ -62,4 +63,4 @@ def build(
         lines.watchers[DECIDED] = robot.react
     board = rig.Board(fmt, robot, clock)
     backend = usb.RigBackend(board, clock, acm=acm)
-    return SimDevices(clock=clock, gpio=lines, backend=backend, source=source, robot=robot)
+    return SimDevices(clock=clock, gpio=lines, backend=backend, source=source, robot=robot, format=fmt)

@@ -5,7 +5,7 @@ rest, or the sweeps of a recorded set, whose windows are exactly the middle of t
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,6 +28,8 @@ SLIDE_S, REST_S = 3.0, 0.1
 LEAD_S = 0.5
 """Time from an edge to a recorded window, equal to `sweep.lead_ms`; the window's first and last frame are repeated for
 this time."""
+LIFTED_SET_S = 0.4
+"""Time that the finger is lifted before a sweep of a set, which says nothing of the unloaded skin: all counts are 0."""
 RESTS_MM = (4.0, 3.0), (-2.5, 2.0), (1.5, -1.0), (0.0, 0.0)
 """Positions of the skin while somebody aligns it, each better than the last: (along the finger, across)."""
 RESTS_FOR_S, LIFTED_S = 3.0, 1.0
@@ -36,19 +38,24 @@ MARGIN = 8
 """Frames before the start edge and after the stop edge."""
 
 
-def named(name: str, fmt: SweepFormat, seed: int) -> tuple[Iterator[Act], str]:
-    """The script with this name after `--sim`, and the name of the source in sentences.
+def named(
+    name: str, fmt: SweepFormat | None, seed: int, *, spread: bool = False
+) -> tuple[Iterator[Act], str, SweepFormat]:
+    """The script with this name after `--sim`, the name of the source in sentences, and the format of its sweeps.
 
-    Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
+    fmt: what the bundle wants, None without one. spread: play the sweeps of a set in an order that is drawn, the
+    materials in turn. Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
     """
     if name in ("skin", "rest"):
         worlds = {world.format: world for world in (skin.WORLD, skin.World(shear=True))}
+        fmt = fmt or skin.FORMAT
         if fmt not in worlds:
             sent = " or ".join(map(str, worlds))
-            raise FormatError(f"the simulated skin sends {sent}, the bundle wants {fmt}; use --sim replay:FILE")
-        return (tubes if name == "skin" else rests)(seed, world=worlds[fmt]), "sim"
+            raise FormatError(f"the simulated skin sends {sent}, {fmt} is wanted; use --sim replay:FILE")
+        return (tubes if name == "skin" else rests)(seed, world=worlds[fmt]), "sim", fmt
     if name.startswith(SETS):
-        return replay(Path(name.removeprefix(SETS)), fmt), "replay"
+        sweeps = load(Path(name.removeprefix(SETS)), fmt)
+        return play(sweeps, in_turn(sweeps.labels, seed) if spread else range(len(sweeps))), "replay", sweeps.format
     raise ConfigError(f"--sim {name} is unknown; use skin, rest, or replay:FILE with a sweep set")
 
 
@@ -106,23 +113,38 @@ def rests(seed: int, world: skin.World = skin.WORLD) -> Iterator[Act]:
         yield Act(frames, off, len(frames) - 1, "wood")
 
 
-def replay(path: Path, fmt: SweepFormat) -> Iterator[Act]:
-    """The sweeps of a set in order, with NEW OBJECT where a recording begins. Raises FormatError if it is not of
-    `fmt`."""
+def load(path: Path, fmt: SweepFormat | None) -> SweepSet:
+    """The set at `path`. Raises FormatError if it is not of `fmt`."""
     sweeps = load_file(path, SweepSet)
-    if sweeps.format != fmt:
+    if fmt not in (None, sweeps.format):
         raise FormatError(
-            f"{path} holds {sweeps.format}, the bundle wants {fmt}; name its bundle with --set classifier.bundle=DIR"
+            f"{path} holds {sweeps.format}, {fmt} is wanted; name its bundle with --set classifier.bundle=DIR"
         )
-    return _play(sweeps)
+    return sweeps
 
 
-def _play(sweeps: SweepSet) -> Iterator[Act]:
-    begins = np.ones(len(sweeps), bool)
-    recording = sweeps.groups.get("recording", np.zeros(len(sweeps), int))
-    begins[1:] = recording[1:] != recording[:-1]
-    lead = round(LEAD_S * sweeps.format.rate_hz)
-    stop = MARGIN + 2 * lead + sweeps.format.window // 2 * 2  # even, so that a frame lies in the middle
-    for window, label, new in zip(sweeps.samples, sweeps.labels, begins & ("recording" in sweeps.groups), strict=True):
-        before, after = window[:1].repeat(MARGIN + lead, 0), window[-1:].repeat(MARGIN + lead, 0)
-        yield Act(np.concatenate([before, window, after]), MARGIN, stop, sweeps.materials[label], bool(new))
+def in_turn(labels: NDArray[Any], seed: int) -> list[int]:
+    """An order of sweeps in which the materials come in turn, in each round in another order. labels: int [N]."""
+    rng = np.random.default_rng(seed)
+    waiting = {label: rng.permutation(np.flatnonzero(labels == label)).tolist() for label in np.unique(labels).tolist()}
+    order = []
+    while waiting:
+        for label in rng.permutation(list(waiting)).tolist():
+            order.append(waiting[label].pop())
+        waiting = {label: left for label, left in waiting.items() if left}
+    return order
+
+
+def play(sweeps: SweepSet, order: Iterable[int]) -> Iterator[Act]:
+    """The sweeps of a set in this order, with NEW OBJECT where a recording begins."""
+    recording = sweeps.groups.get("recording")
+    before = None
+    lead, lifted = (round(s * sweeps.format.rate_hz) for s in (LEAD_S, LIFTED_SET_S))
+    start = lifted + MARGIN
+    stop = start + 2 * lead + sweeps.format.window // 2 * 2  # even, so that a frame lies in the middle
+    for i in order:
+        window, now = sweeps.samples[i], None if recording is None else recording[i]
+        ahead, after = window[:1].repeat(MARGIN + lead, 0), window[-1:].repeat(MARGIN + lead, 0)
+        frames = np.concatenate([np.zeros((lifted, *window.shape[1:]), window.dtype), ahead, window, after])
+        yield Act(frames, start, stop, sweeps.materials[sweeps.labels[i]], now is not None and now != before)
+        before = now

@@ -28,7 +28,7 @@ TACTMAT_HZ = 750.0
 (sec. II.A). A `rate_hz` in the file takes precedence."""
 NAMED = ("position", "session")
 """What a recording may name, beside its material."""
-REFUSED = (Status.NO_CONTACT, Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
+REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to a window that it does not classify."""
 NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 """A name that is a whole number; 07 is not one, or it would equal 7."""

@@ -21,11 +21,12 @@ import numpy as np
 import pytest
 
 from appliance.alignment import live
-from appliance.alignment.live import Alignment
-from appliance.alignment.terminal import ASCII, BLOCKS, ENTER, LEAVE, Canvas, Screen
+from appliance.alignment.live import Alignment, Expected
+from appliance.alignment.terminal import ASCII, BLOCKS, ENTER, LEAVE, Canvas, Screen, line
 from appliance.alignment.view import View
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle, Manifest
+from appliance.cli.main import main
 from appliance.core import config
 from appliance.core.config import SensorConfig
 from appliance.signal.contact import ContactPositions
@@ -42,10 +43,10 @@ def model(default_bundle: Bundle) -> Bundle:
     return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE))
 
 
-def views_of(simulated: devices.SimDevices, model: Bundle) -> Callable[[float], list[View]]:
+def views_of(simulated: devices.SimDevices, model: Bundle | Expected) -> Callable[[float], list[View]]:
     """A function that reads the skin of `simulated` for some seconds and returns the Views of this time."""
     settings = simulated.wire(config.load(None, [], site=NO_SITE))
-    alignment = Alignment(settings.sensor, model, simulated)
+    alignment = Alignment(settings.sensor, model if isinstance(model, Expected) else Expected.by(model), simulated)
 
     def views(seconds: float) -> list[View]:
         seen, end_ns, next_ns = [], simulated.clock.now_ns() + round(seconds * SECOND), simulated.clock.now_ns()
@@ -127,6 +128,41 @@ def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
     assert "export it again" in last.hint
     assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
     assert last.nearest is None
+
+
+def test_without_a_bundle_the_contact_alone_is_shown(model: Bundle):
+    """A skin that no bundle is for: load and centre, in taxels; what is a contact comes from the unloaded skin."""
+    seen = views_of(resting(), Expected(model.format))(14.5)
+    assert [state for state in states(seen) if state != "wait"][:2] == ["no-contact", "no-positions"]
+    last = [v for v in seen if v.centre][-1]
+    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
+    assert (last.bundle, last.place, last.unit) == ("none for this skin", None, "taxels")
+    assert "no bundle fits this skin" in last.hint
+
+
+@pytest.mark.parametrize(("source", "word"), [("usb", ""), ("sim", "SIMULATED"), ("replay", "REPLAYED")])
+def test_a_view_says_what_it_is_of(source: str, word: str):
+    """A replayed set is not called simulated; a real skin is not called anything."""
+    shown = Canvas(replace(VIEW, source=source), ASCII, 80, 24, "").lines(False)[0]
+    assert shown.endswith(word or VIEW.bundle)
+    assert line(replace(VIEW, source=source)).startswith(f"{word}  " * bool(word) + VIEW.message)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("which", "want"), [("skin", "SIMULATED"), ("replay", "REPLAYED")])
+def test_align_with_what_is_simulated(
+    which: str, want: str, tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):  # fmt: skip
+    """`align --sim skin` and `--sim replay:SET` find a contact, and say what they are."""
+    np.savez(tmp_path / "s.npz", samples=default_bundle.golden, labels=[0, 1], materials=["a", "b"], rate_hz=750.0)
+    turns = iter(range(1200))
+    monkeypatch.setattr("appliance.cli.commands.stop_flag", lambda: lambda: next(turns, None) is None)
+    name = which if which == "skin" else f"replay:{tmp_path / 's.npz'}"
+    assert main(["align", "--sim", name, "--virtual"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert all(text.startswith(want) for text in lines)
+    assert any("centre row" in text for text in lines)
 
 
 def test_another_skin_shape(model: Bundle):
@@ -231,7 +267,11 @@ def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("appliance.alignment.terminal.LINE_NS", 0)
     settings = simulated.wire(config.load(None, [], site=NO_SITE))
     live.run(
-        settings.sensor, model, simulated, [Screen(out, simulated.clock)], lambda: simulated.clock.now_ns() >= end_ns
+        settings.sensor,
+        Expected.by(model),
+        simulated,
+        [Screen(out, simulated.clock)],
+        lambda: simulated.clock.now_ns() >= end_ns,
     )
     assert 24 <= len(out.getvalue().splitlines()) <= 26
     assert not simulated.backend.board.running
@@ -241,7 +281,7 @@ def test_a_denied_skin_is_named(model: Bundle):
     """The View says why the skin cannot be read and what helps; the command goes on."""
     simulated = idle_devices()
     simulated.backend.errors["open"] = errno.EACCES
-    alignment = Alignment(SensorConfig(), model, simulated)
+    alignment = Alignment(SensorConfig(), Expected.by(model), simulated)
     alignment.read()
     view = alignment.view()
     assert (view.state, view.skin, view.message) == ("no-skin", "denied", "no skin: denied")

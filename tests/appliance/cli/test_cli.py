@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import errno
+import fcntl
 import json
 import os
+import select
 import shutil
 import signal
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -17,10 +21,12 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Early
+from appliance.cli import main as main_module
 from appliance.cli.main import main
 from appliance.core import statistics
 from appliance.core.clock import SystemClock
-from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError
+from appliance.core.devices import Devices
+from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError, SensorError
 from appliance.core.types import Frames, Status, Sweep, save
 from appliance.inference.classifier import Classifier
 from appliance.sim import skin
@@ -65,9 +71,10 @@ def test_run_on_a_serial_port():
 
 
 def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]):
-    """`record --capture`, then `replay` of either: the same labels and probabilities."""
-    where = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
-    assert main(["record", "--sim", "skin", *VIRTUAL, *where]) == 0
+    """`run --capture` with a black box, then `replay` of either, and of the same sweeps recorded without a bundle: the
+    same labels and probabilities."""
+    kept = ["--set", f"store.folder={tmp_path}", "--set", "store.black_box=9"]
+    assert main(["run", "--sim", "skin", *VIRTUAL, "--capture", str(tmp_path / "c"), *kept]) == 0
 
     def output() -> list[list[bytes]]:
         return [line.split(b",")[4:8] for line in capsysbinary.readouterr().out.splitlines() if b",RES," in line]
@@ -75,9 +82,14 @@ def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsysbinary: pyt
     first = output()
     assert main(["replay", str(tmp_path / "c")]) == 0
     assert output() == first
-    for path in sorted((tmp_path / "kept").glob("*.npy")):
-        assert main(["replay", str(path)]) == 0
+    assert main(["replay", str(tmp_path / "black-box")]) == 0
     assert output() == first
+    recorded = ["--out", str(tmp_path / "sweeps"), "--capture", str(tmp_path / "d")]
+    assert main(["record", "--sim", "skin", *VIRTUAL, *recorded]) == 0
+    assert {status for status, *_ in output()} == {b"recorded"}
+    for what in ("sweeps", "d"):
+        assert main(["replay", str(tmp_path / what)]) == 0
+        assert output() == first
 
 
 def test_a_full_disk_costs_the_recording_never_the_classifying(
@@ -154,8 +166,8 @@ def test_the_sequential_test_is_configured(
         "--set",
         "classifier.fuse=product",
     ]
-    played = ["record", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
-    kept = ["--out", str(tmp_path / "kept"), "--capture", str(tmp_path / "c")]
+    played = ["run", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
+    kept = ["--capture", str(tmp_path / "c"), "--set", f"store.folder={tmp_path}", "--set", "store.black_box=9"]
 
     def output() -> list[bytes]:
         return [r.split(b",")[4] for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
@@ -165,9 +177,9 @@ def test_the_sequential_test_is_configured(
     assert output()[:2] == [b"unsure", b"undecided"]
     assert main(["replay", str(tmp_path / "c"), *never]) == 0
     assert output()[:2] == [b"unsure", b"undecided"]
-    assert main(["replay", str(next((tmp_path / "kept").glob("*.npy"))), *never]) == 0
+    assert main(["replay", str(next((tmp_path / "black-box").glob("*.npy"))), *never]) == 0
     assert output() == [b"unsure"]
-    assert main(["run", *played[1:]]) == 0
+    assert main(played) == 0
     assert output() == [b"ok"] * 3
 
 
@@ -220,6 +232,83 @@ def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "FAIL  bundle" in capsys.readouterr().out
 
 
+def test_check_needs_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Without a bundle the skin is checked all the same; one for another skin is named with both forms and what to do."""
+    skin_and_no_bundle = ["check", "--sim", "skin", "--virtual", "--set", f"classifier.bundle={tmp_path / 'none'}"]
+    assert main(skin_and_no_bundle) == 1
+    assert [line[:20].split()[:2] for line in capsys.readouterr().out.splitlines()] == [
+        ["FAIL", "bundle"], ["ok", "skin"], ["ok", "gpio"],
+    ]  # fmt: skip
+    other = toy_bundle.put(tmp_path / "toy", toy_bundle.files())
+    assert main(["check", "--sim", "skin", "--virtual", "--set", f"classifier.bundle={other}"]) == 1
+    (fail,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL")]
+    assert "4x4 uint8 at 750 Hz, 750 frames in 1.0 s, 0 lost; the bundle wants 2x2 int16 at 100 Hz" in fail
+    assert "palpate record" in fail
+
+
+@pytest.mark.parametrize("mode", ["serial", "key", "timed"])
+def test_check_of_a_trigger_without_lines(mode: str, capsys: pytest.CaptureFixture[str]):
+    """No line is asked for."""
+    assert main(["check", "--sim", "skin", "--virtual", "--set", f"trigger.mode={mode}"]) == 0
+    assert f"ok    trigger        {mode}, no lines" in capsys.readouterr().out
+
+
+def test_record_on_a_machine_without_gpio(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """A PC: no line is wired, gpiod cannot be imported, no bundle is there; sweeps by the clock are recorded."""
+    simulated = main_module._simulated("skin", None, argparse.Namespace(seed=1, sweeps=None, virtual=True))
+    plain = Devices(simulated.clock, None, simulated.backend, "sim")
+    monkeypatch.setattr(main_module, "Devices", lambda clock: plain)
+    monkeypatch.setitem(sys.modules, "gpiod", None)
+    monkeypatch.setattr("appliance.cli.commands.load_bundle", None)
+    code = main(["record", "--every", "4", "--sweeps", "3", "--out", str(tmp_path), "--material", "wood"])
+    assert code == 0
+    assert len([*tmp_path.glob("*.npy")]) == 3
+    about = json.loads((tmp_path / "sweep-000001.json").read_text())
+    assert about["trigger"] == {"mode": "timed", "times": "clock of the box"}
+    assert about["format"] == skin.FORMAT.json()
+    assert about["verdict"]["status"] == "recorded"
+    output = capsys.readouterr()
+    assert output.out.count(",RES,") == 3
+    assert "palpate: start: slide for 3 s" in output.err
+
+
+def test_record_takes_a_set_of_any_form(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """`record --sim replay:SET` of a skin that no bundle is for: each window comes out as it went in."""
+    samples = np.random.default_rng(1).integers(100, 4000, (3, 40, 5, 3)).astype(np.int16)
+    np.savez(tmp_path / "s.npz", samples=samples, labels=[0, 0, 1], materials=["a", "b"], rate_hz=50.0)
+    assert main(["record", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--out", str(tmp_path / "kept")]) == 0
+    kept = [np.load(path)["taxels"] for path in sorted((tmp_path / "kept").glob("*.npy"))]
+    assert np.array_equal(kept, samples)
+    assert capsys.readouterr().out.count(",recorded,") == 3
+
+
+@pytest.mark.slow
+def test_the_space_bar_in_a_real_terminal(tmp_path: Path):
+    """`palpate record --trigger key` as a person uses it: lines and no sentences; Ctrl-C ends it, the terminal is as
+    before."""
+    far, near = os.openpty()
+    before = termios.tcgetattr(near)
+    command = [sys.executable, "-m", "appliance", "record", "--sim", "skin", "--trigger", "key", "--material", "wood"]
+    with subprocess.Popen(
+        [*command, "--out", str(tmp_path)], stdin=near, stdout=near, stderr=near, start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(near, termios.TIOCSCTTY, 0),
+    ) as run:  # fmt: skip
+        shown = b""
+        for until, key in ((b"streaming", b" "), (b"bar stops the sweep", b" "), (b"no answer, short", b"\x03")):
+            while until not in shown and select.select([far], [], [], 60)[0]:
+                shown += os.read(far, 65536)
+            assert until in shown, run.kill()
+            os.write(far, key)
+        assert run.wait(timeout=60) == 0
+    assert termios.tcgetattr(near) == before
+    os.close(near)
+    os.close(far)
+    assert b"$PPLP" not in shown
+    assert b"the space bar starts a sweep and stops it" in shown
+
+
 def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
     """Each value with the file it comes from."""
     assert main(["config", "--board", "rpi5", "--set", "sweep.max_duration_s=9"]) == 0
@@ -247,17 +336,33 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (["replay", "/nowhere"], FormatError, "cannot be read"),
         (["replay", "/nowhere.npy"], FormatError, "not a recorded sweep"),
         (["record", "--sim", "skin", "--virtual", "--out", "/proc/x"], ConfigError, "--out /proc/x"),
+        (["record", "--material", "wood"], SensorError, "or say what it sends, with --format 4x4:uint8:750"),
+        (["record", "--format", "4x4:uint8:750", "--out", "OUT"], ConfigError, "--trigger serial, key or timed"),
+        (["record", "--format", "4:uint8"], ConfigError, "--format 4:uint8: not understood; give rows x columns"),
+        (["record", "--format", "4x4:uint9:10"], ConfigError, "--format 4x4:uint9:10: data type 'uint9' is unknown"),
+        (["record", "--format", "4x4:uint8:10", "--window", "13"], ConfigError, "use a shorter --window"),
+        (["record", "--sim", "skin", "--virtual", "--window", "0"], FormatError, "a window of 0 frames is empty"),
+        (["record", "--sim", "skin", "--format", "2x2:uint8:10"], FormatError, "2x2 uint8 at 10 Hz"),
+        (["run", "--trigger", "serial"], ConfigError, "serial.port names none"),
+        (["run", "--trigger", "key"], ConfigError, "standard input is no terminal"),
+        (["run", "--trigger", "key", "--every", "3"], ConfigError, "--every and --sweep are for --trigger timed"),
+        (["run", "--every", "3"], ConfigError, "a sweep of 3 s every 3 s leaves no pause"),
+        (["run", "--sweep", "0"], ConfigError, "trigger.sweep_s = 0.0 is not allowed"),
         (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], ConfigError, "--capture /proc/x"),
     ],
 )
-def test_exit_codes(args: list[str], trouble: type[ApplianceError], hint: str, capsys: pytest.CaptureFixture[str]):
+def test_exit_codes(
+    args: list[str], trouble: type[ApplianceError], hint: str, capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):  # fmt: skip
     """Each kind of trouble has its exit code and one line that says what to do."""
     if "rpi5" in args and trouble is LineError and any(Path("/dev").glob("gpiochip*")):
         pytest.skip("this machine has gpio chips")
-    assert main(args) == trouble.exit_code
-    err = capsys.readouterr().err.strip()
-    assert hint in err
-    assert len(err.splitlines()) == 1
+    monkeypatch.setattr("sys.stdin", None)
+    assert main([str(tmp_path) if arg == "OUT" else arg for arg in args]) == trouble.exit_code
+    err = [line for line in capsys.readouterr().err.splitlines() if ": record: " not in line]
+    assert hint in err[0]
+    assert len(err) == 1
 
 
 @pytest.mark.parametrize("key", ["samples", "labels", "materials", "rate_hz"])

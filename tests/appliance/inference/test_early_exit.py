@@ -511,7 +511,7 @@ def test_a_set_is_played_so_that_early_answers_see_it(tmp_path: Path):
     """The recorded window begins `sweep.lead_ms` (as delivered) after the start edge and lies in the middle."""
     windows = np.random.default_rng(0).integers(0, 256, (2, 100, 2, 2)).astype(np.uint8)
     np.savez(tmp_path / "s.npz", samples=windows, labels=[0, 1], materials=["left", "right"], rate_hz=100.0)
-    for act, window in zip(script.replay(tmp_path / "s.npz", FMT), windows, strict=True):
+    for act, window in zip(script.play(script.load(tmp_path / "s.npz", FMT), range(2)), windows, strict=True):
         first = act.start + round(SweepConfig().lead_ms / 1000 * FMT.rate_hz)
         assert (act.frames[first:][:100] == window).all()
         assert (act.start + act.stop) // 2 - 50 == first

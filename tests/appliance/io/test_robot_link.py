@@ -93,6 +93,8 @@ def test_checksums_agree(text: str):
         (b"$PPLP,ID*" + checksum("PPLP,ID").encode(), Command("ID")),
         (b"$PPLP,TARE", Command("TARE")),
         (b"PPLP,NEW", Command("NEW")),
+        (b"PPLP ID", Command("ID")),
+        (b"PPLP MATERIAL plastic rough", Command("MATERIAL", "plastic rough")),
         (b"\0$PPLP,ID", Command("ID")),
         (b"$PPLP,TAR\xff$PPLP,ABORT", Command("ABORT")),
         (b"$PPLP,ABORT*" + checksum("PPLP,ABORT").lower().encode(), Command("ABORT")),
@@ -119,6 +121,16 @@ def test_bad_commands_are_answered(line: bytes, hint: str):
     (command,), rest = parse(line + b"\n")
     assert hint in command.error
     assert rest == b""
+
+
+@pytest.mark.parametrize("line", [b"ID", b"help", b"$PPLP,MATERIAL", b"$PPLP,ID,now", b"\xff"])
+def test_the_example_of_an_error_can_be_copied(line: bytes):
+    """Whatever was typed, what the ANS sentence says to send is understood: nothing of it was lost to NMEA's characters."""
+    ((bad,), _) = parse(line + b"\r\n")
+    heard = sentence("ANS", bad.name, "error", bad.error).decode("ascii")
+    example = re.search(r"(?:send for example|send it as) ([^,*]+)", heard)[1]
+    ((good,), _) = parse(example.encode() + b"\r\n")
+    assert not good.error
 
 
 def test_a_line_without_end_is_dropped():

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from appliance.bundle.manifest import Thresholds
 from appliance.core.types import Status, shape
-from appliance.signal.window_check import inspect
+from appliance.signal.unloaded import UnloadedSkin
+from appliance.signal.window_check import inspect, inspect_bare
 
 LIMITS = Thresholds(contact=10, full_scale=255, saturated=0.01)
 BARE = np.zeros((4, 4))
@@ -137,3 +138,47 @@ def test_any_window_gets_a_status(n: int, rows: int, cols: int, axes: int, sprea
     form = shape(rows, cols, axes)
     taxels = np.random.default_rng(seed).integers(0, spread + 1, (n, *form)).astype(np.uint8)
     assert inspect(taxels, np.zeros(form), LIMITS).status in Status
+
+
+UNLOADED = UnloadedSkin.measured(np.random.default_rng(1).integers(9, 12, (100, 4, 4)).astype(np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "status", "detail"),
+    [
+        (np.s_[:, :, :], 10, Status.NO_CONTACT, "digits"),
+        (np.s_[:, 1, 2], 90, Status.STUCK_TAXEL, "taxel 2.3"),
+        (np.s_[:, 1, 2], 10, Status.DEAD_TAXEL, "taxel 2.3"),
+        (np.s_[:, 0, 1], 255, Status.SATURATED, "taxel 1.2"),
+    ],
+)
+def test_faults_are_found_without_a_bundle(place, value: int, status: Status, detail: str):
+    """Contact, stuck and dead taxels by comparison with the unloaded skin, saturation by the highest count."""
+    taxels = moving()
+    assert inspect_bare(taxels, UNLOADED).status is Status.OK
+    taxels[place] = value
+    found = inspect_bare(taxels, UNLOADED)
+    assert found.status is status
+    assert detail in found.detail
+
+
+def test_a_skin_whose_counts_fall_under_load():
+    """A load is a difference in either direction."""
+    falling = UnloadedSkin(np.full((4, 4), 200.0), np.ones((4, 4)), 5.0)
+    assert inspect_bare(moving(80), falling).status is Status.OK
+    assert inspect_bare(moving(200), falling).status is Status.NO_CONTACT
+
+
+@pytest.mark.parametrize(("bits", "status"), [(10, Status.SATURATED), (12, Status.SATURATED), (11, Status.OK)])
+def test_the_full_scale_of_usual_converters(bits: int, status: Status):
+    """Counts of ten bits in sixteen are saturated at 1023; a limit that no usual converter has is not guessed."""
+    taxels = moving().astype(np.uint16)
+    taxels[::10, 1:3, 1:3] = 2**bits - 1
+    assert inspect_bare(taxels, UNLOADED).status is status
+
+
+def test_a_weak_contact_at_the_edge_is_no_fault():
+    """Taxels beside the contact, constant at a little more than nothing, are neither stuck nor dead."""
+    taxels = moving(120)
+    taxels[:, 3] = 13
+    assert inspect_bare(taxels, UNLOADED).status is Status.OK

@@ -5,10 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from appliance.bundle.bundle import Bundle
 from appliance.cli.main import main
+from appliance.sim import script
 from appliance.tools import demo
 from tests.factories.simulated_box import numbered
 
@@ -33,6 +37,57 @@ def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
     assert first.count(",RES,") == 3
     main(["demo", "--raw", *VIRTUAL])
     assert capsys.readouterr().out == first
+
+
+def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:
+    """A set of three materials in the order of a file: all of the first, then all of the next. The name of its script."""
+    samples = np.repeat(bundle.golden[:1], 3 * each, axis=0)
+    np.savez(
+        folder / "s.npz", samples=samples, labels=np.repeat(np.arange(3), each), materials=["a", "b", "c"],
+        rate_hz=bundle.format.rate_hz, group_recording=np.repeat(np.arange(3), each),
+    )  # fmt: skip
+    return f"replay:{folder / 's.npz'}"
+
+
+def test_demo_of_a_set_shows_its_materials_in_turn(
+    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
+):
+    """Three sweeps of a set of three materials show each once, also where the file has them one after another."""
+    assert main(["demo", *VIRTUAL, "--sim", played_set(tmp_path, default_bundle)]) == 0
+    named = [line.split()[1] for line in capsys.readouterr().out.splitlines() if " -> " in line]
+    assert sorted(named) == ["a", "b", "c"]
+
+
+def test_demo_of_a_set_ends_with_the_set(tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]):
+    """More sweeps are asked for than there are: all are shown, then the table, and the exit code is 0."""
+    which = ["--sim", played_set(tmp_path, default_bundle, 1), "--sweeps", "50"]
+    assert main(["demo", "--virtual", *which]) == 0
+    out = capsys.readouterr().out
+    assert out.count(" -> ") == 3
+    assert "all sweeps" in out
+
+
+@pytest.mark.parametrize("text", ["0", "-3", "many", "1.5"])
+def test_a_number_of_sweeps_is_a_number(text: str, capsys: pytest.CaptureFixture[str]):
+    """Anything else is a usage error that names it."""
+    with pytest.raises(SystemExit) as e:
+        main(["demo", "--sweeps", text])
+    assert e.value.code == 2
+    assert f"{text} is no number of sweeps" in capsys.readouterr().err
+
+
+def test_the_order_of_a_set_depends_on_the_seed_alone():
+    """Each sweep once; in each round each material that has one left."""
+    labels = np.array([0, 0, 0, 0, 1, 1, 2])
+    order = script.in_turn(labels, 1)
+    assert sorted(order) == list(range(7))
+    assert [sorted(labels[order[:3]]), sorted(labels[order[3:5]]), labels[order[5:]].tolist()] == [
+        [0, 1, 2],
+        [0, 1],
+        [0, 0],
+    ]
+    assert order == script.in_turn(labels, 1)
+    assert order != script.in_turn(labels, 2)
 
 
 @pytest.mark.slow

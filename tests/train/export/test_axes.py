@@ -44,7 +44,7 @@ def test_from_a_set_to_the_answers_of_the_box(
     answers, _ = pack.score(Classifier(model, SystemClock()), unseen)
     labels = [model.manifest.labels[k] if k >= 0 else "" for k in answers]
     assert np.mean([a == unseen.materials[k] for a, k in zip(labels, unseen.labels, strict=True)]) > 0.7
-    acts = list(script.replay(tmp_path / "unseen.npz", model.format))
+    acts = list(script.named(f"replay:{tmp_path / 'unseen.npz'}", model.format, 0)[0])
     simulated = devices.build(model.format, acts, rig.VirtualClock(), "replay")
     kept = BlackBox(tmp_path / "kept", model.format, len(acts))
     capture = CaptureWriter(tmp_path / "capture", model.format)

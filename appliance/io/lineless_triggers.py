@@ -1,0 +1,185 @@
+"""Triggers for the bench and for robots without a line to spare: by command, by the space bar, by the clock.
+
+In: commands of the serial line, a terminal, a period. Out: START and STOP with the time at which the command or the key
+was read, or at which the clock was due. None of them is as exact as a line, whose edges the kernel stamps.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import tty
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Self
+
+from appliance.core.clock import Clock
+from appliance.core.config import TriggerConfig
+from appliance.core.errors import ConfigError, PortError
+from appliance.core.observer import Observer
+from appliance.core.types import Edge, EdgeKind, Verdict
+from appliance.io.trigger import EdgeCounters
+
+SECOND = 1_000_000_000
+COUNTDOWN = 3
+"""Seconds before a start of the clock from which on each is announced."""
+SPACE = ord(" ")
+
+Say = Callable[[str], object]
+"""Shows a line to a person."""
+
+
+class LinelessTrigger:
+    """What these triggers have in common: edges wait for the next turn of the loop, and none is ever lost.
+
+    about: for the sidecar of a recorded sweep, as GpioTrigger has it.
+    """
+
+    blind = False
+
+    def __init__(self, mode: str, times: str) -> None:
+        self.edge_counters = EdgeCounters()
+        self.about = {"mode": mode, "times": times}
+        self._edges: list[Edge] = []
+
+    def edges(self, now_ns: int) -> list[Edge]:
+        """The edges since the last call."""
+        taken, self._edges = self._edges, []
+        return taken
+
+
+class CommandTrigger(LinelessTrigger):
+    """START and STOP as commands on the serial line; `commands` carries them out."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__("serial", "arrival of the command")
+        self._clock = clock
+        self.commands: Mapping[str, Callable[[str], list[object]]] = {
+            kind.name: partial(self._take, kind) for kind in (EdgeKind.START, EdgeKind.STOP)
+        }
+
+    def _take(self, kind: EdgeKind, _: str) -> list[object]:
+        self._edges.append(Edge(kind, self._clock.now_ns()))
+        return []
+
+
+class KeyTrigger(LinelessTrigger):
+    """The space bar of a terminal starts a sweep and stops it. Restores the terminal when it is closed.
+
+    While it is open, keys are not shown, and Ctrl-\\ and Ctrl-Z do nothing, since either would leave the terminal so.
+    A sweep that was answered without a stop, for example `long`, is over: the next space starts another one.
+    terminal: its file descriptor. Raises ConfigError if it is no terminal, and in `edges` PortError once it is closed.
+    """
+
+    def __init__(self, terminal: int, clock: Clock, say: Say) -> None:
+        super().__init__("key", "arrival of the key")
+        self._terminal, self._clock, self._say = terminal, clock, say
+        self._sweeping, self._started = False, 0
+        try:
+            self._before = termios.tcgetattr(terminal)
+            tty.setcbreak(terminal, termios.TCSANOW)
+            changed = termios.tcgetattr(terminal)
+            for key in (termios.VQUIT, termios.VSUSP):
+                changed[6][key] = os.fpathconf(terminal, "PC_VDISABLE").to_bytes()
+            termios.tcsetattr(terminal, termios.TCSANOW, changed)
+        except (termios.error, OSError, ValueError) as e:
+            raise ConfigError(
+                'trigger.mode = "key" reads the space bar, but standard input is no terminal; '
+                'run it in one, or use "serial" or "timed"'
+            ) from e
+        say("the space bar starts a sweep and stops it; Ctrl-C ends")
+
+    def edges(self, now_ns: int) -> list[Edge]:
+        """START or STOP for each space since the last call."""
+        for _ in range(self._keys().count(SPACE)):
+            kind = EdgeKind.STOP if self._sweeping else EdgeKind.START
+            self._started += kind is EdgeKind.START
+            self._sweeping = kind is EdgeKind.START
+            self._edges.append(Edge(kind, self._clock.now_ns()))
+            self._say(f"{kind}: the space bar stops the sweep" if self._sweeping else str(kind))
+        return super().edges(now_ns)
+
+    def over(self, sweep: int) -> None:
+        """The sweep of this number was answered, so it is over."""
+        if sweep == self._started:  # an older one may be answered late, when the next has begun
+            self._sweeping = False
+
+    def close(self) -> None:
+        """Give the terminal back as it was, where it is still there."""
+        try:
+            termios.tcsetattr(self._terminal, termios.TCSANOW, self._before)
+        except termios.error:
+            return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _keys(self) -> bytes:
+        try:
+            if not select.select([self._terminal], [], [], 0)[0]:
+                return b""
+            keys = os.read(self._terminal, 64)
+        except OSError:
+            keys = b""
+        if not keys:
+            raise PortError("the terminal whose space bar is the trigger was closed; start again in another one")
+        return keys
+
+
+class TimedTrigger(LinelessTrigger):
+    """Starts a sweep of `sweep_s` every `every_s` by the clock, and announces it. Raises ConfigError if one does not
+    fit into the other."""
+
+    def __init__(self, config: TriggerConfig, clock: Clock, say: Say) -> None:
+        super().__init__("timed", "clock of the box")
+        if config.every_s <= config.sweep_s:
+            raise ConfigError(
+                f"a sweep of {config.sweep_s:g} s every {config.every_s:g} s leaves no pause; "
+                "let --every (trigger.every_s) be longer than --sweep (trigger.sweep_s)"
+            )
+        self._every_ns, self._sweep_ns = round(config.every_s * SECOND), round(config.sweep_s * SECOND)
+        self._say = say
+        self._due_ns = clock.now_ns() + self._every_ns - self._sweep_ns
+        self._sweeping, self._announced = False, COUNTDOWN + 1
+
+    def edges(self, now_ns: int) -> list[Edge]:
+        """START and STOP that are due, with the time at which they were."""
+        if (
+            not self._sweeping and now_ns - self._due_ns > self._every_ns
+        ):  # after a pause of the program none is made up
+            self._due_ns = now_ns
+        while now_ns >= self._due_ns:
+            kind = EdgeKind.STOP if self._sweeping else EdgeKind.START
+            self._edges.append(Edge(kind, self._due_ns))
+            self._due_ns += self._every_ns - self._sweep_ns if self._sweeping else self._sweep_ns
+            self._sweeping, self._announced = not self._sweeping, COUNTDOWN + 1
+            self._say(f"{kind}: slide for {self._sweep_ns / 1e9:g} s" if self._sweeping else str(kind))
+        left = -(-(self._due_ns - now_ns) // SECOND)
+        if not self._sweeping and left < self._announced:
+            self._announced = left
+            self._say(f"start in {left} s")
+        return super().edges(now_ns)
+
+
+class AnswerWatch(Observer):
+    """Tells a KeyTrigger which sweeps are over."""
+
+    def __init__(self, trigger: KeyTrigger) -> None:
+        self._trigger = trigger
+
+    def answered(self, verdict: Verdict) -> None:
+        """Tell it."""
+        self._trigger.over(verdict.sweep)
+
+
+def standard_input() -> int:
+    """The file descriptor of standard input, -1 where there is none."""
+    try:
+        return sys.stdin.fileno()
+    except (AttributeError, OSError, ValueError):  # closed, or replaced by something without a descriptor
+        return -1

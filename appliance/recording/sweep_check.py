@@ -1,0 +1,77 @@
+"""Answers sweeps that are recorded before there is a bundle. In: Sweeps, frames. Out: Verdicts without a label.
+
+The status is `recorded`, or what a skin's counts alone show to be wrong: no contact, saturation, stuck and dead taxels.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.clock import Clock
+from appliance.core.errors import ApplianceError
+from appliance.core.observer import Observer
+from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict
+from appliance.signal.unloaded import UnloadedTracker
+from appliance.signal.window_check import Finding, inspect_bare
+
+UNCHECKED = Finding(Status.RECORDED, "contact not checked: the skin was not both touched and let go so far")
+
+
+class SweepCheck(Observer):
+    """Checks each window against the unloaded skin, which it finds by itself; a TARE says where it is. model: "", since
+    there is none.
+    """
+
+    model = ""
+
+    def __init__(self, fmt: SweepFormat, clock: Clock) -> None:
+        self.format, self._clock = fmt, clock
+        self._unloaded = UnloadedTracker(fmt)
+        self._epoch = -1
+
+    def frames(self, frames: Frames) -> None:
+        """Look for the unloaded skin."""
+        epoch = int(frames.seq[-1]) >> EPOCH_BITS
+        if epoch != self._epoch:
+            self._epoch = epoch
+            self._unloaded.restart()
+        self._unloaded.put(frames.taxels)
+
+    def __call__(self, sweep: Sweep) -> Verdict:
+        """The verdict on one sweep. A sweep whose status is not ok keeps it."""
+        finding = Finding(sweep.status)
+        if sweep.status is Status.OK:
+            finding = self._checked(sweep.frames.taxels)
+        now = self._clock.now_ns()
+        return Verdict(
+            sweep=sweep.id, time_ns=now, status=finding.status, label="", probability=0.0, margin=0.0,
+            scores=np.empty(0), fused=0, lost=sweep.lost, latency_ns=now - sweep.complete_ns, bundle=self.model,
+            detail=finding.detail, share=sweep.share,
+        )  # fmt: skip
+
+    def _checked(self, taxels: NDArray[Any]) -> Finding:
+        if not (self._unloaded.skin and self._unloaded.certain):
+            return UNCHECKED
+        finding = inspect_bare(taxels, self._unloaded.skin)
+        return Finding(Status.RECORDED) if finding.status is Status.OK else finding
+
+    def about(self) -> dict[str, Any]:
+        """For sidecars: the unloaded skin as it was found, level and noise in counts; None where it was not certain."""
+        found = self._unloaded.skin if self._unloaded.certain else None
+        return {"unloaded": found and {"level": found.level.tolist(), "noise": found.noise.tolist()}}
+
+    def tell(self) -> list[object]:
+        """No bundle, and the format."""
+        return ["recording", "", self.model, self.format]
+
+    def test(self) -> str:
+        """Raises ApplianceError: there is nothing to test."""
+        raise ApplianceError("no bundle is used while palpate record runs; palpate check tests one")
+
+    def set_tare(self, taxels: NDArray[Any]) -> str:
+        """Take frames [n, R, C] as the unloaded skin."""
+        self._unloaded.set(taxels)
+        return f"largest {taxels.mean(axis=0).max():.1f} digits"

@@ -1,0 +1,100 @@
+"""What the skin gives without contact, found while it streams. In: frames. Out: an UnloadedSkin, and whether it is certain.
+
+Nobody has to keep the finger off at a certain moment: an unloaded skin is quiet, and no quiet stretch is lower.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.types import SweepFormat, normal
+
+BLOCK_S, LEAST_FRAMES = 0.1, 8
+"""Length of the stretches that are compared: a finger is lifted for longer than that between two sweeps."""
+NOISE = 5.0
+"""A mean over time is a load if it differs from the unloaded skin by as many standard deviations of one frame."""
+LEAST_COUNTS = 2.0
+"""The same for whole counts, whose noise may lie below one count."""
+QUIET = 2.0
+"""Stretches whose noise differs by no more than this factor are equally quiet."""
+TOUCH = 5.0
+"""A stretch that differs by as many times what is a load was certainly a touch."""
+
+LEAST_SHARE = 0.1
+"""A stretch is lower than another by at least this share of what is a load; less is noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnloadedSkin:
+    """The skin without contact. level, noise: mean and standard deviation of the counts of each taxel, of the shape of a
+    frame. contact: least difference from `level`, in counts, that is a load."""
+
+    level: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    contact: float
+
+    @classmethod
+    def measured(cls, taxels: NDArray[Any]) -> UnloadedSkin:
+        """From frames of a skin that nothing touches, raw counts [n, R, C] or [n, R, C, A]."""
+        noise = taxels.std(axis=0, dtype=np.float64)
+        contact = NOISE * _median(noise)
+        if taxels.dtype.kind != "f":
+            contact = max(contact, LEAST_COUNTS)
+        return cls(taxels.mean(axis=0, dtype=np.float64), noise, contact)
+
+
+class UnloadedTracker:
+    """Follows the stream. skin: the quietest, and of the quiet ones the lowest stretch so far; None before the first.
+
+    certain: whether the skin was also touched since then, so that it was not sliding all the time.
+    """
+
+    def __init__(self, fmt: SweepFormat) -> None:
+        self._size = max(LEAST_FRAMES, round(BLOCK_S * fmt.rate_hz))
+        self.restart()
+
+    def restart(self) -> None:
+        """This may be another skin than before."""
+        self.skin: UnloadedSkin | None = None
+        self.certain = self._given = False
+        self._waiting: list[NDArray[Any]] = []
+        self._frames = 0
+
+    def set(self, taxels: NDArray[Any]) -> None:
+        """A person says that nothing touched the skin in these frames [n, R, C]."""
+        self.skin, self.certain, self._given = UnloadedSkin.measured(taxels), True, True
+
+    def put(self, taxels: NDArray[Any]) -> None:
+        """Frames [n, R, C] that have come."""
+        if self._given:
+            return
+        self._waiting.append(taxels)
+        self._frames += len(taxels)
+        if self._frames >= self._size:
+            self._take(UnloadedSkin.measured(np.concatenate(self._waiting)))
+            self._waiting, self._frames = [], 0
+
+    def _take(self, block: UnloadedSkin) -> None:
+        if self.skin is None or self._less(block, self.skin):
+            self.skin, self.certain = block, False
+            return
+        away = normal(np.abs(block.level - self.skin.level), 0)
+        self.certain |= bool(away.max(initial=0, where=np.isfinite(away)) >= TOUCH * self.skin.contact)
+
+    @staticmethod
+    def _less(block: UnloadedSkin, than: UnloadedSkin) -> bool:
+        """Whether a stretch is less loaded than another: much quieter, or as quiet and lower."""
+        if block.contact * QUIET < than.contact:
+            return True
+        lower = float(np.nanmean(normal(block.level - than.level, 0))) < -LEAST_SHARE * block.contact
+        return lower and block.contact <= QUIET * than.contact
+
+
+def _median(noise: NDArray[np.float64]) -> float:
+    """Noise of an ordinary taxel along the normal; one that is broken does not count."""
+    along = normal(noise, 0)
+    return float(np.median(along[np.isfinite(along)])) if np.isfinite(along).any() else 0.0

@@ -1,0 +1,237 @@
+"""Sweeps without lines: commands, the space bar of a real pseudo-terminal, the clock; and what each refuses."""
+
+from __future__ import annotations
+
+import os
+import pty
+import termios
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from appliance.core.config import TriggerConfig
+from appliance.core.errors import ConfigError, PortError
+from appliance.core.types import Edge, EdgeKind, Status, Verdict
+from appliance.io.lineless_triggers import AnswerWatch, CommandTrigger, KeyTrigger, TimedTrigger, standard_input
+from appliance.sim import devices, rig, script, skin
+from tests.factories.simulated_box import SECOND, Rigged
+
+START, STOP = EdgeKind.START, EdgeKind.STOP
+
+
+def kinds(edges: list[Edge]) -> list[EdgeKind]:
+    """The kinds of edges."""
+    return [edge.kind for edge in edges]
+
+
+def answer(sweep: int) -> Verdict:
+    """An answer to this sweep."""
+    return Verdict(sweep, 0, Status.LONG, "", 0, 0, np.empty(0), 0, 0, 0, "")
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """A terminal: the person's end, and the end for programs."""
+    far, near = pty.openpty()
+    yield far, near
+    for end in (far, near):
+        try:
+            os.close(end)
+        except OSError:
+            continue
+
+
+def test_a_command_is_an_edge_at_the_time_of_its_arrival():
+    """START and STOP come once, in their order, with the time at which they were carried out."""
+    clock = rig.VirtualClock(5)
+    trigger = CommandTrigger(clock)
+    assert trigger.commands["START"]("") == []
+    clock.sleep_until(9)
+    trigger.commands["STOP"]("")
+    assert trigger.edges(20) == [Edge(START, 5), Edge(STOP, 9)]
+    assert trigger.edges(30) == []
+    assert (trigger.blind, trigger.about) == (False, {"mode": "serial", "times": "arrival of the command"})
+
+
+def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
+    """The whole box with `trigger.mode = "serial"`: START, STOP and NEW as commands; same statuses, no input line is used."""
+    off = np.zeros((60 * 750, 4, 4), np.uint8)
+    simulated = devices.build(skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim")
+    box = rigged(simulated, sets=("trigger.mode=serial",))
+    assert {name for request in simulated.gpio.requests for name in request.names.values()}.isdisjoint(
+        {devices.START, devices.STOP, devices.NEW_OBJECT}
+    )
+    box.seconds(0.5)
+    assert ",STOP,ok*" in box.ask("$PPLP,STOP")
+    box.seconds(0.5)
+    assert ",START,ok*" in box.ask("PPLP START")
+    begun_ns = simulated.clock.now_ns()
+    box.seconds(2.5)
+    assert ",STOP,ok*" in box.ask("$PPLP,STOP")
+    box.seconds(0.5)
+    assert ",NEW,ok*" in box.ask("$PPLP,NEW")
+    box.ask("$PPLP,START")
+    box.seconds(1)
+    box.ask("$PPLP,STOP")
+    box.seconds(0.1)
+    assert [sweep.status for sweep in box.kept] == [Status.NO_START, Status.OK, Status.SHORT]
+    assert abs(box.kept[1].start_ns - begun_ns) < 0.1 * SECOND
+    assert [sweep.object for sweep in box.kept] == [0, 0, 1]
+    assert box.box.circumstances()["trigger"]["mode"] == "serial"
+
+
+def test_commands_of_another_trigger_are_refused(rigged: Callable[..., Rigged]):
+    """With lines, START and STOP are answered by an error that names the setting."""
+    box = rigged(devices.build(skin.FORMAT, script.tubes(1, 1), rig.VirtualClock(), "sim"))
+    box.seconds(0.5)
+    for name in ("START", "STOP"):
+        assert f",{name},error,sweeps are triggered otherwise; set trigger.mode to serial" in box.ask(f"$PPLP,{name}")
+
+
+def test_the_space_bar_starts_and_stops(terminal: tuple[int, int]):
+    """Each press once, whatever else is typed; several in one read count each; a person is told."""
+    far, near = terminal
+    said: list[str] = []
+    clock = rig.VirtualClock(7)
+    with KeyTrigger(near, clock, said.append) as trigger:
+        assert trigger.edges(8) == []
+        os.write(far, b"x \x04")
+        assert trigger.edges(8) == [Edge(START, 7)]
+        os.write(far, b"  ")
+        assert kinds(trigger.edges(9)) == [STOP, START]
+        assert trigger.edges(10) == []
+    assert said == [
+        "the space bar starts a sweep and stops it; Ctrl-C ends",
+        "start: the space bar stops the sweep",
+        "stop",
+        "start: the space bar stops the sweep",
+    ]
+
+
+def test_after_an_answer_the_space_bar_starts(terminal: tuple[int, int]):
+    """A sweep that was answered `long` is over; a late answer to an older one changes nothing."""
+    far, near = terminal
+    with KeyTrigger(near, rig.VirtualClock(), lambda line: None) as trigger:
+        watch = AnswerWatch(trigger)
+        os.write(far, b" ")
+        assert kinds(trigger.edges(1)) == [START]
+        watch.answered(answer(1))
+        os.write(far, b" ")
+        assert kinds(trigger.edges(2)) == [START]
+        watch.answered(answer(1))
+        os.write(far, b" ")
+        assert kinds(trigger.edges(3)) == [STOP]
+
+
+def test_the_terminal_is_restored(terminal: tuple[int, int]):
+    """While it is open, keys come at once, are not shown, and none stops or kills the program but Ctrl-C; then all is as
+    before."""
+    _, near = terminal
+    tty.setcbreak(near)  # some settings that are not the default
+    before = termios.tcgetattr(near)
+    before[3] |= termios.ECHO
+    termios.tcsetattr(near, termios.TCSANOW, before)
+    before = termios.tcgetattr(near)
+    with KeyTrigger(near, rig.VirtualClock(), lambda line: None):
+        inside = termios.tcgetattr(near)
+        assert not inside[3] & (termios.ECHO | termios.ICANON)
+        assert inside[3] & termios.ISIG
+        assert inside[6][termios.VINTR] == b"\x03"
+        assert inside[6][termios.VQUIT] == inside[6][termios.VSUSP] == b"\0"
+    assert termios.tcgetattr(near) == before
+
+
+def test_a_terminal_that_is_gone_ends_it(terminal: tuple[int, int]):
+    """Nobody could start a sweep any more: PortError, not a loop for ever; closing does not fail."""
+    far, near = terminal
+    with closing(KeyTrigger(near, rig.VirtualClock(), lambda line: None)) as trigger:
+        os.close(far)
+        with pytest.raises(PortError, match="was closed"):
+            trigger.edges(1)
+
+
+@pytest.mark.parametrize("what", ["pipe", "none"])
+def test_what_is_no_terminal_is_refused(what: str):
+    """A pipe, or no standard input at all."""
+    read, write = os.pipe()
+    try:
+        with pytest.raises(ConfigError, match=r'standard input is no terminal; run it in one, or use "serial"'):
+            KeyTrigger(read if what == "pipe" else -1, rig.VirtualClock(), lambda line: None)
+    finally:
+        os.close(read)
+        os.close(write)
+
+
+def test_standard_input_may_be_missing(monkeypatch: pytest.MonkeyPatch):
+    """A program may be started without one."""
+    monkeypatch.setattr("sys.stdin", None)
+    assert standard_input() == -1
+
+
+def timed(every_s: float = 5.0, sweep_s: float = 3.0) -> tuple[TimedTrigger, rig.VirtualClock, list[str]]:
+    """A trigger by the clock, the clock, and what it says."""
+    said: list[str] = []
+    clock = rig.VirtualClock(0)
+    return TimedTrigger(TriggerConfig(mode="timed", every_s=every_s, sweep_s=sweep_s), clock, said.append), clock, said
+
+
+def test_the_clock_starts_and_stops():
+    """A sweep every 5 s: edges have the time at which they were due, however late they are asked for."""
+    trigger, _, said = timed()
+    edges = [edge for t in range(0, 13 * SECOND, SECOND // 7) for edge in trigger.edges(t)]
+    assert edges == [Edge(START, 2 * SECOND), Edge(STOP, 5 * SECOND), Edge(START, 7 * SECOND), Edge(STOP, 10 * SECOND),
+                     Edge(START, 12 * SECOND)]  # fmt: skip
+    countdown = ["start in 2 s", "start in 1 s", "start: slide for 3 s", "stop"]
+    assert said == [*countdown, *countdown, *countdown[:3]]
+
+
+def test_a_long_pause_is_counted_down_at_its_end():
+    """From three seconds before the start on."""
+    trigger, _, said = timed(60, 3)
+    for t in range(0, 57 * SECOND + 1, SECOND // 4):
+        trigger.edges(t)
+    assert said == ["start in 3 s", "start in 2 s", "start in 1 s", "start: slide for 3 s"]
+
+
+def test_no_sweep_is_made_up_for_a_pause_of_the_program():
+    """A program that was stopped for a minute does not report the sweeps of that minute."""
+    trigger, _, _ = timed()
+    assert kinds(trigger.edges(0)) == []
+    assert trigger.edges(60 * SECOND) == [Edge(START, 60 * SECOND)]
+
+
+def test_a_sweep_must_leave_a_pause():
+    """One as long as the period is refused."""
+    with pytest.raises(ConfigError, match="a sweep of 3 s every 3 s leaves no pause"):
+        timed(3, 3)
+
+
+def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
+    """The whole box: windows are cut in the middle of what the clock started and stopped."""
+    off = np.zeros((60 * 750, 4, 4), np.uint8)
+    simulated = devices.build(skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim")
+    box = rigged(simulated, sets=("trigger.mode=timed", "trigger.every_s=4"))
+    box.seconds(10)
+    assert [(s.stop_ns - s.start_ns, s.status) for s in box.kept] == [(3 * SECOND, Status.OK)] * 2
+    middle = (box.kept[0].start_ns + box.kept[0].stop_ns) / 2
+    assert abs(box.kept[0].frames.t_ns[[0, -1]].mean() - middle) < 2 * skin.FORMAT.period_ns
+
+
+@pytest.mark.parametrize(
+    ("sets", "hint"),
+    [
+        (("trigger.mode=timed", "trigger.sweep_s=1"), "a sweep of 1 s is shorter than the window of 2 s"),
+        (("trigger.mode=timed", "trigger.sweep_s=6"), "leaves no pause"),
+        (("trigger.mode=key",), "is no terminal"),
+    ],
+)
+def test_a_box_that_could_not_sweep_does_not_start(
+    rigged: Callable[..., Rigged], sets: tuple[str, ...], hint: str, monkeypatch: pytest.MonkeyPatch
+):
+    """Settings with which every sweep would fail are refused before the first one."""
+    monkeypatch.setattr("sys.stdin", None)
+    with pytest.raises(ConfigError, match=hint):
+        rigged(sets=sets)
