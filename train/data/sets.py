@@ -152,7 +152,8 @@ def load(spec: str, seed: int = 0) -> Dataset:
     """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or
     aeon:NAME.
 
-    x3: of a skin with three axes. SWEEPS: per material and position. SEED-LAST: one set of several simulated scenes, each with positions of its own.
+    x3: of a skin with three axes. SWEEPS: per material and position. SEED-LAST: one set of several simulated scenes, each
+    with positions of its own.
     seed: for a simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
     """
     if spec.startswith("sim:"):

@@ -60,3 +60,18 @@ def test_from_a_set_to_the_answers_of_the_box(
     assert [fields[5] for fields in sentences] == labels
     assert palpate(["replay", str(tmp_path / "kept"), *choose]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"{len(acts)} sweeps: {len(acts)} the same"
+
+
+@pytest.mark.slow
+def test_the_demo_slides_a_skin_that_feels_shear(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """With a bundle of the simulated set with three axes `palpate demo` simulates shear by itself, and names most tubes."""
+    fit, out = str(tmp_path / "fit.npz"), str(tmp_path / "bundle")
+    assert main(["fit", "--set", "sim:T-REALx3:1001:1", "--seed", "1", "--out", fit, "--size", "bands"]) == 0
+    assert main(["export", fit, "--out", out, "--name", "shear", "--version", "1"]) == 0
+    capsys.readouterr()
+    asked = ["demo", "--sim", "skin", "--virtual", "--seed", "3", "--sweeps", "12", "--set", f"classifier.bundle={out}"]
+    assert palpate(asked) == 0
+    shown = capsys.readouterr().out
+    assert shown.count(",RES,") == 12
+    assert shown.count(" right ") >= 8
+    assert "  frames lost     0 of " in shown

@@ -35,7 +35,8 @@ def copies(sweeps: Dataset, augmentation: Augmentation, seed: int, count: int) -
 
 
 def _changed(counts: NDArray[Any], scale: float, augmentation: Augmentation, rng: Generator) -> NDArray[np.float32]:
-    """Raw counts [B, T, R, C] or [B, T, R, C, A], changed; where they are integers rounded and clipped to what their data type holds."""
+    """Raw counts [B, T, R, C] or [B, T, R, C, A], changed; where they are integers rounded and clipped to what their data
+    type holds."""
     n, frames, rows, cols = counts.shape[:4]
     x = np.ascontiguousarray(counts.reshape(n, frames, -1).transpose(0, 2, 1), np.float32)
     means = x.mean(axis=2, keepdims=True)

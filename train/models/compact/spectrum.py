@@ -2,8 +2,9 @@
 
 Fixed features beside the learned ones. What is trained to separate materials discards what does not help it: it hardly
 sees that a material is none of them, and it fits its training sweeps too closely. Here the taxels' mean over the grid, on
-each axis by itself, is cut into tenths of the window, and the power in bands of each tenth's spectrum is taken (Welch 1967), as logarithms. Each
-tenth is processed by itself, so that no offset and no later frame matters; the hum of the mains is removed.
+each axis by itself, is cut into tenths of the window, and the power in bands of each tenth's spectrum is taken (Welch
+1967), as logarithms. Each tenth is processed by itself, so that no offset and no later frame matters; the hum of the
+mains is removed.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ def count(form: SweepFormat) -> int:
 
 
 def nodes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale: float, tenths: bool) -> str:
-    """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1, rows, bands], those of the
-    first axis first.
+    """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1, rows, bands], those of
+    the first axis first.
 
     One row for the whole window; with `tenths` one for each of the first tenth, the first two tenths, and so on.
     """
