@@ -16,7 +16,7 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from appliance.cli import bundle_commands, commands
+from appliance.cli import bundle_commands, commands, skin_commands
 from appliance.cli.commands import OpenDevices, load_bundle, load_settings, stop_flag
 from appliance.cli.parser import parser
 from appliance.core.clock import SystemClock
@@ -127,5 +127,5 @@ def _on_lines(settings: Config) -> Config:
 
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
     "demo": run_demo, "bench": run_bench, **commands.RUNS, **bundle_commands.RUNS,
-    **{name: partial(_with_devices, run) for name, run in commands.WITH_DEVICES.items()},
+    **{name: partial(_with_devices, run) for name, run in {**commands.WITH_DEVICES, **skin_commands.WITH_DEVICES}.items()},
 }  # fmt: skip

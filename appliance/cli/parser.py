@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -71,14 +72,18 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
     common, devices, answers = _shared()
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def add(name: str, text: str, *parents: argparse.ArgumentParser) -> Any:
-        command = commands.add_parser(name, help=text, description=text, parents=[common, *parents], epilog=EXIT_CODES)
+    def add(name: str, text: str, *parents: argparse.ArgumentParser, group: Any = commands) -> Any:
+        last, options = name.rpartition(" ")[2], [common, *parents]
+        command = group.add_parser(last, help=text, description=text, parents=options, epilog=EXIT_CODES)
         command.set_defaults(run=runs[name])
         return command
 
     _service_commands(add, devices, answers)
     _local_commands(add, devices, answers)
     _bundle_commands(add)
+    about = "the skin by itself, without a bundle"
+    skin = commands.add_parser("skin", help=about, description=about).add_subparsers(required=True, metavar="COMMAND")
+    _skin_commands(partial(add, group=skin), devices)
     return parser
 
 
@@ -147,6 +152,27 @@ def _local_commands(
         "--part", choices=("memory", "stream"), help="one part alone, as JSON, with the sweeps of --acts"
     )
     bench.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
+
+
+def _skin_commands(add: Callable[..., Any], devices: argparse.ArgumentParser) -> None:
+    """The commands `palpate skin ...`."""
+    check = add("skin check", "whether the skin's firmware keeps to PROTOCOL.md, part by part", devices)
+    check.add_argument(
+        "--seconds", type=_seconds, default=10.0, metavar="S",
+        help="how long frames are listened to, 1 to 3600 (default 10); the longer, the surer of the clock",
+    )  # fmt: skip
+    check.set_defaults(sweeps=None)
+
+
+def _seconds(text: str) -> float:
+    """A length of time, for argparse."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 1 <= seconds <= 3600:
+        raise argparse.ArgumentTypeError(f"{text} is no time to listen; use 1 to 3600 seconds")
+    return seconds
 
 
 def _bundle_commands(add: Callable[..., Any]) -> None:

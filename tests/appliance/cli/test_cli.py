@@ -29,6 +29,7 @@ from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError, SensorError
 from appliance.core.types import Frames, Status, Sweep, save
 from appliance.inference.classifier import Classifier
+from appliance.io import packets
 from appliance.sim import skin
 from appliance.tools import pseudo_terminal
 from tests.factories import toy_bundle
@@ -410,3 +411,38 @@ def test_skin_format_is_the_default_bundles(default_bundle: bundle.Bundle):
 def test_wilson():
     """The paper's 55 of 60 has the interval that is known for it."""
     assert statistics.wilson(55, 60) == pytest.approx([0.819, 0.964], abs=5e-4)
+
+
+def test_skin_check_prints_a_verdict_for_each_part(capsys: pytest.CaptureFixture[str]):
+    """`palpate skin check` on the simulated board: all ok, exit code 0, and no bundle is asked for."""
+    no_bundle = ["--set", "classifier.bundle=/nowhere"]
+    assert main(["skin", "check", "--sim", "skin", "--virtual", *no_bundle]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 12
+    assert all(line.startswith("ok       ") for line in lines)
+
+
+def test_skin_check_fails_with_a_part(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """One line says FAIL and what to do; exit code 1."""
+    monkeypatch.setattr(packets, "pack", lambda *args, right=packets.pack: right(*args)[:-4] + bytes(4))
+    assert main(["skin", "check", "--sim", "skin", "--virtual"]) == 1
+    assert "FAIL     crc       " in (out := capsys.readouterr().out)
+    assert "the CRC is 0; compute CRC-32" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["--seconds", "0"], 2, "0 is no time to listen; use 1 to 3600 seconds"),
+        (["--seconds", "long"], 2, "long is no time to listen"),
+        (["--set", "sensor.link=serial", "--set", "sensor.port=/dev/none"], 69, "no port /dev/none"),
+    ],
+)
+def test_skin_check_refuses(options: list[str], code: int, words: str, capsys: pytest.CaptureFixture[str]):
+    """Arguments out of range, and a board that is not there."""
+    try:
+        ended: object = main(["skin", "check", *options])
+    except SystemExit as e:
+        ended = e.code
+    assert ended == code
+    assert words in capsys.readouterr().err

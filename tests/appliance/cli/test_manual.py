@@ -87,7 +87,7 @@ def test_every_command_is_named_and_there():
     assert PARSER.parse_args(["bench"]).run is RUNS["bench"]
     listed = [name.removeprefix("palpate ") for name in named("Commands and exit codes", "command")]
     assert sorted(listed) == sorted(RUNS)
-    assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= {*RUNS}
+    assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= {name.split()[0] for name in RUNS}
 
 
 @pytest.mark.parametrize("words", spoken(), ids=" ".join)

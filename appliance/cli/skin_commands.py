@@ -1,0 +1,37 @@
+"""The commands `palpate skin ...`: the skin by itself, without a bundle.
+
+In: arguments, and a way to the devices, which `main` chooses. Out: lines on standard output, exit codes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+
+from appliance.cli.commands import OpenDevices, load_settings
+from appliance.core.types import SweepFormat
+from appliance.io.usb_sensor import open_link
+
+
+def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
+    """`palpate skin check`: each part of PROTOCOL.md, one line each; 1 where any fails."""
+    from appliance.tools import skin_check
+
+    devices = open_devices(_simulated_format)
+    sensor = devices.wire(load_settings(args)).sensor
+    failed = 0
+    with closing(open_link(sensor, devices.backend, devices.clock)) as link:
+        for found in skin_check.check(link, devices.clock, args.seconds, port=sensor.link == "serial"):
+            print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
+            failed += found.verdict == "FAIL"
+    return 1 if failed else 0
+
+
+def _simulated_format() -> SweepFormat:
+    """What the simulated skin sends."""
+    from appliance.sim import skin
+
+    return skin.FORMAT
+
+
+WITH_DEVICES = {"skin check": run_check}
