@@ -27,6 +27,9 @@ from appliance.core.errors import (
 from appliance.io import packets
 from appliance.io.link import REPLY_MS, reply_to
 
+CDC_CONTROL = 2
+DTR, RTS = 1, 2
+
 
 class VendorLink:
     """An opened vendor-class board: control requests and one bulk IN endpoint."""
@@ -75,10 +78,21 @@ class AcmLink(VendorLink):
     def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
         self._out = _endpoint(interface, usb.util.ENDPOINT_OUT)
         super().__init__(device, interface, clock)
+        self._raise_dtr()
 
     def _claimed(self) -> list[int]:
         # the kernel's cdc_acm holds both the control and the data interface
         return [i.bInterfaceNumber for i in self._device.get_active_configuration() if i.bInterfaceClass in (2, 10)]
+
+    def _raise_dtr(self) -> None:
+        """Tell the board that somebody reads, as the kernel's driver does (SET_CONTROL_LINE_STATE, USB PSTN 1.2, 6.3.12).
+
+        Without it TinyUSB, and with it MicroPython, overwrites what it has not yet sent. A board need not know the request.
+        """
+        configuration = self._device.get_active_configuration()
+        control = [i.bInterfaceNumber for i in configuration if i.bInterfaceClass == CDC_CONTROL]
+        with contextlib.suppress(usb.core.USBError):
+            self._device.ctrl_transfer(0x21, 0x22, DTR | RTS, control[0] if control else self._number, None, REPLY_MS)
 
     def request(self, request: packets.Request, length: int) -> bytes:
         """Send a request byte; returns the reply, b"" for length 0. Raises SensorError."""

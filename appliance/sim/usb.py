@@ -29,7 +29,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
 
     errors: errno that all calls of a kind raise, by name ("claim", "open", "read" and so on). mangle: changes the bytes
     of a transfer, as a bad cable. halted: the bulk endpoint stalls until it is cleared. kernel_driver: cdc_acm holds
-    the board.
+    the board. dtr: the host has said that it reads (CDC-ACM).
     """
 
     def __init__(self, board: Board, clock: Clock, *, acm: bool = False) -> None:
@@ -38,6 +38,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         self.mangle: Callable[[bytes], bytes] = lambda data: data
         self.halted = False
         self.kernel_driver = acm
+        self.dtr = False
         self.acm = acm
         self._clock = clock
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
@@ -154,6 +155,9 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
     ) -> int:
         """pyusb: standard string descriptors and the requests of PROTOCOL.md."""
         self._touch("control")
+        if self.acm and (kind, request) == (0x21, 0x22):
+            self.dtr = bool(value & 1)
+            return 0
         if kind == 0x80 and request == 6 and value >> 8 == 3:
             text = ("", "Palpate", self.board.identity.board, self.board.identity.serial)[value & 0xFF]
             body = b"\x09\x04" if value & 0xFF == 0 else text.encode("utf-16-le")

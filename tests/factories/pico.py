@@ -42,10 +42,11 @@ def interpreter() -> str:
     return found
 
 
-def run(script: str, **kwargs: Any) -> subprocess.CompletedProcess[str]:
-    """Run a script under MicroPython in the firmware's folder."""
-    command = [interpreter(), "-c", script]
-    return subprocess.run(command, cwd=FIRMWARE, capture_output=True, text=True, timeout=60, **kwargs)
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run MicroPython in the firmware's folder."""
+    return subprocess.run(
+        [interpreter(), *arguments], cwd=FIRMWARE, capture_output=True, text=True, timeout=60, check=False
+    )  # fmt: skip
 
 
 @contextmanager

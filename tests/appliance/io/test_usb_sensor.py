@@ -41,6 +41,21 @@ def check_content(frames: Frames) -> None:
         assert (taxels == numbered(1, first=frame % 97)[0]).all()
 
 
+def test_a_board_that_does_not_know_dtr_is_read(monkeypatch: pytest.MonkeyPatch):
+    """It stalls SET_CONTROL_LINE_STATE, and streams all the same."""
+    simulated = idle_devices(acm=True)
+    right = simulated.backend.ctrl_transfer
+
+    def stalling(handle, kind, request, *rest):
+        if (kind, request) == (0x21, 0x22):
+            raise usb.core.USBError("Pipe error", -9, errno.EPIPE)
+        return right(handle, kind, request, *rest)
+
+    monkeypatch.setattr(simulated.backend, "ctrl_transfer", stalling)
+    assert len(read_for(sensor_on(simulated), simulated, 1)) > 700
+    assert not simulated.backend.dtr
+
+
 @pytest.mark.parametrize("acm", [False, True])
 def test_streams_without_loss(acm: bool):
     """A healthy board, vendor class or CDC-ACM: every frame in order, its time correct to a millisecond."""
@@ -55,6 +70,7 @@ def test_streams_without_loss(acm: bool):
     truth = np.array([simulated.backend.board.frame_ns(int(s)) for s in frames.seq])
     assert np.abs(frames.t_ns - truth).max() < 1_000_000
     assert sensor.identity.serial == "SIM0001"
+    assert simulated.backend.dtr is acm, "a board on a serial port is told that somebody reads"
     sensor.close()
     assert not simulated.backend.board.running
 
