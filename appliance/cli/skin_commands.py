@@ -9,7 +9,6 @@ import argparse
 from contextlib import closing
 
 from appliance.cli.commands import OpenDevices, load_settings
-from appliance.core.types import SweepFormat
 from appliance.io.usb_sensor import open_link
 
 
@@ -17,7 +16,7 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     """`palpate skin check`: each part of PROTOCOL.md, one line each; 1 where any fails."""
     from appliance.tools import skin_check
 
-    devices = open_devices(_simulated_format)
+    devices = open_devices(None)
     sensor = devices.wire(load_settings(args)).sensor
     failed = 0
     with closing(open_link(sensor, devices.backend, devices.clock)) as link:
@@ -25,13 +24,6 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
             failed += found.verdict == "FAIL"
     return 1 if failed else 0
-
-
-def _simulated_format() -> SweepFormat:
-    """What the simulated skin sends."""
-    from appliance.sim import skin
-
-    return skin.FORMAT
 
 
 WITH_DEVICES = {"skin check": run_check}
