@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.types import Status, normal
-from appliance.signal.unloaded import UnloadedSkin
+from appliance.signal.unloaded import QUIET, UnloadedSkin
 
 FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
 """Highest counts of usual converters; that of a skin is not announced."""
@@ -110,11 +110,13 @@ def _enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:
     """As `inspect`, for a skin of which no bundle says how strong a contact is, nor which count is the highest.
 
-    It refuses only what is certain: `no-contact` if no taxel differs from the unloaded skin, in either direction, and
-    `saturated` if the highest count is one of FULL_SCALES.
+    It refuses only what is certain: `no-contact` if no taxel differs from the unloaded skin, in either direction, and none
+    vibrates; `saturated` if the highest count is one of FULL_SCALES.
     """
     load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - unloaded.level, 0))
     strongest = float(load.max(initial=0, where=np.isfinite(load)))
+    if strongest < unloaded.contact and UnloadedSkin.measured(taxels).contact > QUIET * unloaded.contact:
+        return Finding(Status.OK)  # something slides over it
     highest = float(taxels.max())
     full_scale = highest if highest in FULL_SCALES else np.inf
     limits = WindowLimits(max(unloaded.contact, SHARE * strongest), full_scale)

@@ -108,14 +108,15 @@ def _recorded(one: RecordedSweep) -> ShownSweep:
     notes = [f"{one.path.name}, sweep {sweep.id}: {sweep.status}", str(one.format)]
     if sweep.lost:
         notes.append(f"{sweep.lost} frames lost, filled in from their neighbours")
-    tare = about.get("tare")
+    found = about.get("unloaded")  # what a recording without a bundle has in place of a tare
+    tare = about.get("tare", found.get("level") if isinstance(found, dict) else None)
     if tare is not None:
         tare = _grid(one.path, tare, sweep.frames.taxels.shape[1:])
         notes.append("grey: the skin at rest")
-    for name in ("verdict", "bundle", "source", "device", "clock"):
+    for name in ("verdict", "bundle", "source", "trigger", "device", "clock"):
         value = about.get(name)
         if name == "verdict" and isinstance(value, dict):
-            value = {key: value.get(key) for key in VERDICT}
+            value = {key: value.get(key) for key in VERDICT if value.get("label") or key in ("status", "detail")}
         if text := _plain(value):
             notes.append(f"{name}: {text}")
     return ShownSweep(

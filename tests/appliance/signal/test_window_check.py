@@ -166,7 +166,13 @@ def test_a_skin_whose_counts_fall_under_load():
     """A load is a difference in either direction."""
     falling = UnloadedSkin(np.full((4, 4), 200.0), np.ones((4, 4)), 5.0)
     assert inspect_bare(moving(80), falling).status is Status.OK
-    assert inspect_bare(moving(200), falling).status is Status.NO_CONTACT
+    assert inspect_bare(np.full((300, 4, 4), 201, np.uint8), falling).status is Status.NO_CONTACT
+
+
+def test_what_vibrates_is_touched():
+    """Also if its mean is that of a stretch that was taken for the unloaded skin, such as a finger at rest."""
+    at_rest = UnloadedSkin(np.full((4, 4), 80.0), np.full((4, 4), 0.3), 2.0)
+    assert inspect_bare(moving(80), at_rest).status is Status.OK
 
 
 @pytest.mark.parametrize(("bits", "status"), [(10, Status.SATURATED), (12, Status.SATURATED), (11, Status.OK)])

@@ -66,6 +66,21 @@ def test_the_picture_says_what_is_known(small: str):
     assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(shown.split("\n"))
 
 
+def test_a_sweep_that_was_recorded_without_a_bundle(tmp_path: Path):
+    """What the recorder found: the status alone, the trigger, and the unloaded skin."""
+    about = {
+        "verdict": {"status": "recorded", "label": "", "probability": 0.0, "detail": ""}, "source": "usb",
+        "trigger": {"mode": "key", "times": "arrival of the key"},
+        "unloaded": {"level": [[1.5] * 4] * 4, "noise": [[0.5] * 4] * 4},
+    }  # fmt: skip
+    shown = words(drawn(tmp_path / "a.npy", SweepFormat(4, 4, 100.0, 200, "uint8"), about))
+    assert "verdict: status recorded · " in shown
+    assert "trigger: mode key, times arrival of the key" in shown
+    assert "grey: the skin at rest" in shown
+    found = drawn(tmp_path / "b.npy", SweepFormat(4, 4, 100.0, 200, "uint8"), about | {"unloaded": None})
+    assert "grey" not in words(found)
+
+
 def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
     """A recording of an older version, with nothing more in its sidecar: nothing of rest, verdict or device is shown."""
     record(tmp_path / "1.npy", "a")
