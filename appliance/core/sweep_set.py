@@ -93,9 +93,21 @@ def read(path: Path, what: str) -> dict[str, Array]:
     """All arrays of an .npz by name; pickled objects are refused. Raises FormatError saying that it is not `what`."""
     try:
         with np.load(path, allow_pickle=False) as z:
-            return {k: z[k] for k in z.files}
+            return {k: _typed(z, k) for k in z.files}
     except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as e:
         raise FormatError(f"{path.name}: not {what}: {e}") from e
+
+
+def _typed(z: Any, name: str) -> Array:
+    """One array of an open .npz. Raises ValueError with the remedy where it holds Python objects."""
+    try:
+        return np.asarray(z[name])
+    except ValueError as e:
+        if "allow_pickle" not in str(e):
+            raise
+        raise ValueError(
+            f"{name} holds objects, which are not read; save np.array({name}, dtype=str), or numbers"
+        ) from e
 
 
 def load_file(path: Path, kind: type[Set]) -> Set:
@@ -105,13 +117,14 @@ def load_file(path: Path, kind: type[Set]) -> Set:
 
 def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
     """A set of `arrays`, named as in a file. Raises FormatError naming `source` and what is wrong."""
+    arrays = _numbered(arrays, source)
     missing = {"samples", "labels", "materials", "rate_hz"} - set(arrays)
     if missing:
         raise FormatError(
             f"{source}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, materials, rate_hz"
         )
     if arrays["materials"].ndim != 1 or arrays["materials"].dtype.kind != "U":
-        raise FormatError(f"{source}: materials hold {arrays['materials'].dtype}; give a list of names")
+        raise FormatError(f"{source}: materials hold {arrays['materials'].dtype}; give a list of names, dtype=str")
     if arrays["rate_hz"].size != 1 or arrays["rate_hz"].dtype.kind not in "iuf":
         raise FormatError(f"{source}: rate_hz holds {arrays['rate_hz']!r}; give one number, frames per second")
     # torch and onnxruntime accept only this machine's byte order
@@ -119,6 +132,19 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
     groups = {k.removeprefix("group_"): v for k, v in native.items() if k.startswith("group_")}
     materials = tuple(str(m) for m in arrays["materials"])
     return kind(native["samples"], native["labels"], materials, arrays["rate_hz"].item(), groups, source)
+
+
+def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:
+    """The arrays with labels that are names as indices into `materials`, which may be missing then. Raises FormatError."""
+    if "labels" not in arrays or (given := arrays["labels"]).dtype.kind != "U":
+        return arrays
+    materials = arrays.get("materials", np.unique(given))
+    number = {name: i for i, name in enumerate(materials.tolist())}
+    if unknown := sorted(set(given.ravel().tolist()) - number.keys()):
+        raise FormatError(
+            f"{source}: label {unknown[0]!r} is not among the materials {materials.tolist()}; add it there"
+        )
+    return arrays | {"materials": materials, "labels": np.vectorize(number.get, otypes=[np.int64])(given)}
 
 
 def _conversion(x: Array) -> str:

@@ -1,8 +1,10 @@
-"""The commands that make bundles: fit, export, pack, parity, sign, references."""
+"""The commands that make and judge bundles: fit, export, pack, score, parity, sign, references."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,12 +12,17 @@ from typing import Any
 
 from appliance.bundle import bundle
 from appliance.bundle.manifest import Manifest
+from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
+from appliance.core.storage import put
+from appliance.inference.classifier import Classifier
 from train.calibration.posthoc import calibrate
 from train.cli import options
 from train.cli.options import Add
-from train.export import measure, pack, quantized_bundle, sign
+from train.data import labels
+from train.data.sets import Dataset
+from train.export import bundle_score, measure, pack, quantized_bundle, sign
 from train.models import methods
 from train.models.compact import recipe
 from train.models.compact.architectures import ARCHITECTURES
@@ -23,12 +30,18 @@ from train.models.compact.augment import default_augmentation
 from train.models.compact.fitted import Fit
 
 STEPS = recipe.Settings().steps
+LEAST_STEPS = 2
+"""Of the training of a network alone: its learning rate rises and falls."""
 
 
 def register(add: Add) -> None:
-    """fit, export, pack, parity, sign, references."""
+    """fit, export, pack, score, parity, sign, references."""
     _add_fit(add)
     _add_bundles(add)
+    score = add("score", run_score, "run a set through the box's classifier with a bundle, and print what it named")
+    score.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    options.add_set(score)
+    score.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     parity = add(
         "parity",
         lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
@@ -43,7 +56,10 @@ def register(add: Add) -> None:
         "--key", type=Path, required=True, metavar="KEY", help="your private key: ssh-keygen -t ed25519 makes one"
     )
     sign_command.add_argument(
-        "--counter", type=int, metavar="N", help="above that of every bundle delivered before (1 for the first)"
+        "--counter",
+        type=options.whole("--counter", 1),
+        metavar="N",
+        help="above that of every bundle delivered before (1 for the first)",
     )
 
 
@@ -51,17 +67,23 @@ def _add_fit(add: Add) -> None:
     command = add("fit", run_fit, "choose a model and fit it to sweep sets")
     options.add_set(command)
     command.add_argument(
-        "--seed", type=int, required=True, help="of the training, and of simulated sets that name none"
+        "--seed",
+        type=options.whole("--seed", 0),
+        required=True,
+        help="of the training, and of simulated sets that name none",
     )
     command.add_argument("--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)")
     command.add_argument("--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7")
     command.add_argument("--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set")
     command.add_argument(
-        "--steps", type=int, default=STEPS, help=f"of training of stages (default {STEPS}; 0 for none)"
+        "--steps",
+        type=options.whole("--steps", 0),
+        default=STEPS,
+        help=f"of training of stages (default {STEPS}; 0 for none)",
     )
-    command.add_argument("--row-shift", type=float, metavar="SHARE", dest="moved",
+    command.add_argument("--row-shift", type=options.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"), metavar="SHARE", dest="moved",
                      help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
-    command.add_argument("--stretch", type=float, metavar="SHARE",
+    command.add_argument("--stretch", type=options.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"), metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
     command.add_argument(
         "--size",
@@ -82,7 +104,10 @@ def _add_bundles(add: Add) -> None:
     options.add_set(pack_command)
     pack_command.add_argument("--method", required=True, metavar="NAME", help="see palpate-train methods")
     pack_command.add_argument(
-        "--seed", type=int, required=True, help="of the training, and of simulated sets that name none"
+        "--seed",
+        type=options.whole("--seed", 0),
+        required=True,
+        help="of the training, and of simulated sets that name none",
     )
     options.add_effort(pack_command)
     for command in (export, pack_command):
@@ -92,11 +117,13 @@ def _add_bundles(add: Add) -> None:
         command.add_argument("--name", required=True)
         command.add_argument("--version", required=True)
         command.add_argument(
-            "--full-scale", type=float, help="the sensor's highest raw count (default: the maximum of its type)"
+            "--full-scale",
+            type=options.above_zero("--full-scale"),
+            help="the sensor's highest raw count (default: the maximum of its type)",
         )
         command.add_argument(
             "--pitch-mm",
-            type=float,
+            type=options.above_zero("--pitch-mm"),
             help="from taxel to taxel; without it `palpate align` cannot show mm (known for the simulated skin)",
         )
     references = add("references", run_references, "write the models that palpate bench times beside the bundle")
@@ -107,32 +134,54 @@ def run_fit(args: argparse.Namespace) -> None:
     """Train, save the fit and print its accuracy on the held-out sweeps."""
     if args.rest and not args.split:
         raise FormatError("--rest needs --split; without it nothing is left over")
-    sweeps = options.load(args, args.seed)
+    for option in ("out", "rest"):
+        if path := getattr(args, option):
+            options.writable_file(path, f"--{option}")
+    sweeps, rest = labels.check(options.load(args, args.seed)), None
     if args.split:
         by, share = _by_share(args.split)
         sweeps, rest = sweeps.split(by, share, args.seed)
-        if args.rest:
-            args.rest.parent.mkdir(parents=True, exist_ok=True)
-            rest.save(args.rest)
-            print(f"rest: {len(rest)} sweeps in {args.rest}")
+    if args.rest and rest:
+        rest.save(args.rest)
+    made = _fitted(args, sweeps)
+    made = replace(made, about=made.about | ({"rest": str(args.rest)} if args.rest else {}))
+    made.save(args.out)
+    print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
+    _print_held_out(made)
+    if args.rest and rest:
+        command = f"palpate-train score BUNDLE --set {shlex.quote(str(args.rest))}"
+        print(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; after export: {command}")
+
+
+def _fitted(args: argparse.Namespace, sweeps: Dataset) -> Fit:
+    """The fit that the options ask for. Raises FormatError where they contradict one another."""
     changes = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
     architecture = ARCHITECTURES.get(args.size, recipe.FIXED)
     augmentation = replace(default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes)
     if args.size in ARCHITECTURES:
+        if args.steps < LEAST_STEPS:
+            raise FormatError(
+                f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with --size {args.size}"
+            )
         from train.models.compact import fit  # here: the default recipe needs no PyTorch
 
         trained = fit.FitRecipe(steps=args.steps, augmentation=augmentation, keep_means=args.keep_means)
-        made = fit.fit(sweeps, args.seed, trained, options.Log(), architecture)
-    elif args.keep_means:
+        return fit.fit(sweeps, args.seed, trained, options.Log(), architecture)
+    if args.keep_means:
         raise FormatError(
             f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default recipe removes means"
         )
-    else:
-        made = recipe.fit(sweeps, args.seed, recipe.Settings(args.steps, augmentation), options.Log())
-        print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
-    made.save(args.out)
-    print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
+    made = recipe.fit(sweeps, args.seed, recipe.Settings(args.steps, augmentation), options.Log())
+    print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
+    return made
+
+
+def _print_held_out(made: Fit) -> None:
+    """The accuracy on the sweeps that judged the fit, and how they differ from those of --rest."""
     by = f"held-out {made.about['held_out_by']}"
+    print(
+        f"{by}: sweeps of this set, by heads that did not see them; they helped to choose the model, so expect less of it"
+    )
     try:
         _print_figures(pack.held_out_figures(calibrate(made).held, made, by))
     except FormatError as e:  # too few sweeps to judge by
@@ -140,15 +189,37 @@ def run_fit(args: argparse.Namespace) -> None:
 
 
 def run_export(args: argparse.Namespace) -> None:
-    """Pack the bundle and print its figures."""
-    _print(quantized_bundle.export(Fit.load(args.fit), *_packing(args)), args.out)
+    """Pack the bundle, print its figures and how to score it."""
+    pack.check_target(args.out)
+    made = Fit.load(args.fit)
+    _print(quantized_bundle.export(made, *_packing(args)), args.out)
+    rest = made.about.get("rest")
+    what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"
+    command = shlex.join(["palpate-train", "score", str(args.out), "--set", rest or "SET"])
+    print(f"what it names of {what}: {command}")
 
 
 def run_pack(args: argparse.Namespace) -> None:
     """Train, pack the bundle and print its figures."""
+    pack.check_target(args.out)
     (method,) = methods.find([args.method], options.effort(args))
-    content = pack.trained(method, options.load(args, args.seed), args.seed)
+    content = pack.trained(method, labels.check(options.load(args, args.seed)), args.seed)
     _print(pack.pack(quantized_bundle.checked(content, content.reference), *_packing(args)), args.out)
+
+
+def run_score(args: argparse.Namespace) -> None:
+    """Run the set through the box's classifier; print the figures, and write them."""
+    if args.json:
+        options.writable_file(args.json, "--json")
+    loaded, sweeps = bundle.load(args.bundle), options.load(args)
+    found = bundle_score.score(Classifier(loaded, SystemClock()), sweeps)
+    if args.json:
+        put(args.json, (json.dumps(found.json(), indent=1) + "\n").encode())
+    print(found.text())
+    if loaded.manifest.made.get("set") == sweeps.source:
+        print(
+            f"the bundle was fitted to a set of this name, {sweeps.source}: sweeps that it has seen say nothing of new ones"
+        )
 
 
 def run_sign(args: argparse.Namespace) -> None:

@@ -40,6 +40,9 @@ def register(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Choose, pack, write and print the reasons. Raises FormatError for an invalid scene, NothingFits where no model fits."""
+    pack.check_target(args.out)
+    page = args.page or args.out.with_name(f"{args.out.name}-why")
+    options.writable(page / "choice.json", "--page")
     requested = scene.read(args.scene)
     sweeps, log = requested.sweeps(), options.Log()
     choice = select.choose(sweeps, requested, options.effort(args), options.where(args), log)
@@ -47,7 +50,6 @@ def run(args: argparse.Namespace) -> None:
     result = choice.json(requested) | {"less": curves, "applied": asdict(change), "left": accuracy}
     result["bundle"] = _packed(args, requested, sweeps, result, change)
     result |= _origin(args, requested, sweeps)
-    page = args.page or args.out.with_name(f"{args.out.name}-why")
     put(page / "choice.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     put(page / "index.html", selection_report.page(result).encode(), parents=True)
     print(selection_report.text(result))

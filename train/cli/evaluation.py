@@ -36,13 +36,20 @@ def register(add: Add) -> None:
     calibrate.add_argument("--seeds", default="201-208", metavar="FIRST-LAST", help="of the simulated worlds (201-208)")
     calibrate.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
     calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    calibrate.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
+    options.add_jobs(calibrate)
     follow = add("cnn-curve", run_cnn_curve, "follow the paper's CNN while it learns the simulated skin")
+    follow.set_defaults(resumes=True)
     follow.add_argument("--size", choices=("small", "whole"), default="small",
                        help="small (a stand-in of a minute) or whole (an hour of one core)")  # fmt: skip
-    follow.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulated world and the training (1)")
+    follow.add_argument(
+        "--seed",
+        type=options.whole("--seed", 0),
+        default=1,
+        metavar="N",
+        help="of the simulated world and the training (1)",
+    )
     follow.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
-    follow.add_argument("--steps", type=int, metavar="N", help="iterations (those of the size)")
+    follow.add_argument("--steps", type=options.whole("--steps", 1), metavar="N", help="iterations (those of the size)")
     follow.add_argument("--out", type=Path, required=True, metavar="FILE",
                        help="where the curve goes; an interrupted training goes on from there")  # fmt: skip
     alignment = add(
@@ -100,7 +107,7 @@ def _add_certainty(add: Add) -> None:
         "--protocol", default="leave:position", help="what is tested on where --test is not given (leave:position)"
     )
     command.add_argument("--method", default="compact", metavar="NAME", help="compact or one of its family (compact)")
-    command.add_argument("--seed", type=int, default=1, help="of training and draws (1)")
+    command.add_argument("--seed", type=options.whole("--seed", 0), default=1, help="of training and draws (1)")
     command.add_argument(
         "--out", type=Path, default=Path("docs/certainty"), metavar="DIR", help="where it goes (docs/certainty)"
     )

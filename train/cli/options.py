@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from appliance.core.errors import FormatError
-from train.data import sets
+from train.data import labels, sets
 from train.evaluation import evaluate
 from train.models import methods
 
@@ -24,29 +26,100 @@ def add_set(command: argparse.ArgumentParser) -> None:
     command.add_argument("--set", action="append", required=True, metavar="SET", dest="sets", help=SET)
     command.add_argument("--only", action="extend", nargs="+", default=[], metavar="NAME=VALUE",
                          help="keep these sweeps: force=100,150, force<=180, material=Canvas,Linen")  # fmt: skip
+    add_rename(command)
+
+
+def add_rename(command: argparse.ArgumentParser) -> None:
+    """--rename."""
+    command.add_argument("--rename", action="append", default=[], metavar="OLD=NEW",
+                         help="give a material another name, before --only; two that get the same become one")  # fmt: skip
 
 
 def add_effort(command: argparse.ArgumentParser) -> None:
     """Options for how long networks are trained."""
     usual = methods.FULL_EFFORT
-    command.add_argument("--effort", type=float, default=usual.share, metavar="SHARE",
+    command.add_argument("--effort", type=above_zero("--effort"), default=usual.share, metavar="SHARE",
                          help="of the networks' usual iterations (1)")  # fmt: skip
-    command.add_argument("--paper-steps", type=int, metavar="N",
+    command.add_argument("--paper-steps", type=whole("--paper-steps", 1), metavar="N",
                          help="iterations of the paper's CNN (4000 on a GPU, fewer on a processor)")  # fmt: skip
     command.add_argument("--bfloat16", action="store_true", help="compute the paper's CNN in bfloat16 where that helps")
 
 
 def add_where(command: argparse.ArgumentParser) -> None:
     """Options for where tasks run and where their results are kept."""
-    command.add_argument("--jobs", type=int, default=-1, metavar="N", help="processes (one for each core)")
+    add_jobs(command)
     command.add_argument("--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster that runs the tasks")
     command.add_argument("--cache", type=Path, default=evaluate.CACHE, metavar="DIR",
                          help=f"where finished folds are kept, so that an interrupted run continues ({evaluate.CACHE})")  # fmt: skip
 
 
+def add_jobs(command: argparse.ArgumentParser) -> None:
+    """--jobs."""
+    command.add_argument("--jobs", type=jobs, default=-1, metavar="N", help="processes (one for each core)")
+
+
+def whole(name: str, least: int) -> Callable[[str], int]:
+    """Reads the option `name`, a whole number from `least` on; raises FormatError for anything else."""
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise FormatError(f"{name} {text} is out of range; use a whole number from {least} on")
+        return value
+
+    return read
+
+
+def number(name: str, fits: Callable[[float], bool], allowed: str) -> Callable[[str], float]:
+    """Reads the option `name`, a number that `fits`; raises FormatError for anything else, with what is `allowed`."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and fits(value)):
+            raise FormatError(f"{name} {text} is out of range; use a number {allowed}")
+        return value
+
+    return read
+
+
+def above_zero(name: str) -> Callable[[str], float]:
+    """Reads the option `name`, a number above 0."""
+    return number(name, lambda x: x > 0, "above 0")
+
+
+def jobs(text: str) -> int:
+    """Reads --jobs: processes from 1 on, or -1 for one on each core. Raises FormatError."""
+    return -1 if text == "-1" else whole("--jobs", 1)(text)
+
+
+def writable(path: Path, option: str = "--out") -> None:
+    """Make the folders above `path`, before hours of work. Raises FormatError where nothing can be written there."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as e:
+        raise FormatError(f"{option} {path}: cannot be written there: {e.strerror}; name another place") from e
+
+
+def writable_file(path: Path, option: str = "--out") -> None:
+    """As `writable`; raises FormatError also where `path` is a folder."""
+    if path.is_dir():
+        raise FormatError(f"{option} {path} is a folder; name a file")
+    writable(path, option)
+
+
 def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
-    """The sets of --set, joined and narrowed by --only. seed: of simulated ones that name none."""
-    return sets.join([sets.load(spec, seed) for spec in args.sets]).select(args.only)
+    """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated ones that name none."""
+    pairs, loaded = labels.renames(args.rename), [sets.load(spec, seed) for spec in args.sets]
+    labels.check_known(pairs, (name for sweeps in loaded for name in sweeps.materials))
+    return sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded]).select(args.only)
 
 
 def names(args: argparse.Namespace) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ def register(add: Add) -> None:
     view.add_argument("--out", type=Path, required=True, metavar="FILE.svg")
     view.set_defaults(run=run_view)
     pull_command = add("pull", run_pull, "fetch what a box has recorded and is not here yet")
+    pull_command.set_defaults(resumes=True)
     pull_command.add_argument("host", metavar="HOST", help="as for ssh: user@box")
     pull_command.add_argument(
         "--from", default=pull.FOLDER, metavar="DIR", dest="folder", help=f"on the box ({pull.FOLDER})"
@@ -53,6 +54,8 @@ def run_describe(args: argparse.Namespace) -> None:
 
 def run_view(args: argparse.Namespace) -> None:
     """Write the plot and print its path."""
+    if args.out.suffix.lower() != ".svg":
+        raise FormatError(f"--out {args.out}: an SVG is written; name a file that ends in .svg")
     put(args.out, sweep_plot.draw(sweep_plot.load(args.sweep, args.number)).encode(), parents=True)
     print(args.out)
 

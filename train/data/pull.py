@@ -33,8 +33,11 @@ SSH_OPTIONS = ("BatchMode=yes", "ConnectTimeout=10", "ServerAliveInterval=5", "S
 AS_READER = (
     'if cd -- "$1" 2>/dev/null && test -r .; then exec sh -c "$2" sh "$1"; else exec sudo -n sh -c "$2" sh "$1"; fi'
 )
-LIST = """cd -- "$1" || exit
-find . -type f '(' -name '*.npy' -o -name '*.json' ')' -exec sha256sum -z -- {} +
+ABSENT = 44
+"""Exit code of LIST where the folder does not exist."""
+LIST = f"""test -e "$1" || exit {ABSENT}
+cd -- "$1" || exit
+find . -type f '(' -name '*.npy' -o -name '*.json' ')' -exec sha256sum -z -- {{}} +
 test $? -le 1"""
 """find ends with 1 where a file was removed meanwhile: it reports that, and still lists the others."""
 SEND = 'cd -- "$1" && exec tar -c --null -T - -f -'
@@ -91,6 +94,11 @@ class RecordingHost:
             print(f"{self.host}: {messages}", file=sys.stderr)
         if code == 255:
             raise ApplianceError(f"{self.host}: no connection; see that `ssh {self.host} true` works")
+        if code == ABSENT:
+            raise ApplianceError(
+                f"{self.host}: there is no {self.folder}: nothing was recorded yet, which makes it (`palpate record`); "
+                "or name another folder with --from"
+            )
         if code:
             raise ApplianceError(
                 f"{self.host}: {self.folder} cannot be read; name another with --from, let the user into its group "

@@ -30,6 +30,9 @@ NAMED = ("position", "session")
 """What a recording may name, beside its material."""
 REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to a window that it does not classify."""
+FRAMES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npy")
+"""Suffixes of files in which laboratories keep the frames of one recording; importing.py makes a set of a folder of them."""
+IMPORT = "palpate-train import {} makes a set of such files"
 NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 """A name that is a whole number; 07 is not one, or it would equal 7."""
 
@@ -69,7 +72,11 @@ def read(path: Path, kind: type[Set]) -> Set:
         )
     if path.is_dir():
         return recordings(path, kind)
-    return hdf5(path, kind) if path.suffix in HDF5 or h5py.is_hdf5(path) else load_file(path, kind)
+    if path.suffix in HDF5 or h5py.is_hdf5(path):
+        return hdf5(path, kind)
+    if path.suffix.lower() in FRAMES:
+        raise FormatError(f"{path.name}: not a sweep set, but a file of frames; {IMPORT.format(path.parent)}")
+    return load_file(path, kind)
 
 
 def hdf5(path: Path, kind: type[Set]) -> Set:
@@ -77,7 +84,7 @@ def hdf5(path: Path, kind: type[Set]) -> Set:
     try:
         with h5py.File(path, "r") as file:
             names = [k for k in file if k in ("samples", "labels", "materials", "rate_hz") or k.startswith("group_")]
-            arrays = {name: _array(file, name) for name in names}
+            arrays = {name: array_in(file, name) for name in names}
             if "rate_hz" in file.attrs:
                 arrays.setdefault("rate_hz", np.asarray(file.attrs["rate_hz"]))
     except (OSError, KeyError, RuntimeError, ValueError, TypeError) as e:
@@ -93,7 +100,7 @@ def hdf5(path: Path, kind: type[Set]) -> Set:
     return build(arrays, source, kind)
 
 
-def _array(file: h5py.File, name: str) -> Array:
+def array_in(file: h5py.File, name: str) -> Array:
     """One array that the file itself holds: what a link or a virtual array refers to may be missing, or read as zeros."""
     link = file.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
@@ -144,9 +151,28 @@ def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
 def recorded(folder: Path) -> list[RecordedSweep]:
     """All sweeps that the box recorded in `folder` (.npy with .json) and below, in the order of their names.
 
-    Raises FormatError naming the file that is broken.
+    Raises FormatError naming the file that is broken, or the folder where it may not be read or holds no recorded sweep.
     """
-    return [RecordedSweep.load(path) for path in sorted(folder.rglob("*.npy"))]
+    try:
+        next(folder.iterdir(), None)
+    except OSError as e:
+        raise FormatError(f"{folder}: not a sweep set: the folder cannot be read: {e.strerror}") from e
+    paths = sorted(folder.rglob("*.npy"))
+    if not any(path.with_suffix(".json").exists() for path in paths):
+        raise FormatError(f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_instead(folder)}")
+    return [RecordedSweep.load(path) for path in paths]
+
+
+def _instead(folder: Path) -> str:
+    """What to do with a folder without recordings of the box."""
+    others = Counter(
+        path.suffix.lower() for path in folder.rglob("*") if path.suffix.lower() in (*FRAMES, *HDF5, ".npz")
+    )
+    if sets := others[".npz"] + sum(others[suffix] for suffix in HDF5):
+        return f"{sets} .npz or HDF5 files are: name one of them, or {IMPORT.format(folder)}"
+    if others:
+        return f"{others.total()} {' and '.join(others)} files are: {IMPORT.format(folder)}"
+    return "record some, or name another folder"
 
 
 def ok(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:

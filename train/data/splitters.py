@@ -43,10 +43,14 @@ class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn shi
         Raises FormatError where a material has fewer recordings than there are folds.
         """
         for label in np.unique(y):
-            if (n := len(np.unique(groups[y == label]))) < self.folds:
+            if (n := len(np.unique(groups[y == label]))) < 2:
+                raise FormatError(
+                    f"material {label} has one recording; record two of each or more, to test on one of them"
+                )
+            if n < self.folds:
                 raise FormatError(
                     f"random:{self.folds} needs {self.folds} recordings of each material; material {label} has {n}: "
-                    f"use random:{max(n, 2)} or less"
+                    f"use random:{n} or less"
                 )
         yield from StratifiedGroupKFold(self.folds, shuffle=True, random_state=self.seed).split(y, y, groups)
 

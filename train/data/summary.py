@@ -6,7 +6,7 @@ cannot be trained on yet is given.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
-from train.data import published, readers, sets
+from train.data import labels, published, readers, sets
 from train.data.readers import RecordedSweep
 from train.data.sets import Dataset, shortened
 
@@ -31,7 +31,8 @@ def describe(spec: str) -> str:
     """The contents of the set that `spec` names, as lines. Raises FormatError where it is missing, broken or unknown."""
     folder = Path(spec)
     if spec.startswith("sim:") or not folder.is_dir():
-        return "\n".join(description(sets.load(spec, 1), {}))
+        whole = sets.load(spec, 1)
+        return "\n".join([*description(whole, {}), *_unsendable(whole.materials)])
     recorded = readers.recorded(folder)
     named, names = _named(recorded)
     lines = description(readers.joined(named, folder, Dataset), names)
@@ -43,7 +44,12 @@ def describe(spec: str) -> str:
         readers.joined(recorded, folder, Dataset).require_materials()
     except FormatError as e:
         lines.append(f"  cannot be trained on yet: {e}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_unsendable(sorted({one.sweep.material for one in readers.ok(recorded)} - {""}))])
+
+
+def _unsendable(materials: Iterable[str]) -> list[str]:
+    """A line where `fit` refuses names of materials."""
+    return [f"  cannot be trained on yet: {why}"] if (why := labels.unsendable(materials)) else []
 
 
 def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Names]:
@@ -113,6 +119,7 @@ def known() -> str:
     lines = [
         "FILE.npz, .h5, .hdf5   samples [N, T, R, C] or [N, T, R, C, A], labels [N], materials [K], rate_hz, group_NAME [N]",
         "FILE.h5, .hdf5         TactMat: samples [materials, repetitions, T, R, C], materials",
+        "                       of CSV, text, MAT, HDF5 and .npy files palpate-train import makes a set",
         "FOLDER                 what palpate record wrote and palpate-train pull fetched, and the folders in it",
         "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]  simulated; x3: three axes, SWEEPS of a tube at each position, SEED to LAST joined",
     ]

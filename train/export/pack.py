@@ -9,6 +9,7 @@ import contextlib
 import io
 import os
 import platform
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -26,10 +27,11 @@ from appliance.bundle.manifest import UNSURE as LEAST_SURE
 from appliance.core import provenance, storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
-from appliance.core.types import Frames, Status, Sweep, normal
+from appliance.core.types import Status, normal
 from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, softmax
 from train.calibration.posthoc import HeldOut, calibrate
 from train.data.sets import Dataset
+from train.export import bundle_score
 from train.export.contact_positions import place_of
 from train.metrics.score import accuracy_figure, fuse
 from train.models.compact.fitted import Fit
@@ -45,6 +47,8 @@ RUNTIME = "0.2.0"
 """The first version of the box that reads such a manifest."""
 REFUSED, UNKNOWN = -1, -2
 """What `score` returns instead of a label."""
+FEWEST = 5
+"""Training sweeps of a material, below which that is why none is recognised."""
 NETWORK = "network alone"
 """Ends the name of the figure of the labels that the network gives, whatever the box makes of them."""
 
@@ -215,12 +219,24 @@ def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> byt
             (sweeps.labels == label) & (logits.argmax(1) == label) & (logits_of_means.argmax(1) == label)
         )
         if not len(known):
-            raise ExportRefused(f"no training sweep of {sweeps.materials[label]!r} is recognised; train longer")
+            raise ExportRefused(
+                f"no training sweep of {sweeps.materials[label]!r} is recognised: {_why(sweeps, label)}"
+            )
         order = np.argsort(softmax(logits[known])[:, label], kind="stable")
         index.append(known[order[len(order) // 2]])
     packed = io.BytesIO()
     np.savez_compressed(packed, samples=sweeps.samples[index], logits=logits[index])
     return packed.getvalue()
+
+
+def _why(sweeps: Dataset, label: int) -> str:
+    """What keeps a material from being recognised, and what to do."""
+    of_it = sweeps.samples[sweeps.labels == label]
+    if not np.ptp(of_it, axis=1).any():
+        return "every taxel of its sweeps is constant; check the skin, and record it again"
+    if len(of_it) < FEWEST:
+        return f"there are {len(of_it)} of it; record {FEWEST} or more"
+    return "they look like others; record it at more positions, or leave it out with --only"
 
 
 def thresholds(sweeps: Dataset, full_scale: float | None) -> bundle.Thresholds:
@@ -239,13 +255,10 @@ def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> tu
 
     fused: each sweep gets the box's answer after all sweeps of its recording.
     """
-    form, labels = sweeps.format, classifier.bundle.manifest.labels
-    t_ns, seq = (np.arange(form.window) * form.period_ns).astype(np.int64), np.arange(form.window)
+    labels = classifier.bundle.manifest.labels
     recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
     answers, sure = np.full(len(sweeps), REFUSED), np.zeros(len(sweeps), bool)
-    for i in np.argsort(recording, kind="stable"):
-        frames = Frames(t_ns, seq, sweeps.samples[i])
-        verdict = classifier(Sweep(int(i), 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1)))
+    for i, verdict in bundle_score.answers(classifier, sweeps, fused=fused):
         if verdict.label:
             answered = recording == recording[i] if fused else i
             answers[answered], sure[answered] = labels.index(verdict.label), verdict.status is Status.OK
@@ -300,13 +313,25 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
     return figures(box, held_out, protocol, logits)
 
 
-@contextlib.contextmanager
-def _replacing(target: Path) -> Iterator[Path]:
-    """A new folder beside `target` that replaces it when the block succeeds, and is removed when it fails."""
+def check_target(target: Path) -> None:
+    """Make the folders above `target`. Raises ExportRefused where no bundle can be put there, before anything is computed."""
     if target.exists() and not (target / bundle.MANIFEST).is_file():
         raise ExportRefused(f"{target} is not a bundle and will not be replaced; name another folder with --out")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent):
+            pass
+    except OSError as e:
+        raise ExportRefused(
+            f"the bundle cannot be written to {target}: {e.strerror}; name another folder with --out"
+        ) from e
+
+
+@contextlib.contextmanager
+def _replacing(target: Path) -> Iterator[Path]:
+    """A new folder beside `target` that replaces it when the block succeeds, and is removed when it fails."""
+    check_target(target)
+    try:
         with storage.folder(target.resolve()) as new:
             yield new
     except OSError as e:

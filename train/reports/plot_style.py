@@ -7,7 +7,7 @@ and dark; a picture by itself is dark on white.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
@@ -128,8 +128,9 @@ def write(axes: Axes, x: float, y: float, text: str, colour: str = BLACK, size: 
         axes.annotate(line, (x, y), (0, 1.2 * size * up), textcoords="offset points", **given | style)
 
 
-def to_svg(figure: Figure, about: str) -> str:
-    """The picture as SVG text. about: its title, for those who cannot see it."""
+def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
+    """The picture as SVG text. about: its title, for those who cannot see it. plain: with colours in place of roles, for
+    programs that know no style sheets."""
     figure.patch.set_facecolor(WHITE)
     file = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": about}):
@@ -139,7 +140,7 @@ def to_svg(figure: Figure, about: str) -> str:
         root.remove(style)  # a style sheet would be that of the whole page
     _drop_empty_groups(root)
     for element in root.iter():
-        _restyle(element)
+        _restyle(element, {} if plain else COLOURS)
     for name in ("width", "height"):
         root.attrib.pop(name)  # as wide as the page
     root.attrib |= {"role": "img", "font-family": FONT, "stroke-linejoin": "round"}
@@ -158,15 +159,15 @@ def _drop_empty_groups(parent: ElementTree.Element) -> None:
             parent.remove(child)
 
 
-def _restyle(element: ElementTree.Element) -> None:
-    """Colours as roles, no font of matplotlib's, no names of groups, coordinates no finer than can be seen."""
+def _restyle(element: ElementTree.Element, colours: Mapping[str, str]) -> None:
+    """Colours as `colours` says, no font of matplotlib's, no names of groups, coordinates no finer than can be seen."""
     attributes = element.attrib
     if element.tag == f"{{{SVG}}}g":
         attributes.pop("id", None)  # two pictures of a page would share them
     if "style" in attributes:
         parts = (part.partition(":") for part in attributes["style"].split(";"))
         pairs = {name.strip(): value.strip() for name, _, value in parts if name.strip() != "font-family"}
-        attributes["style"] = "; ".join(f"{name}: {COLOURS.get(value, value)}" for name, value in pairs.items() if name)
+        attributes["style"] = "; ".join(f"{name}: {colours.get(value, value)}" for name, value in pairs.items() if name)
     for name in NUMBERS & attributes.keys():
         attributes[name] = _short(attributes[name])
     if "d" in attributes:

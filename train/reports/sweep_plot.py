@@ -184,7 +184,7 @@ def draw(sweep: ShownSweep) -> str:
         if still := taxels.shape[1] - moving.shape[1]:
             text += f"; without {still} that stand still"
     _caption(page, SPECTRUM[0] - 0.13, text)
-    return to_svg(figure, f"one sweep: {_printable(sweep.title)}")
+    return to_svg(figure, f"one sweep: {_printable(sweep.title)}", plain=True)
 
 
 def _ends(inches: tuple[float, float]) -> tuple[float, float]:

@@ -321,6 +321,13 @@ def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.Ca
     assert capsys.readouterr().err == "user@box: sudo: a password is required\n"
 
 
+def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):
+    """The folder does not exist, and sudo may look."""
+    ground.program("sudo", '#!/bin/sh\nshift\nexec "$@"\n')
+    with pytest.raises(ApplianceError, match=r"^user@box: there is no /nowhere: nothing was recorded yet"):
+        pull.pull(RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None)
+
+
 def test_a_list_or_stream_that_is_cut_short_is_told(ground: Ground):
     """Tools that fail or are not there, however their connection ends, never look like a box without recordings."""
     ground.ssh("tar", "exit 0")

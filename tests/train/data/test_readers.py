@@ -13,7 +13,7 @@ import pytest
 from appliance.core.errors import FormatError
 from appliance.core.types import Status, SweepFormat, load, save
 from tests.factories.recordings import FORMAT, record
-from tests.factories.sweep_sets import held
+from tests.factories.sweep_sets import held, write
 from train.data import readers, sets
 
 
@@ -89,7 +89,7 @@ PAIR = np.zeros(6, [("a", "i4"), ("b", "f4")])
         ({"labels": PAIR}, "labels holds .*; give one whole number for each of 6"),
         ({"labels": np.array([0, 1, 2, 0, 3, 1])}, "label 3 of sweep 4 is out of range; there are 3"),
         ({"labels": np.full(6, 1)}, "only one class, 'b'"),
-        ({"labels": ["a", "b", "ç"] * 2}, "labels holds <U1"),
+        ({"labels": ["a", "b", "c"] * 2}, "label 'c' is not among the materials \\['a', 'b', 'ç'\\]; add it"),
         ({"materials": np.arange(3)}, "materials hold int64"),
         ({"materials": np.array([b"a", b"b", b"\xff"])}, "not a sweep set .*: .*utf-8"),
         ({"rate_hz": "fast"}, "rate_hz holds .*fast.*; give one number"),
@@ -325,7 +325,7 @@ def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, mess
 
 def test_broken_recordings_are_named(tmp_path: Path):
     """A table cut in two, a sidecar that is missing or empty, nothing that is ok, nothing at all, one material."""
-    with pytest.raises(FormatError, match="no recorded sweep is ok; record some"):
+    with pytest.raises(FormatError, match="no sweep of `palpate record` is in it; record some, or name another"):
         sets.load(str(tmp_path))
     record(tmp_path / "0.npy", status=Status.SHORT)
     with pytest.raises(FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"):
@@ -341,6 +341,7 @@ def test_broken_recordings_are_named(tmp_path: Path):
     (tmp_path / "1.json").write_text(json.dumps(about | {"status": "fine"}))
     with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep"):
         sets.load(str(tmp_path))
+    record(tmp_path / "2.npy", "b")
     (tmp_path / "1.json").unlink()
     with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep"):
         sets.load(str(tmp_path))
@@ -353,3 +354,36 @@ def test_a_recording_is_never_unpickled(tmp_path: Path):
     before_crc(tmp_path / "1.json")
     with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep .*allow_pickle"):
         readers.read(tmp_path, sets.Dataset)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".CSV", ".txt", ".tsv", ".dat", ".mat", ".npy"])
+def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
+    """A single file, or a folder of them: no set, and the command that makes one."""
+    np.save(tmp_path / "x.npy", np.zeros((9, 4)))
+    path = (tmp_path / "x.npy").rename(tmp_path / f"x{suffix}")
+    with pytest.raises(
+        FormatError, match=f"x{suffix}: not a sweep set, but a file of frames; palpate-train import .* makes"
+    ):
+        sets.load(str(path))
+    with pytest.raises(
+        FormatError, match=f"1 {suffix.lower()} files are: palpate-train import .* makes a set of such files"
+    ):
+        sets.load(str(tmp_path))
+
+
+def test_a_folder_of_sets_names_them(tmp_path: Path):
+    """The user meant one of the files in it."""
+    write(tmp_path / "a.npz")
+    with pytest.raises(FormatError, match=r"1 \.npz or HDF5 files are: name one of them"):
+        sets.load(str(tmp_path))
+
+
+def test_a_folder_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The cause, not that nothing is in it."""
+
+    def denied(self: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(FormatError, match="the folder cannot be read: Permission denied"):
+        sets.load(str(tmp_path))

@@ -284,3 +284,27 @@ def test_a_set_goes_to_another_process():
     again = pickle.loads(pickle.dumps(s))
     assert sets.digest(again) == sets.digest(s)
     assert again.source == s.source
+
+
+def test_labels_may_be_names(tmp_path: Path):
+    """With materials or without; a name that is not among them is refused."""
+    texts = np.array(["b", "a", "b", "a", "c", "c"])
+    bare = sets.load(write(tmp_path / "bare.npz", labels=texts, materials=None))
+    assert (bare.materials, bare.labels.tolist()) == (("a", "b", "c"), [1, 0, 1, 0, 2, 2])
+    given = sets.load(write(tmp_path / "given.npz", labels=texts, materials=np.array(["c", "b", "a"])))
+    assert (given.materials, given.labels.tolist()) == (("c", "b", "a"), [1, 2, 1, 2, 0, 0])
+    with pytest.raises(FormatError, match=r"label 'c' is not among the materials \['a', 'b'\]; add it there"):
+        sets.load(write(tmp_path / "less.npz", labels=texts, materials=np.array(["a", "b"])))
+
+
+@pytest.mark.parametrize("name", ["labels", "materials", "group_speed"])
+def test_objects_are_refused_with_the_remedy(tmp_path: Path, name: str):
+    """What pandas and lists of names become in numpy; nothing is unpickled."""
+    arrays = held()
+    np.savez(tmp_path / "o.npz", **arrays | {name: arrays[name].astype(object)})
+    with pytest.raises(
+        FormatError, match=rf"{name} holds objects, which are not read; save np.array\({name}, dtype=str\)"
+    ):
+        sets.load(str(tmp_path / "o.npz"))
+    with pytest.raises(FormatError, match=r"materials hold .S1; give a list of names, dtype=str"):
+        sets.load(write(tmp_path / "s.npz", materials=np.array([b"a", b"b", b"c"])))

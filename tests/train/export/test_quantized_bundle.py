@@ -388,7 +388,7 @@ def test_references_are_what_they_are_called(tmp_path: Path):
 
 
 def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """One line a figure, the size at the end; a fit that is none has a FormatError's exit code."""
+    """One line a figure, then the size, at the end the command that scores it; a fit that is none has a FormatError's exit code."""
     fitted.save(tmp_path / "fit.npz")
     args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
     assert main(["export", str(tmp_path / "fit.npz"), *args]) == 0
@@ -398,7 +398,9 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
         "held-out recording, network alone",
         "held-out recording, by recording",
         "bundle",
+        "what it names of sweeps that the fit has not seen",
     ]
+    assert lines[-1].endswith(f": palpate-train score {tmp_path / 'bundle'} --set SET")
     assert bundle.load(tmp_path / "bundle").manifest.version == "3"
     assert main(["export", str(tmp_path / "bundle" / "golden.npz"), *args]) == FormatError.exit_code
     assert "golden.npz: not a fit" in capsys.readouterr().err

@@ -1,0 +1,115 @@
+"""Scoring a bundle: a set through the box's classifier, what it named, with interval and confusions."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.core.clock import SystemClock
+from appliance.core.errors import FormatError
+from appliance.inference.classifier import Classifier
+from tests.factories import toy_bundle
+from train.cli.main import main
+from train.data.sets import Dataset
+from train.export import bundle_score, pack
+from train.metrics.score import interval
+
+HERE = [(0, 0), (6, 0), (0, 6)]
+"""Embeddings of the toy's three materials."""
+
+
+def sweeps(*embeddings: tuple[float, float], labels: list[int], materials: str = "abc", **groups: list[int]) -> Dataset:
+    """A set for the toy bundle."""
+    samples = np.stack([toy_bundle.window(*z) for z in embeddings])
+    return Dataset(
+        samples, np.array(labels), tuple(materials), 100.0, {k: np.array(v) for k, v in groups.items()}, "s.npz"
+    )
+
+
+@pytest.fixture
+def classifier(tmp_path: Path) -> Classifier:
+    """The toy's."""
+    return Classifier(toy_bundle.load(tmp_path / "toy"), SystemClock())
+
+
+def test_what_is_named_is_counted(classifier: Classifier):
+    """Right, taken for another, unsure and unknown, by material; the interval resamples positions."""
+    s = sweeps(
+        (0, 0), (0, 0), (6, 0), (0, 6), (3, 0), (40, 40), labels=[0, 0, 0, 2, 1, 2], position=[1, 1, 2, 2, 3, 3]
+    )  # fmt: skip
+    found = bundle_score.score(classifier, s)
+    assert found.right.tolist() == [True, True, False, True, False, False]
+    assert found.answered["a"] == Counter(a=2, b=1)
+    assert found.answered["c"] == Counter({"c": 1, "(unknown)": 1})
+    assert found.statuses == Counter(ok=4, unsure=1, unknown=1)
+    assert found.json()["named_rightly"] == {
+        "right": 3,
+        "total": 6,
+        "interval": interval(found.right, s.groups["position"]),
+    }
+    assert found.by == "position"
+    lines = found.text().splitlines()
+    assert lines[1].startswith("named rightly: 3 of 6: 50.0 % [")
+    assert lines[1].endswith("95 % interval, by position (3)")
+    assert "  a     2 of 3     b 1" in lines
+    assert (found.right == ((pack.score(classifier, s)[0] == s.labels) & pack.score(classifier, s)[1])).all()
+
+
+def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier):
+    """The same names in another order; one that the bundle has not is listed with its answers."""
+    s = sweeps(*HERE, (0, 6), labels=[1, 0, 2, 2], materials="bax")
+    found = bundle_score.score(classifier, s)
+    assert found.right.tolist() == [True, True]
+    assert found.foreign == {"x": Counter(c=2)}
+    assert "  x  not in the bundle, not counted: c 2" in found.text()
+
+
+def test_windows_of_a_recording_are_fused_too(classifier: Classifier):
+    """The last answer to each recording; without several windows there are no recordings to tell of."""
+    s = sweeps((0, 0), (3, 0), (6, 0), (6, 0), labels=[0, 0, 1, 1], recording=[0, 0, 1, 1])
+    found = bundle_score.score(classifier, s)
+    assert found.recordings is not None
+    assert found.recordings.tolist() == [True, True]
+    assert found.by == "recording"
+    assert "recordings, their sweeps fused: 2 of 2: 100.0 %" in found.text()
+    assert bundle_score.score(classifier, sweeps(*HERE, labels=[0, 1, 2])).recordings is None
+
+
+def test_a_set_of_another_form_is_refused(classifier: Classifier):
+    """Both forms are named; so are the materials where none is the same."""
+    s = sweeps(*HERE, labels=[0, 1, 2])
+    with pytest.raises(
+        FormatError, match=r"s.npz is of 2x2 int16 at 50 Hz, window 20, the bundle of 2x2 int16 at 100 Hz"
+    ):
+        bundle_score.score(classifier, replace(s, rate_hz=50.0))
+    with pytest.raises(FormatError, match=r"s.npz has x, y, z, the bundle a, b, c; none is the same"):
+        bundle_score.score(classifier, replace(s, materials=tuple("xyz")))
+
+
+def test_the_command_prints_and_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """`palpate-train score`, with --json and --rename; a bundle that is none is one line."""
+    toy_bundle.load(tmp_path / "toy")
+    sweeps(*HERE, labels=[0, 1, 2], materials="Abc").save(tmp_path / "s.npz")
+    args = ["score", str(tmp_path / "toy"), "--set", str(tmp_path / "s.npz")]
+    assert main([*args, "--rename", "A=a", "--json", str(tmp_path / "out.json")]) == 0
+    assert "named rightly: 3 of 3: 100.0 % [43.9, 100.0], 95 % interval" in capsys.readouterr().out
+    told = json.loads((tmp_path / "out.json").read_text())
+    assert told["named_rightly"]["right"] == 3
+    assert told["answers"] == {"a": {"a": 1}, "b": {"b": 1}, "c": {"c": 1}}
+    content = toy_bundle.files()
+    manifest = content["manifest.json"].replace(b'"seed": 1', b'"set": "s.npz"')
+    toy_bundle.put(tmp_path / "toy", content | {"manifest.json": manifest})
+    assert main(args) == 0
+    assert (
+        "fitted to a set of this name, s.npz: sweeps that it has seen say nothing of new ones"
+        in capsys.readouterr().out
+    )
+    assert main([*args, "--rename", "Q=a"]) == FormatError.exit_code
+    assert "no material is called 'Q'" in capsys.readouterr().err
+    assert main(["score", str(tmp_path / "none"), *args[2:]]) != 0
+    assert capsys.readouterr().err.count("\n") == 1

@@ -1,0 +1,62 @@
+"""Names of materials: which the box can send, and how others are renamed. In: names. Out: the same, or one error for all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from appliance.bundle.manifest import LABEL
+from appliance.core.errors import FormatError
+from appliance.core.schema import closest
+from train.data.sets import Dataset
+
+ALLOWED = "1 to 24 letters, digits, spaces, '.', '_' or '-', the first a letter or a digit"
+
+
+def unsendable(names: Iterable[str]) -> str:
+    """Which of `names` the box cannot send, all in a line with the remedy; "" where it can send all."""
+    if not (bad := [name for name in names if not LABEL.fullmatch(name)]):
+        return ""
+    listed = ", ".join(f"{name!r} ({len(name)} characters)" for name in bad)
+    return f"the box cannot send {listed}; a label is {ALLOWED}; give each another name with --rename '{bad[0]}=NEW'"
+
+
+def check(sweeps: Dataset) -> Dataset:
+    """The set itself. Raises FormatError listing every material that the box cannot send."""
+    if why := unsendable(sweeps.materials):
+        raise FormatError(f"{sweeps.source}: {why}")
+    return sweeps
+
+
+def renames(texts: Sequence[str]) -> dict[str, str]:
+    """What --rename OLD=NEW says. Raises FormatError where one cannot be read, or one name gets two."""
+    pairs: dict[str, str] = {}
+    for text in texts:
+        old, separator, new = text.rpartition("=")
+        if not (separator and old and new):
+            raise FormatError(f"--rename {text!r} cannot be read; write OLD=NEW")
+        if pairs.setdefault(old, new) != new:
+            raise FormatError(f"--rename gives {old!r} two names, {pairs[old]!r} and {new!r}; give it one")
+    return pairs
+
+
+def check_known(pairs: Mapping[str, str], names: Iterable[str]) -> None:
+    """Raises FormatError where something is renamed that is not among `names`."""
+    known = tuple(dict.fromkeys(names))
+    for old in pairs:
+        if old not in known:
+            near = closest(old, known, cutoff=0.6)
+            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+            raise FormatError(f"--rename: no material is called {old!r}; {hint}")
+
+
+def renamed(sweeps: Dataset, pairs: Mapping[str, str]) -> Dataset:
+    """The set with other names of materials, in the same order; what gets the same name becomes one material."""
+    if not set(pairs) & set(sweeps.materials):
+        return sweeps
+    names = [pairs.get(name, name) for name in sweeps.materials]
+    materials = tuple(dict.fromkeys(names))
+    labels = np.array([materials.index(name) for name in names])[sweeps.labels]
+    return replace(sweeps, labels=labels, materials=materials)

@@ -1,0 +1,154 @@
+"""What a bundle answers to a sweep set, through the classifier of the box. In: a classifier, a Dataset. Out: a BundleScore.
+
+A sweep counts as named rightly where the box names its material and is sure of it (status ok).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+from appliance.core.types import Frames, Status, Sweep, Verdict
+from appliance.inference.classifier import Classifier
+from train.data.sets import Dataset, digest
+from train.metrics.score import Score, interval, provenance
+
+Array = NDArray[Any]
+CLUSTERS = ("position", "session", "object")
+"""Groups whose sweeps succeed or fail together; the first that has several values is resampled for the interval."""
+
+
+def answers(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> Iterator[tuple[int, Verdict]]:
+    """The box's verdict on each sweep with its number, recording by recording. fused: the sweeps of a recording count as
+    sweeps of one object."""
+    form = sweeps.format
+    t_ns, seq = (np.arange(form.window) * form.period_ns).astype(np.int64), np.arange(form.window)
+    recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
+    for i in np.argsort(recording, kind="stable").tolist():
+        frames = Frames(t_ns, seq, sweeps.samples[i])
+        yield (
+            i,
+            classifier(Sweep(i, 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1))),
+        )
+
+
+@dataclass(frozen=True)
+class BundleScore:
+    """What a bundle answered to the sweeps of a set.
+
+    about: name, version and id of the bundle. right: bool [n], of the sweeps whose material it has. clusters, by: the
+    groups [n] that the interval resamples, and their name; None, "" where sweeps are independent. answered: of each
+    material the answers and their counts: a label, or a status in parentheses. statuses: counts.
+    unsure_right: answers that were unsure but named the material. recordings: right ones of those with several sweeps,
+    fused; None where there are none. foreign: as `answered`, of materials that the bundle does not have.
+    """
+
+    about: dict[str, str]
+    sweeps: Dataset
+    right: Array
+    clusters: Array | None
+    by: str
+    answered: dict[str, Counter[str]]
+    statuses: Counter[str]
+    unsure_right: int
+    recordings: Array | None
+    foreign: dict[str, Counter[str]]
+
+    def json(self) -> dict[str, Any]:
+        """The figures for scripts, with where they come from."""
+        result: dict[str, Any] = {
+            "bundle": self.about, "set": self.sweeps.source, "digest": digest(self.sweeps), "sweeps": len(self.sweeps),
+            "named_rightly": Score.of(self.right).json() | {"interval": interval(self.right, self.clusters)},
+            "interval_by": self.by, "statuses": self.statuses, "unsure_right": self.unsure_right,
+            "answers": self.answered, "not_in_the_bundle": self.foreign,
+        }  # fmt: skip
+        if self.recordings is not None:
+            result["recordings"] = Score.of(self.recordings).json() | {"interval": interval(self.recordings)}
+        return result | provenance()
+
+    def text(self) -> str:
+        """The figures for a person, as lines."""
+        by = "" if self.clusters is None else f", by {self.by} ({len(np.unique(self.clusters))})"
+        lines = [
+            f"{self.about['name']} {self.about['version']}, {self.about['id']}, on {self.sweeps.source}: "
+            f"{len(self.sweeps)} sweeps of {len(self.answered) + len(self.foreign)} materials",
+            f"named rightly: {_share(self.right, self.clusters)}, 95 % interval{by}",
+        ]
+        if self.recordings is not None:
+            lines.append(f"recordings, their sweeps fused: {_share(self.recordings)}")
+        sure = f" ({self.unsure_right} of them with the right label)" if self.statuses[Status.UNSURE] else ""
+        counts = [f"{status} {n}{sure * (status == Status.UNSURE)}" for status, n in self.statuses.most_common()]
+        lines.append(f"answers: {', '.join(counts)}")
+        wide = max(map(len, (*self.answered, *self.foreign)))
+        for material, given in self.answered.items():
+            others = ", ".join(f"{answer} {n}" for answer, n in given.most_common() if answer != material)
+            lines.append(f"  {material:<{wide}}  {given[material]:>4} of {given.total():<4}  {others}".rstrip())
+        for material, given in self.foreign.items():
+            named = ", ".join(f"{answer} {n}" for answer, n in given.most_common())
+            lines.append(f"  {material:<{wide}}  not in the bundle, not counted: {named}")
+        return "\n".join(lines)
+
+
+def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
+    """Run `sweeps` through the box's classifier. Raises FormatError where their format is not the bundle's, or it has none
+    of their materials."""
+    manifest = classifier.bundle.manifest
+    present = [sweeps.materials[k] for k in np.unique(sweeps.labels)]
+    if sweeps.format != manifest.format:
+        raise FormatError(
+            f"{sweeps.source} is of {sweeps.format}, the bundle of {manifest.format}; name a set of its form"
+        )
+    if not set(present) & set(manifest.labels):
+        raise FormatError(
+            f"{sweeps.source} has {', '.join(present)}, the bundle {', '.join(manifest.labels)}; none is the same: "
+            "name another set, or --rename OLD=NEW"
+        )
+    material = np.array(sweeps.materials)[sweeps.labels]
+    known = np.isin(material, manifest.labels)
+    given = np.empty(len(sweeps), object)
+    statuses: Counter[str] = Counter()
+    hinted = 0
+    for i, verdict in answers(classifier, sweeps):
+        statuses[str(verdict.status)] += 1
+        given[i] = verdict.label if verdict.status is Status.OK else f"({verdict.status})"
+        hinted += verdict.status is Status.UNSURE and verdict.label == material[i]
+    clusters, by = _clusters(sweeps)
+    return BundleScore(
+        {"name": manifest.name, "version": manifest.version, "id": classifier.bundle.id}, sweeps,
+        (given == material)[known], None if clusters is None else clusters[known], by,
+        {name: Counter(given[material == name].tolist()) for name in present if name in manifest.labels},
+        statuses, hinted, _recordings(classifier, sweeps.take(known)),
+        {name: Counter(given[material == name].tolist()) for name in present if name not in manifest.labels},
+    )  # fmt: skip
+
+
+def _clusters(sweeps: Dataset) -> tuple[Array | None, str]:
+    """Which sweeps [N] succeed or fail together, and the name of that group."""
+    for name in CLUSTERS:
+        if name in sweeps.groups and len(np.unique(sweeps.groups[name])) > 1:
+            return sweeps.groups[name], name
+    recording = sweeps.group("recording")
+    return (recording, "recording") if len(np.unique(recording)) < len(sweeps) else (None, "")
+
+
+def _recordings(classifier: Classifier, sweeps: Dataset) -> Array | None:
+    """Whether the last fused answer to each recording is right, bool [G]; None where each holds one sweep."""
+    values, member = np.unique(sweeps.group("recording"), return_inverse=True)
+    if len(values) == len(sweeps):
+        return None
+    right = np.zeros(len(values), bool)
+    for i, verdict in answers(classifier, sweeps, fused=True):
+        if verdict.label:  # what is unknown is not fused, and leaves the answer so far
+            right[member[i]] = verdict.status is Status.OK and verdict.label == sweeps.materials[sweeps.labels[i]]
+    return right
+
+
+def _share(right: Array, clusters: Array | None = None) -> str:
+    low, high = (100 * end for end in interval(right, clusters))
+    return f"{right.sum()} of {len(right)}: {100 * right.mean():.1f} % [{low:.1f}, {high:.1f}]"
