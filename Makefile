@@ -9,7 +9,7 @@ DESKTOP := $(VENV)/desktop.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
+.PHONY: help demo desktop test test-fast check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
   deploy install wheel lock clean
 
 help: ## this list
@@ -17,6 +17,9 @@ help: ## this list
 
 demo: $(RUNTIME) ## watch simulated sweeps being classified, live
 	$(BIN)/palpate demo
+
+desktop: $(DESKTOP) ## install palpate-train, and palpate, with all that training needs; no test runs
+	@echo "palpate and palpate-train are in $(BIN): call $(BIN)/palpate-train, or first: source $(BIN)/activate"
 
 test: $(DESKTOP) ## run the tests (set PALPATE_DATA to the folder of real sweeps to run those as well)
 	$(BIN)/python -m pytest -q -n auto --dist loadfile

@@ -2,7 +2,16 @@
 
 import sys
 
-from train.cli.main import main
+
+def main() -> int:
+    """Run one command; its exit code."""
+    try:
+        from train.cli import main as command  # here: these imports take seconds, in which Ctrl-C may come
+    except KeyboardInterrupt:
+        print("palpate-train: interrupted before anything was done", file=sys.stderr)
+        return 130
+    return command.main()
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -8,14 +8,15 @@ import sys
 from collections.abc import Callable, Sequence
 
 from appliance.core.errors import ApplianceError
-from train.cli import bundles, choose, evaluation, reports, sets
+from train.cli import bundles, choose, evaluation, importing, reports, sets
 from train.metrics import score
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; its exit code. An error of this project is one line on the error stream."""
-    args = parser().parse_args(argv)
+    args = argparse.Namespace()
     try:
+        args = parser().parse_args(argv)
         score.provenance()  # read once, now: the code that runs is of this commit
         args.run(args)
         sys.stdout.flush()
@@ -30,7 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"palpate-train: {e.filename}: {e.strerror}", file=sys.stderr)
         return ApplianceError.exit_code
     except KeyboardInterrupt:
-        print("palpate-train: interrupted; the same command goes on where it was", file=sys.stderr)
+        kept = "goes on where it was" if getattr(args, "resumes", hasattr(args, "cache")) else "begins anew"
+        print(f"palpate-train: interrupted; the same command {kept}", file=sys.stderr)
         return 130
     return 0
 
@@ -45,6 +47,6 @@ def parser() -> argparse.ArgumentParser:
         command.set_defaults(run=run)
         return command
 
-    for group in (sets, evaluation, bundles, choose, reports):
+    for group in (sets, importing, evaluation, bundles, choose, reports):
         group.register(add)
     return parser

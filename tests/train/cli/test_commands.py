@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
+from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import easy
 from train.cli.main import main
-from train.data import sets
+from train.data import pull, sets
 from train.models.compact.fit import Fit
 
 
@@ -47,6 +49,28 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         (["--set", "sim:T-LAB:1:1", "--only", "force=1"], "no group 'force'"),
         (["--set", "sim:T-LAB:1:1", "--split", "recording"], "split 'recording' cannot be read"),
         (["--set", "sim:T-LAB:1:1", "--rest", "rest.npz"], "--rest needs --split"),
+        (["--set", "sim:T-LAB:1:1", "--seed", "-1"], "--seed -1 is out of range; use a whole number from 0 on"),
+        (["--set", "sim:T-LAB:1:1", "--steps", "-1"], "--steps -1 is out of range"),
+        (["--set", "sim:T-LAB:1:1", "--steps", "x"], "--steps x is out of range"),
+        (["--set", "sim:T-LAB:1:1", "--steps", "0", "--size", "1k"], "--steps 0 trains no network; use 2 or more"),
+        (["--set", "sim:T-LAB:1:1", "--row-shift", "3"], "--row-shift 3 is out of range; use a number from 0 to 1"),
+        (["--set", "sim:T-LAB:1:1", "--stretch", "-1"], "--stretch -1 is out of range"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--out", "/proc/none/fit.npz"],
+            "--out /proc/none/fit.npz: cannot be written there",
+        ),
+        (["--set", "sim:T-LAB:1:1", "--out", "/"], "--out / is a folder; name a file"),
+        (["--set", "sim:T-LAB:1:1", "--rename", "wood"], "--rename 'wood' cannot be read; write OLD=NEW"),
+        (["--set", "sim:T-LAB:1:1", "--rename", "wod=oak"], "no material is called 'wod'; did you mean 'wood'?"),
+        (["--set", "sim:T-LAB:1:1", "--rename", "wood=a", "--rename", "wood=b"], "'wood' two names, 'a' and 'b'"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wood=a,b", "--rename", "foam=" + "f" * 33],
+            "cannot send 'a,b' (3 charac",
+        ),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wood=a,b", "--rename", "foam=" + "f" * 33],
+            "f' (33 characters); a label",
+        ),
     ],
 )
 def test_an_error_of_the_project_is_one_line(
@@ -70,3 +94,56 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
         process.stdout.close()
         error = process.stderr.read()
     assert (process.returncode, error) == (1, "")
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["choose", "--scene", "none.toml", "--out", "/proc/none/b"], "cannot be written to /proc/none/b"),
+        (["export", "none.npz", "--out", "/proc/none/b", "--name", "b", "--version", "1"], "written to /proc/none/b"),
+        (["pack", "--set", "none", "--method", "H", "--seed", "1", "--out", "/proc/none/b", "--name", "b", "--version", "1"],
+         "written to /proc/none/b"),
+        (["score", "none", "--set", "none.npz", "--json", "/proc/none/x.json"], "--json /proc/none/x.json: cannot be"),
+        (["evaluate", "--set", "none", "--protocol", "random:2", "--method", "H", "--jobs", "0"], "--jobs 0 is out of range"),
+        (["evaluate", "--set", "none", "--protocol", "random:2", "--method", "H", "--effort", "0"], "--effort 0 is out of"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_written_or_computed_is_refused_first(
+    args: list[str], message: str, capsys: pytest.CaptureFixture[str]
+):
+    """Before a set is read: the sets named here do not even exist."""
+    assert main(args) != 0
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("args", "message"), [
+    (["fit", "--set", "x", "--seed", "1", "--out", "fit.npz"], "the same command begins anew"),
+    (["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H"], "the same command goes on where it was"),
+    (["pull", "user@box", "--out", "here"], "the same command goes on where it was"),
+])  # fmt: skip
+def test_an_interrupted_command_says_what_becomes_of_it(
+    args: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Ctrl-C: exit code 130, one line; whether the next call begins anew."""
+
+    def interrupt(*args: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sets, "load", interrupt)
+    monkeypatch.setattr(pull, "pull", interrupt)
+    assert main(args) == 130
+    assert capsys.readouterr().err == f"palpate-train: interrupted; {message}\n"
+
+
+@pytest.mark.slow
+def test_ctrl_c_during_the_imports_is_one_line(tmp_path: Path):
+    """The first seconds of the program, before it has read its arguments."""
+    (tmp_path / "torch.py").write_text("raise KeyboardInterrupt\n")
+    (tmp_path / "sklearn.py").write_text("raise KeyboardInterrupt\n")
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    command = [sys.executable, "-m", "train", "methods"]
+    done = subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "palpate-train: interrupted before anything was done\n")

@@ -1,0 +1,122 @@
+"""palpate-train import, as a user calls it: the five commands of docs/import.md, its report, its exit codes."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.sim import skin
+from tests.factories.lab_files import csv_folder, write
+from tests.factories.paths import ROOT
+from train.cli.main import main
+from train.data import sets
+
+PAGE = (ROOT / "docs" / "import.md").read_text()
+
+
+def five() -> list[list[str]]:
+    """The commands of the page, as a shell splits them."""
+    (block,) = re.findall(r"<!-- five -->\n(.*?)<!-- /five -->", PAGE, re.S)
+    return [shlex.split(line) for line in block.splitlines()]
+
+
+@pytest.mark.slow
+def test_the_five_commands_of_the_page_make_a_bundle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """As they stand there, on simulated sweeps written as CSV: the sweeps come back, and most of the rest is named."""
+    monkeypatch.chdir(tmp_path)
+    folder = csv_folder(tmp_path / "recordings", each=3)
+    assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in PAGE
+    commands = five()
+    assert len(commands) == 5
+    for program, *args in commands:
+        assert program == "palpate-train"
+        assert main(args) == 0, capsys.readouterr()
+    made = sets.load("build/mine.npz")
+    samples, labels, position = skin.sweep_set("T-REAL", 5, 3)
+    expected = samples[(labels < 3) & (position < 4)]
+    assert len(made) == len(expected) == 36
+    assert {s.tobytes() for s in made.samples} == {s.tobytes() for s in expected}
+    out = capsys.readouterr().out
+    assert "they helped to choose the model" in out
+    assert "which no part of the fit has seen; after export: palpate-train score BUNDLE --set build/rest.npz\n" in out
+    assert f"what it names of the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
+    assert "left out: README.md: its name does not fit the pattern" in out
+    found = re.search(r"named rightly: (\d+) of 9: ", out)
+    assert found
+    assert int(found[1]) >= 6
+
+
+def test_a_broken_file_is_told_and_the_others_are_imported(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Its line, the set of the rest, a report with a line for each file, exit code 65."""
+    folder = csv_folder(tmp_path / "r", each=1, positions=1)
+    (folder / "foam_p0_1.csv").write_text("time,s0\n0,1\n0,x\n")
+    args = [
+        "import",
+        str(folder),
+        "--pattern",
+        "{material}_p{position:d}_{trial:d}.csv",
+        "--time",
+        "time:ms",
+        "--grid",
+        "4x4",
+    ]
+    args += ["--out", str(tmp_path / "s.h5"), "--report", str(tmp_path / "report.txt")]
+    assert main(args) == 65
+    told = capsys.readouterr()
+    assert "left out: foam_p0_1.csv: line 3, column 2 is 'x', which is no number" in told.out
+    assert told.err.splitlines()[-1].startswith("palpate-train: 1 of 4 files could not be used, as said above")
+    assert len(sets.load(str(tmp_path / "s.h5"))) == 3
+    report = dict(line.split("\t") for line in (tmp_path / "report.txt").read_text().splitlines())
+    assert report["metal_p0_1.csv"] == "taken: 1 windows of 2100 frames"
+    assert report["foam_p0_1.csv"].startswith("left out: line 3, column 2")
+    assert report.keys() == {path.name for path in folder.iterdir()}
+
+
+def test_what_fails_the_same_way_is_told_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Five lines of twelve, the rest in one; nothing is written but the report."""
+    for k in range(12):
+        write(tmp_path / "r" / f"wood_{k:02}.csv", np.zeros((9, 4)), 100.0)
+    args = ["import", str(tmp_path / "r"), "--pattern", "{material}_{trial}.csv", "--rate", "100", "--grid", "4x4"]
+    args += ["--out", str(tmp_path / "s.npz"), "--report", str(tmp_path / "report.txt")]
+    assert main(args) == 65
+    told = capsys.readouterr()
+    assert told.out.count("left out: ") == 6
+    assert "left out: 7 more for the same reason: it has 5 columns, a grid of 4x4 takes 16" in told.out
+    assert "none of 12 files could be taken" in told.err
+    assert not (tmp_path / "s.npz").exists()
+    assert len((tmp_path / "report.txt").read_text().splitlines()) == 12
+
+
+@pytest.mark.skipif("PALPATE_DATA" not in os.environ, reason="PALPATE_DATA names no folder of real sweeps")
+@pytest.mark.slow
+def test_real_sweeps_come_back_from_csv(tmp_path: Path):
+    """FabricSlide, each window as a CSV file with its force and speed in the name: the same counts and groups come back."""
+    real = sets.load(str(Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"))
+    real = real.take(np.arange(len(real)) % 20 == 0)
+    for i, counts in enumerate(real.samples):
+        name = f"{real.materials[real.labels[i]]}/{real.groups['force'][i]}_{real.groups['speed'][i]}_{i}.csv"
+        write(tmp_path / "r" / name, counts.reshape(len(counts), -1), real.rate_hz)
+    args = [
+        "import",
+        str(tmp_path / "r"),
+        "--pattern",
+        "{material}/{force:d}_{speed:d}_{number:d}.csv",
+        "--time",
+        "time:ms",
+    ]
+    args += ["--grid", "16x1", "--window", "128", "--dtype", real.samples.dtype.name, "--out", str(tmp_path / "s.npz")]
+    assert main(args) == 0
+    made = sets.load(str(tmp_path / "s.npz"))
+    order = np.argsort(made.groups["number"])
+    assert made.rate_hz == pytest.approx(real.rate_hz, rel=0.005)
+    np.testing.assert_array_equal(made.samples[order], real.samples)
+    for group in ("force", "speed"):
+        np.testing.assert_array_equal(made.groups[group][order], real.groups[group])
+    assert [made.materials[k] for k in made.labels[order]] == [real.materials[k] for k in real.labels]

@@ -1,0 +1,64 @@
+"""Patterns over file names: what they read, what is ambiguous, what is no pattern."""
+
+from __future__ import annotations
+
+import pytest
+
+from appliance.core.errors import FormatError
+from train.data.file_names import NamePattern, group
+
+
+@pytest.mark.parametrize(
+    ("pattern", "path", "fields"),
+    [
+        ("{material}_{force}N_{trial}.csv", "wood_2.5N_3.csv", {"material": "wood", "force": "2.5", "trial": "3"}),
+        ("{material}/{speed}/{}.csv", "wood/fast/run 7.csv", {"material": "wood", "speed": "fast"}),
+        ("{material}_{force:d}N.csv", "plastic_rough_5N.csv", {"material": "plastic_rough", "force": "5"}),
+        ("{material}_{x:f}.csv", "wood_-0.5.csv", {"material": "wood", "x": "-0.5"}),
+        ("{material}.(1).csv", "a+b.(1).csv", {"material": "a+b"}),
+        ("{material}.csv", "wood.txt", None),
+        ("{material}.csv", "deep/wood.csv", None),
+        ("{material}_{force:d}.csv", "wood_x.csv", None),
+    ],
+)
+def test_a_pattern_reads_a_name(pattern: str, path: str, fields: dict[str, str] | None):
+    """Text, whole numbers, numbers, parts that say nothing; a field stays within one name."""
+    assert NamePattern(pattern).read(path) == fields
+
+
+def test_a_name_that_fits_in_several_ways_is_refused():
+    """`plastic_rough_5N_1` may be plastic or plastic_rough; nothing is guessed."""
+    with pytest.raises(FormatError, match="several ways \\(material 'plastic' or 'plastic_rough'\\); say which"):
+        NamePattern("{material}_{force}N_{trial}.csv").read("plastic_rough_5N_1.csv")
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("{trial}.csv", "does not say where the material stands"),
+        ("{material}_{a}_{a}.csv", "'a' stands twice"),
+        ("{material}_{A}.csv", "'A' stands twice or is no name; use small letters"),
+        ("{material}_{a.csv", "a brace without its other one"),
+        ("{material}_{a:x}.csv", "'x' is no kind"),
+        ("{material}_{recording}.csv", "each file is a recording"),
+    ],
+)
+def test_what_is_no_pattern_is_refused(pattern: str, message: str):
+    """Each with its reason."""
+    with pytest.raises(FormatError, match=message):
+        NamePattern(pattern)
+
+
+@pytest.mark.parametrize(
+    ("texts", "values", "meaning"),
+    [
+        (["10", "5", "10"], [10, 5, 10], ""),
+        (["2.5", "10", "-1"], [1, 2, 0], "0 = -1, 1 = 2.5, 2 = 10"),
+        (["slow", "fast"], [1, 0], "0 = fast, 1 = slow"),
+        (["01", "10"], [0, 1], "0 = 01, 1 = 10"),
+    ],
+)
+def test_texts_become_numbers_that_are_told(texts: list[str], values: list[int], meaning: str):
+    """Whole numbers stay; others are ranked by value, or by name, and the report says what a rank is."""
+    numbers, told = group(texts)
+    assert (numbers.tolist(), told) == (values, meaning)

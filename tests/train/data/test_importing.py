@@ -1,0 +1,342 @@
+"""Import: folders of CSV, text, MAT, HDF5 and .npy become sets; what cannot be used gets one exact line."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+from appliance.core.errors import FormatError
+from tests.factories.lab_files import write
+from train.data import sets
+from train.data.file_names import NamePattern
+from train.data.importing import Imported, ImportPlan, LeftOut, Length, import_folder
+
+NAMES = NamePattern("{material}_{trial:d}.{}")
+COUNTS = np.arange(40 * 4).reshape(40, 4) % 150
+
+
+def plan(**changes: object) -> ImportPlan:
+    """Four taxels at 100 Hz, windows of ten frames."""
+    given = {"grid": "2x2", "rate_hz": 100.0, "window": Length("10", "--window")} | changes
+    return ImportPlan(**{"pattern": NAMES} | given)
+
+
+def taken(folder: Path, **changes: object) -> Imported:
+    """What is imported; every file fits and is used."""
+    left_out: list[LeftOut] = []
+    made = import_folder(folder, plan(**changes), lambda line: None, left_out)
+    assert left_out == []
+    return made
+
+
+def reasons(folder: Path, **changes: object) -> dict[str, str]:
+    """Why files were left out, by name."""
+    left_out: list[LeftOut] = []
+    with suppress(FormatError):  # where none could be taken
+        import_folder(folder, plan(**changes), lambda line: None, left_out)
+    return {one.name: one.why for one in left_out}
+
+
+def text(path: Path, counts: np.ndarray = COUNTS, delimiter: str = ",", head: str = "") -> Path:
+    """Counts as text, without times."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(head + "".join(delimiter.join(f"{c:g}" for c in row) + "\n" for row in counts.tolist()))
+    return path
+
+
+FORMS = {
+    "csv": lambda path: text(path),
+    "txt": lambda path: text(path, delimiter=" ", head="# a b c d\n\n"),
+    "tsv": lambda path: text(path, delimiter="\t", head="Recorded by hand\na\tb\tc\td\n"),
+    "dat": lambda path: path.write_text(text(path, delimiter=";").read_text().replace("\n", ";\n")),
+    "npy": lambda path: np.save(path, COUNTS.astype(np.uint8)),
+    "npz": lambda path: np.savez(path, frames=COUNTS.astype(np.uint8), t=np.arange(40.0)),
+    "mat": lambda path: scipy.io.savemat(path, {"frames": COUNTS, "rate": 100.0}),
+    "h5": lambda path: h5py.File(path, "w").create_dataset("run/frames", data=COUNTS).file.close(),
+}
+
+
+@pytest.mark.parametrize("suffix", FORMS)
+def test_every_format_gives_the_same_sweeps(tmp_path: Path, suffix: str):
+    """The middle ten frames of each file as a sweep [10, 2, 2] of the smallest type, with its groups."""
+    for name in ("cork_1", "felt_1", "felt_2"):
+        FORMS[suffix](tmp_path / f"{name}.{suffix}")
+    s = taken(tmp_path).sweeps
+    assert str(s.format) == "2x2 uint8 at 100 Hz, window 10"
+    np.testing.assert_array_equal(s.samples, np.tile(COUNTS[15:25].reshape(10, 2, 2), (3, 1, 1, 1)))
+    assert (s.materials, s.labels.tolist()) == (("cork", "felt"), [0, 1, 1])
+    assert s.groups["trial"].tolist() == [1, 1, 2]
+    assert s.groups["recording"].tolist() == [0, 1, 2]
+    s.save(tmp_path / "set.npz")
+    assert sets.digest(sets.load(str(tmp_path / "set.npz"))) == sets.digest(s)
+
+
+def test_a_mat_file_of_version_7_3_has_its_axes_back(tmp_path: Path):
+    """MATLAB writes columns first; HDF5 shows them as [taxels, frames]."""
+    for name in ("cork_1", "felt_1"):
+        with h5py.File(tmp_path / f"{name}.mat", "w") as file:
+            file["frames"] = COUNTS.T
+    np.testing.assert_array_equal(taken(tmp_path).sweeps.samples[0], COUNTS[15:25].reshape(10, 2, 2))
+
+
+def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
+    """By name, by number from 1 on, by range, by a pattern; in the order given."""
+    for name in ("cork_1", "felt_1"):
+        write(tmp_path / f"{name}.csv", COUNTS, 100.0)
+    whole = COUNTS[15:25].reshape(10, 2, 2)
+    for given in (
+        {"time": "time:ms", "rate_hz": None},
+        {"columns": "2-5"},
+        {"columns": "s*"},
+        {"columns": "s0,3,s2-,5"},
+    ):
+        if "s2-" in str(given):
+            assert "no column is called 's2-'" in reasons(tmp_path, **given)["cork_1.csv"]
+        else:
+            np.testing.assert_array_equal(taken(tmp_path, **given).sweeps.samples[0], whole)
+    turned = taken(tmp_path, columns="s3,4,3,s0").sweeps.samples[0]
+    np.testing.assert_array_equal(turned, whole.reshape(10, 4)[:, ::-1].reshape(10, 2, 2))
+
+
+def test_windows_are_cut_as_asked(tmp_path: Path):
+    """The middle one; or one every so often from the start on, all of one recording."""
+    for name in ("cork_1", "felt_1"):
+        text(tmp_path / f"{name}.csv")
+    s = taken(tmp_path, every=Length("150ms", "--every")).sweeps
+    assert s.groups["recording"].tolist() == [0, 0, 0, 1, 1, 1]
+    np.testing.assert_array_equal(s.samples[1].reshape(10, 4), COUNTS[15:25])
+    assert taken(tmp_path, window=Length("0.25s", "--window")).sweeps.format.window == 25
+
+
+def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
+    """Times rounded to milliseconds at 300 Hz: the counts are as recorded, the rate is that of the set."""
+    for name in ("cork_1", "felt_1"):
+        write(tmp_path / f"{name}.csv", COUNTS, 300.0, np.round(1000 * np.arange(40) / 300))
+    made = taken(tmp_path, time="time:ms", rate_hz=None)
+    assert made.sweeps.rate_hz == pytest.approx(300, rel=0.005)
+    np.testing.assert_array_equal(made.sweeps.samples[0].reshape(10, 4), COUNTS[15:25])
+    assert [cut.notes for cut in made.taken] == ["", ""]
+
+
+def test_times_that_wander_are_interpolated(tmp_path: Path):
+    """A ramp sampled at wandering times is a ramp again, in whole counts, and the report says so."""
+    late = 25 * np.sin(np.arange(400) / 20)  # ms, of periods of 10 ms
+    times = 10 * np.arange(400) + late
+    ramp = np.repeat(np.rint(times)[:, None] + 100, 4, axis=1)
+    for name in ("cork_1", "felt_1"):
+        write(tmp_path / f"{name}.csv", ramp, 100.0, times)
+    made = taken(tmp_path, time="time:ms", rate_hz=100.0)
+    steps = np.diff(made.sweeps.samples[0, :, 0, 0].astype(float))
+    assert np.abs(steps - 10).max() <= 1
+    assert made.sweeps.samples.dtype == np.int16
+    assert made.taken[0].notes == "interpolated onto even times"
+
+
+def test_no_window_goes_over_a_gap(tmp_path: Path):
+    """Half a second without frames: windows lie before and after it, none across."""
+    times = 10.0 * np.arange(40)
+    times[25:] += 500
+    for name in ("cork_1", "felt_1"):
+        write(tmp_path / f"{name}.csv", COUNTS, 100.0, times)
+    made = taken(tmp_path, time="time:ms", rate_hz=100.0, every=Length("5", "--every"))
+    starts = [int(np.flatnonzero((w.reshape(10, 4)[0] == COUNTS).all(1))[0]) for w in made.sweeps.samples[:6]]
+    assert starts == [0, 5, 10, 15, 25, 30]
+    assert made.taken[0].notes == "1 gaps"
+    why = reasons(tmp_path, time="time:ms", rate_hz=100.0, window=Length("26", "--window"))["cork_1.csv"]
+    assert why == "has 25 frames in a row (1 gaps), a window takes 26; see --window"
+
+
+@pytest.mark.parametrize(
+    ("dtype", "recorded", "expected"),
+    [
+        ("", np.int16, "int16"),
+        ("", np.float64, "uint8"),
+        ("", np.int64, "uint8"),
+        ("float32", np.int16, "float32"),
+    ],
+)
+def test_types_stay_as_recorded_or_are_the_first_that_holds_all(
+    tmp_path: Path, dtype: str, recorded: type, expected: str
+):
+    """Types of the box stay; others become the first that holds every count; --dtype decides."""
+    for name in ("cork_1", "felt_1"):
+        np.save(tmp_path / f"{name}.npy", COUNTS.astype(recorded))
+    assert taken(tmp_path, dtype=dtype).sweeps.samples.dtype == expected
+
+
+@pytest.mark.parametrize(
+    ("dtype", "value", "why"),
+    [
+        ("uint8", 300, "a count is 300, and uint8 holds 0 to 255"),
+        ("int16", 40000, "a count is 40000, and int16 holds -32768 to 32767"),
+        ("uint16", -1, "a count is -1, and uint16 holds 0 to 65535"),
+        ("int16", 0.5, "a count is 0.5, and int16 holds whole numbers"),
+        ("", 16777217, "a count is 16777217, and float32 would round it; take an offset away"),
+        ("", 1e300, "a count is 1.0000000000000001e+300, and float32 holds -3.40282e+38 to 3.40282e+38"),
+    ],
+)
+def test_a_count_that_does_not_fit_leaves_its_file_out(tmp_path: Path, dtype: str, value: float, why: str):
+    """By name, with the count and what the type holds; the others are taken."""
+    for name in ("cork_1", "felt_1", "felt_2"):
+        np.save(tmp_path / f"{name}.npy", COUNTS.astype(np.float64))
+    bad = COUNTS.astype(np.float64)
+    bad[20, 2] = value
+    np.save(tmp_path / "felt_2.npy", bad)
+    assert reasons(tmp_path, dtype=dtype) == {"felt_2.npy": why}
+
+
+GOOD = "1,2,3,4\n" * 20
+BAD = {
+    "empty": (b"", "holds no line of numbers"),
+    "words": (b"time,a,b\nnone,of,these\n", "holds no line of numbers"),
+    "short line": (GOOD.encode() + b"1,2,3\n", "line 21 has 3 columns, line 1 has 4"),
+    "word": (b"a,b,c,d\n" + GOOD.encode() + b"1,2,x,4\n", "line 22, column 3 is 'x', which is no number"),
+    "hole": (GOOD.encode() + b"1,,3,4\n", "line 21, column 2 is '', which is no number"),
+    "nan": (GOOD.encode() + b"1,nan,3,4\n", "frame 21, taxel 1, 2 is nan; fill it in or cut it away"),
+    "UTF-16": (GOOD.encode("utf-16"), "is UTF-16; save it as UTF-8"),
+    "wide": (b"1,2,3,4,5\n" * 20, "it has 5 columns, a grid of 2x2 takes 4; see --columns and --grid"),
+    "few": (b"1,2,3,4\n" * 9, "has 9 frames, a window takes 10; see --window"),
+    "noise": (bytes(range(256)) * 9, "holds no line of numbers"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
+    """The place and what stands there; the other files are taken."""
+    content, why = BAD[name]
+    for good in ("cork_1", "felt_1"):
+        (tmp_path / f"{good}.csv").write_text(GOOD)
+    (tmp_path / "felt_2.csv").write_bytes(content)
+    assert reasons(tmp_path) == {"felt_2.csv": why}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "save", "why"),
+    [
+        ("npy", lambda p: np.save(p, np.zeros(9)), "holds float64 [9]; frames x taxels are wanted"),
+        ("npy", lambda p: np.save(p, np.array(["a"])), "holds <U1 [1]; frames x taxels"),
+        (
+            "npy",
+            lambda p: np.save(p, np.array([{}]), allow_pickle=True),
+            "cannot be read: Object arrays cannot be loaded",
+        ),
+        ("npy", lambda p: p.write_bytes(b"\x93NUMPY"), "cannot be read: "),
+        ("npy", lambda p: np.save(p, np.zeros((20, 3, 3))), "holds frames [3, 3]; leave --columns out"),
+        ("npz", lambda p: p.write_bytes(b"PK\3\4"), "cannot be read: "),
+        ("npz", lambda p: np.savez(p, a=COUNTS, b=COUNTS), "holds 2 arrays of frames; name one with --variable"),
+        ("mat", lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)), "cannot be read: "),
+        ("h5", lambda p: p.write_bytes(b"nothing"), "cannot be read: "),
+        (
+            "h5",
+            lambda p: h5py.File(p, "w").close(),
+            "holds 0 arrays of frames; name one with --variable: it holds nothing",
+        ),
+    ],
+)
+def test_each_bad_binary_gets_one_exact_line(tmp_path: Path, suffix: str, save, why: str):
+    """Damaged files, objects, other shapes; nothing is unpickled."""
+    for good in ("cork_1", "felt_1"):
+        text(tmp_path / f"{good}.csv")
+    save(tmp_path / f"felt_2.{suffix}")
+    (found,) = reasons(tmp_path).values()
+    assert found.startswith(why)
+    assert "\n" not in found
+
+
+def test_an_array_is_chosen_and_turned(tmp_path: Path):
+    """Of two arrays the one that --variable names; taxels x frames with --transpose; times beside it."""
+    for name in ("cork_1", "felt_1"):
+        np.savez(tmp_path / f"{name}.npz", other=np.zeros((3, 3)), frames=COUNTS.T, t=np.arange(40) / 50)
+    made = taken(tmp_path, variable="frames", transpose=True, time="t:s", rate_hz=None)
+    assert made.sweeps.rate_hz == 50
+    np.testing.assert_array_equal(made.sweeps.samples[0].reshape(10, 4), COUNTS[15:25])
+    assert "has no array 'x'; it holds other [3, 3]" in reasons(tmp_path, variable="x")["cork_1.npz"]
+
+
+@pytest.mark.parametrize(
+    ("times", "why"),
+    [
+        (np.r_[np.arange(30), 5, np.arange(31, 40)] * 10.0, "the time of frame 31 is before that of frame 30"),
+        (np.zeros(40), "all its times are the same; give --rate in place of --time"),
+        (np.arange(40) // 8 * 80.0, "its frames come in bursts"),
+        (np.arange(40) // 4 * 40.0 + np.arange(40) % 4 * 0.1, "its frames come in bursts"),
+        (np.arange(40) * 20.0, "is sampled at 50 Hz, the set at 100 Hz; import it by itself"),
+        (np.r_[0:10, 12:30, 29, 30:41] * 10.0, "frames 28 and 29 of a run have the same time; where frames are even"),
+        (np.r_[np.nan, 1:40] * 10.0, "the time of frame 1 is no number"),
+    ],
+)
+def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: str):
+    """Back in time, standing still, in bursts, at another rate: the file is left out, the others are taken."""
+    for good in ("cork_1", "felt_1"):
+        write(tmp_path / f"{good}.csv", COUNTS, 100.0)
+    write(tmp_path / "felt_2.csv", COUNTS, 100.0, times)
+    (found,) = reasons(tmp_path, time="time:ms", rate_hz=None).items()
+    assert found[0] == "felt_2.csv"
+    assert found[1].startswith(why)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rate_hz": None}, "how fast frames follow is not known; give --rate HZ, or --time COLUMN:UNIT"),
+        ({"time": "t"}, "--time t names no unit; write t:s, :ms, :us or :ns"),
+        ({"grid": "4"}, "--grid 4 cannot be read; write ROWSxCOLUMNS"),
+        ({"dtype": "int8"}, "--dtype int8 is unknown; use one of uint8"),
+    ],
+)
+def test_an_option_that_cannot_be_read_is_named(changes: dict, message: str):
+    """Before any file is read."""
+    with pytest.raises(FormatError) as e:
+        plan(**changes)
+    assert str(e.value).startswith(message)
+
+
+@pytest.mark.parametrize("length", ["", "2", "0s", "-1s", "2 s", "0", "x"])
+def test_a_length_is_seconds_or_frames(length: str):
+    """2 alone is two frames; nothing and nonsense are refused."""
+    if length == "2":
+        assert Length(length, "--window").frames(100) == 2
+        return
+    with pytest.raises(FormatError, match=r"--window .*cannot be read; write 2s"):
+        Length(length, "--window")
+
+
+def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
+    """All at once; --rename gives others, and joins two; one that nobody has is refused."""
+    for name in ("a,b", "x" * 30, "felt"):
+        (tmp_path / f"{name}_1.csv").write_text("nothing to read")
+    with pytest.raises(FormatError, match=r"cannot send 'a,b' \(3 characters\), 'x+' \(30 characters\)"):
+        taken(tmp_path)
+    for name in ("a,b", "x" * 30, "felt"):
+        text(tmp_path / f"{name}_1.csv")
+    s = taken(tmp_path, renames={"a,b": "ab", "x" * 30: "ab"}).sweeps
+    assert (s.materials, s.labels.tolist()) == (("ab", "felt"), [0, 1, 0])
+    with pytest.raises(FormatError, match="no material is called 'felz'; did you mean 'felt'"):
+        taken(tmp_path, renames={"felz": "wool"})
+
+
+def test_shapes_that_differ_are_refused(tmp_path: Path):
+    """Arrays of two grids are no set; nor is a folder that is none, or in which nothing fits."""
+    np.save(tmp_path / "cork_1.npy", np.zeros((20, 2, 2)))
+    np.save(tmp_path / "felt_1.npy", np.zeros((20, 2, 3)))
+    with pytest.raises(FormatError, match=r"frames differ in shape: \[\[2, 2\], \[2, 3\]\]"):
+        taken(tmp_path, grid="")
+    with pytest.raises(FormatError, match="is no folder"):
+        taken(tmp_path / "cork_1.npy")
+    with pytest.raises(FormatError, match=r"no file fits --pattern .*; the first is 'cork_1.npy'"):
+        taken(tmp_path, pattern=NamePattern("{material}.csv"))
+
+
+def test_axes_are_the_last_of_a_frame(tmp_path: Path):
+    """Columns x, y, z of each taxel become frames [R, C, A]."""
+    counts = np.arange(20 * 12).reshape(20, 12) % 250
+    for name in ("cork_1", "felt_1"):
+        text(tmp_path / f"{name}.csv", counts)
+    s = taken(tmp_path, grid="2x2x3").sweeps
+    np.testing.assert_array_equal(s.samples[0], counts[5:15].reshape(10, 2, 2, 3))
+    assert taken(tmp_path, grid="3x4x1").sweeps.samples.shape == (2, 10, 3, 4)

@@ -1,0 +1,105 @@
+"""The command import. In: a folder of recordings as laboratories keep them. Out: a sweep set, and a line for each file."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from appliance.core.types import DATA_TYPES
+from train.cli import options
+from train.cli.options import Add
+from train.data import labels, summary
+from train.data.file_names import EXAMPLE, NamePattern
+from train.data.importing import Cut, Imported, ImportPlan, LeftOut, Length, import_folder
+
+SHOWN = 5
+"""Files that were left out for the same reason and have a line each."""
+
+
+def register(add: Add) -> None:
+    """import."""
+    command = add("import", run, "make a sweep set of CSV, text, MAT, HDF5 and .npy files (docs/import.md)")
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="of recordings, and the folders in it")
+    command.add_argument("--pattern", required=True, metavar="PATTERN",
+                         help=f"what the names below FOLDER say: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'")  # fmt: skip
+    command.add_argument("--out", type=Path, required=True, metavar="SET", help="the sweep set (.npz, .h5)")
+    command.add_argument("--grid", default="", metavar="ROWSxCOLUMNS[xAXES]", help="how the columns lie: 4x4, 5x3x3")
+    command.add_argument("--columns", default="", metavar="COLUMNS",
+                         help="those of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)")  # fmt: skip
+    command.add_argument(
+        "--time", default="", metavar="COLUMN:UNIT", help="of sampling times in s, ms, us or ns: t:ms, 1:s"
+    )
+    command.add_argument("--rate", type=options.above_zero("--rate"), metavar="HZ", help="frames per second")
+    command.add_argument("--window", default="2s", metavar="LENGTH", help="of a sweep: 2s, 500ms or 1500 frames (2s)")
+    command.add_argument("--every", metavar="LENGTH",
+                         help="cut windows from the start on, one each LENGTH (the middle window alone)")  # fmt: skip
+    command.add_argument("--dtype", default="", metavar="TYPE",
+                         help=f"of the counts: {', '.join(DATA_TYPES)} (as recorded, else the first that holds all)")  # fmt: skip
+    command.add_argument("--variable", default="", metavar="NAME", help="the array to take, where a file holds several")
+    command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
+    command.add_argument("--report", type=Path, metavar="FILE", help="a line for each file, taken or not")
+    options.add_rename(command)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Import, print what was left out and what is in the set. Raises FormatError at the end where a file was broken."""
+    plan = ImportPlan(
+        NamePattern(args.pattern), args.grid, args.columns, args.time, args.rate, Length(args.window, "--window"),
+        Length(args.every, "--every") if args.every else None, args.dtype, args.variable, args.transpose,
+        labels.renames(args.rename),
+    )  # fmt: skip
+    for option in ("out", "report"):
+        if path := getattr(args, option):
+            options.writable_file(path, f"--{option}")
+    left_out: list[LeftOut] = []
+    taken: Sequence[Cut] = ()
+    try:
+        made = import_folder(args.folder, plan, options.Log(), left_out)
+        taken = made.taken
+        made.sweeps.save(args.out)
+    finally:
+        print(*_left_out(left_out), sep="\n", end="\n" * bool(left_out))
+        if args.report:
+            put(args.report, _report(taken, left_out).encode())
+    print("\n".join([*_taken(made), *summary.description(made.sweeps, {}), f"set: {args.out}"]))
+    if broken := sum(one.broken for one in left_out):
+        raise FormatError(
+            f"{broken} of {broken + len(taken)} files could not be used, as said above; {args.out} is of the others"
+        )
+
+
+def _left_out(left_out: Sequence[LeftOut]) -> list[str]:
+    """A line for each file; of many with the same reason for the first ones."""
+    lines, reasons = [], Counter(one.why for one in left_out)
+    seen: Counter[str] = Counter()
+    for one in sorted(left_out, key=lambda one: one.name):
+        seen[one.why] += 1
+        if seen[one.why] <= SHOWN:
+            lines.append(f"left out: {one.name}: {one.why}")
+        elif seen[one.why] == reasons[one.why]:
+            lines.append(
+                f"left out: {seen[one.why] - SHOWN} more for the same reason: {one.why}; --report FILE lists all"
+            )
+    return lines
+
+
+def _taken(made: Imported) -> list[str]:
+    """How the taken files became sweeps, in lines."""
+    lines = [f"taken: {len(made.taken)} files; left out: {len(made.left_out)}"]
+    for what in ("interpolated onto even times", "gaps"):
+        if n := sum(what in cut.notes for cut in made.taken):
+            lines.append(f"  {n} of them: {what}")
+    return [*lines, *(f"  {note}" for note in made.notes)]
+
+
+def _report(taken: Sequence[Cut], left_out: Sequence[LeftOut]) -> str:
+    """A line for each file, in the order of their names."""
+    lines = {one.name: f"left out: {one.why}" for one in left_out}
+    for cut in taken:
+        notes = f"; {cut.notes}" if cut.notes else ""
+        lines[cut.recording.name] = f"taken: {len(cut.windows)} windows of {len(cut.recording.frames)} frames{notes}"
+    return "".join(f"{name}\t{line}\n" for name, line in sorted(lines.items()))
