@@ -55,11 +55,12 @@ class Ticker:
     """The timer, as `readout.Readout` uses it."""
 
     def __init__(self, hard):
-        self._timer, self._hard = Timer(), hard
+        self._timer = Timer()
+        self._options = {"hard": True} if hard else {}  # which older versions do not know
 
     def start(self, period_us, callback):
         """Call `callback` once a period."""
-        self._timer.init(mode=Timer.PERIODIC, period=period_us, tick_hz=1000000, callback=callback, hard=self._hard)
+        self._timer.init(mode=Timer.PERIODIC, period=period_us, tick_hz=1000000, callback=callback, **self._options)
 
     def stop(self):
         """Call it no more."""

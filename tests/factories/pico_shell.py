@@ -63,8 +63,9 @@ class PicoMachine:
             def __init__(self):
                 self._run = 0
 
-            def init(self, mode, period, tick_hz, callback, hard):
-                assert (mode, tick_hz, hard) == (self.PERIODIC, 1000000, config.HARD_TIMER)
+            def init(self, mode, period, tick_hz, callback, **hard):
+                assert (mode, tick_hz) == (self.PERIODIC, 1000000)
+                assert hard == ({"hard": True} if config.HARD_TIMER else {})
                 self._run += 1
                 _thread.start_new_thread(self._fire, (self._run, period, callback))
 

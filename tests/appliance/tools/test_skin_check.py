@@ -9,11 +9,10 @@ from dataclasses import replace
 
 import pytest
 
-from appliance.core.clock import SystemClock
+from appliance.cli.main import main
 from appliance.core.config import SensorConfig
 from appliance.core.errors import SensorLost
 from appliance.io import packets
-from appliance.io.serial_link import BoardLink
 from appliance.io.usb_sensor import open_link
 from appliance.sim import rig, skin
 from appliance.sim.devices import SimDevices
@@ -237,14 +236,34 @@ def test_a_cable_that_is_pulled_ends_the_check():
         findings(simulated)
 
 
+def of_a_port(capsys: pytest.CaptureFixture[str], port: str, *options: str) -> dict[str, tuple[str, str]]:
+    """(verdict, detail) by part, as `palpate skin check` prints them for a board at a serial port."""
+    sets = ("--set", "sensor.link=serial", "--set", f"sensor.port={port}")
+    ended = main(["skin", "check", *sets, *options])
+    lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines()]
+    assert ended == any(line[0] == "FAIL" for line in lines)
+    return {part: (verdict, detail) for verdict, part, detail in lines}
+
+
 @pytest.mark.slow
-def test_the_pico_passes():
+def test_the_pico_passes(capsys: pytest.CaptureFixture[str]):
     """The reference firmware under MicroPython, at a serial port: nothing that a busy machine has no part in fails."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=200, DTYPE="uint16", FIFO_S=0.5) as port:
-        clock = SystemClock()
-        link = BoardLink(port, 115200, clock)
-        found = {f.part: f for f in skin_check.check(link, clock, 2, port=True)}
-        link.close()
+        found = of_a_port(capsys, port, "--seconds", "2")
     assert tuple(found) == PARTS
     timed = {"rate", "clock", "loss", "start"}
-    assert {f.verdict for name, f in found.items() if name not in timed} == {"ok"}, found
+    assert {verdict for name, (verdict, _) in found.items() if name not in timed} == {"ok"}, found
+
+
+@pytest.mark.slow
+def test_a_pico_that_is_too_slow_is_found(capsys: pytest.CaptureFixture[str]):
+    """Every tenth interrupt comes 20 ms late: frames are missing though all was read, and count and clock still agree."""
+    with pico.plugged_in(RATE_HZ=200, late_ms=20, late_every=10) as port:
+        found = of_a_port(capsys, port, "--seconds", "3")
+    verdict, detail = found["loss"]
+    assert verdict == "FAIL"
+    assert detail.endswith("no packet tells of an overflow: they were never taken; lower the rate")
+    assert found["sequence"][0] == "ok"
+    # 3.2 kB/s: what the kernel keeps for a port takes longer than anybody waits
+    assert found["overflow"][0] == "unknown"
+    assert "not waited for" in found["overflow"][1]
