@@ -181,7 +181,9 @@ def _start(silent: bool, first: Reception, listener: Listener) -> PartResult:
     listener.link.request(Request.START, 0)
     again = listener.listen(QUIET_S)
     _, _, stale, restarts = Reception(first.packets + again.packets).followed()
-    if first.packets and (stale or restarts or not again.packets):
+    if not first.packets:
+        return PartResult("start", "unknown", f"{first.size} bytes came after it, and no whole packet; mend that first")
+    if stale or restarts or not again.packets:
         return PartResult(
             "start", "FAIL", "a second START disturbs the stream; it must have no effect while frames are sent"
         )
@@ -194,6 +196,8 @@ def _crc(heard: Reception) -> PartResult:
     share = f"{heard.garbage} of {heard.size} bytes are in no packet"
     if fault := _crc_fault(heard.sample):
         return PartResult("crc", "FAIL", f"{share}: {fault}")
+    if not heard.size:
+        return PartResult("crc", "unknown", "no byte came: nothing to judge")
     if not heard.packets:
         hint = "each packet begins with 50 C1 01 00, its length in bytes 4 and 5"
     else:

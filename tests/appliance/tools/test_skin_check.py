@@ -11,7 +11,7 @@ import pytest
 
 from appliance.cli.main import main
 from appliance.core.config import SensorConfig
-from appliance.core.errors import SensorLost
+from appliance.core.errors import SensorLost, SensorMismatch
 from appliance.io import packets
 from appliance.io.usb_sensor import open_link
 from appliance.sim import rig, skin
@@ -234,6 +234,39 @@ def test_a_cable_that_is_pulled_ends_the_check():
     simulated.backend.at(simulated.clock.now_ns() + 3_000_000_000, simulated.backend.unplug)
     with pytest.raises(SensorLost, match="was unplugged"):
         findings(simulated)
+
+
+class EchoLink:
+    """A device that sends each byte back, as a terminal does; it never answers."""
+
+    def __init__(self) -> None:
+        self.clock, self.sent = rig.VirtualClock(), b""
+
+    def request(self, request: packets.Request, length: int) -> bytes:
+        """No reply."""
+        self.sent += bytes([request])
+        if length:
+            raise SensorMismatch(f"the skin sends 1 other bytes but does not answer request {request.name}")
+        return b""
+
+    def read(self, size: int, timeout_ms: int) -> bytes:
+        """The echo."""
+        self.clock.sleep_until(self.clock.now_ns() + timeout_ms * 1_000_000)
+        data, self.sent = self.sent, b""
+        return data
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def test_another_device_at_the_port_is_told_apart():
+    """It answers nothing, and its bytes are no packets: no part is ok, and the check ends."""
+    link = EchoLink()
+    found = {f.part: f for f in skin_check.check(link, link.clock, 5, port=True)}
+    assert [found[part].verdict for part in ("identity", "format", "start")] == ["FAIL", "FAIL", "unknown"]
+    assert "does not answer request FORMAT" in found["format"].detail
+    assert found["start"].detail.startswith("1 bytes came after it, and no whole packet")
+    assert not [f for f in found.values() if f.verdict == "ok"]
 
 
 def of_a_port(capsys: pytest.CaptureFixture[str], port: str, *options: str) -> dict[str, tuple[str, str]]:
