@@ -125,7 +125,7 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
         return [f"not running: {report['why']}"]
     head = f"process {report['pid']}, palpate {report['version']}, source {report['source']}"
     rows = [f"running for {_span(now_ns - report['since_ns'])} ({head})"]
-    facts = {"skin": _skin(report), "bundle": report["bundle"], "sweeps": f"{report['answered']} answered"}
+    facts = {"skin": _skin(report), "bundle": report["bundle"] or "none", "sweeps": f"{report['answered']} answered"}
     if edges := _trigger(report):
         facts["trigger"] = edges
     if report["dropped"]:

@@ -128,8 +128,9 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     assert text[6].split()[-6:] == ["plastic", "rough", "98.7", "%", "1.2", "ms"]
     assert text[7].endswith("1.2 ms; moved 2.1 mm too far towards row 4")
     assert status.exit_code(status_file.read()) == 0
-    status_file.turns(1.5, replace(AWAY, garbage_bytes=9, enumerations=2, dropped=4))
+    status_file.turns(1.5, replace(AWAY, garbage_bytes=9, enumerations=2, dropped=4, bundle=""))
     text = status_file.text()
+    assert "bundle   none" in text  # while sweeps are recorded
     assert "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, plugged in 2 t" in text
     assert "serial   4 sentences dropped, since nobody read them" in text
     assert status.exit_code(status_file.read()) == 69
