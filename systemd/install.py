@@ -39,7 +39,10 @@ PATHS = {
     "firmware_config/PROTOCOL.md": "/usr/share/doc/palpate/PROTOCOL.md",
 }
 """Files of this checkout, and their paths on a box."""
+SKINS = "firmware_config/skins"
+"""The delivered skin profiles; each is linked by itself, since there may be others beside them."""
 LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS.items()} | {
+    **{f"/etc/palpate/skins/{f.name}": f"{LINK}/share/palpate/skins/{f.name}" for f in (ROOT / SKINS).glob("*.toml")},
     "/etc/systemd/system/multi-user.target.wants/palpate.service": "../palpate.service",
     "/usr/local/bin/palpate": f"{LINK}/bin/palpate",
 }
@@ -75,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
             sys.exit(f"palpate: no file {file}; check the path (make wheel makes the wheel)")
     signers = args.signers.read_text() if args.signers else ""
     with tempfile.TemporaryDirectory() as folder:
-        archives = ReleaseArchives(args.wheel, [*PATHS], Path(folder))
+        archives = ReleaseArchives(args.wheel, [*PATHS, SKINS], Path(folder))
         return each(args, lambda box: install(box, archives, box.data("board", args.board), signers))
 
 

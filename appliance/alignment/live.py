@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from appliance.alignment.view import Display, View
 from appliance.bundle.bundle import Bundle
-from appliance.core.config import SensorConfig
+from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.types import Frames, SweepFormat, normal
-from appliance.io.usb_sensor import UsbSensor
+from appliance.io import skins
 from appliance.signal.contact import IN_PLACE, ContactPositions, Point, advice, centre
 from appliance.signal.unloaded import UnloadedTracker
 
@@ -53,8 +53,8 @@ class Alignment:
     when it is lifted (with a bundle, whose threshold is above what an unloaded skin gives).
     """
 
-    def __init__(self, settings: SensorConfig, expected: Expected, devices: Devices) -> None:
-        self._sensor = UsbSensor(settings, expected.format, devices.clock, devices.backend)
+    def __init__(self, settings: Config, expected: Expected, devices: Devices) -> None:
+        self._sensor = skins.sensor(settings, expected.format, devices)
         self._expected, self._source = expected, devices.source
         self._shape = expected.format.rows, expected.format.cols
         self._span = max(1, round(SPAN_S * expected.format.rate_hz))
@@ -129,7 +129,7 @@ class Alignment:
 
 
 def run(
-    settings: SensorConfig, expected: Expected, devices: Devices, displays: Iterable[Display],
+    settings: Config, expected: Expected, devices: Devices, displays: Iterable[Display],
     stopped: Callable[[], bool],
 ) -> None:  # fmt: skip
     """Show on `displays` where the skin is touched, until `stopped()`. A slow display makes frames late, which does no

@@ -92,7 +92,7 @@ def run(args: argparse.Namespace, open_devices: OpenDevices) -> int:
             Notifier(SystemClock()), trial, shadow, *_reports(settings, current, facts, stack),
         ]  # fmt: skip
         box = assembly.box(
-            settings, current, devices, port, stack, capture=_capture(args, current.format, stack),
+            settings, current, devices, port, stack, capture=_capture(args, settings, current.format, stack),
             observers=[o for o in observers if o],
         )  # fmt: skip
         box.run(_done(args, box, devices, stopped))
@@ -120,7 +120,7 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:g} s")
         status = _status(settings, {"model": lambda: "none: sweeps are recorded"})
         box = assembly.recorder(
-            settings, fmt, devices, port, stack, capture=_capture(args, fmt, stack),
+            settings, fmt, devices, port, stack, capture=_capture(args, settings, fmt, stack),
             observers=[Notifier(SystemClock()), recording, *status], commands=recording.commands,
         )  # fmt: skip
         box.run(_done(args, box, devices, stopped))
@@ -130,7 +130,7 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
 def _announced(settings: Config, devices: Devices) -> SweepFormat:
     """The form that the skin announces. Raises SensorError, with what else would do."""
     try:
-        return skins.announced(settings.sensor, devices)
+        return skins.announced(settings, devices)
     except SensorError as e:
         raise type(e)(f"{e}; or say what it sends, with --format 4x4:uint8:750, and it is waited for") from e
 
@@ -148,8 +148,8 @@ def _sentences(port: Port | None) -> Callable[[bytes], None]:
     return port.say if port else lambda line: None
 
 
-def _capture(args: argparse.Namespace, fmt: SweepFormat, stack: ExitStack) -> CaptureWriter | None:
-    capture = CaptureWriter(args.capture, fmt) if args.capture else None
+def _capture(args: argparse.Namespace, settings: Config, fmt: SweepFormat, stack: ExitStack) -> CaptureWriter | None:
+    capture = CaptureWriter(args.capture, fmt, skins.profile(settings)) if args.capture else None
     if capture:
         stack.callback(capture.close)
     return capture
@@ -268,7 +268,7 @@ def run_align(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         pages = [stack.enter_context(Page(args.web, devices.clock))] if args.web is not None else []
         screen = stack.enter_context(Screen(sys.stdout, devices.clock, *(page.address for page in pages)))
         displays: list[Display] = [screen, *pages]
-        live.run(devices.wire(settings).sensor, expected, devices, displays, stopped)
+        live.run(devices.wire(settings), expected, devices, displays, stopped)
     return 0
 
 
@@ -282,7 +282,7 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     except BundleError as e:
         log.warning(f"no bundle: {e}")
     try:
-        fmt = devices.format or skins.announced(settings.sensor, devices)
+        fmt = devices.format or skins.announced(settings, devices)
     except SensorError:
         if not current:
             raise

@@ -24,21 +24,29 @@ SITE = Path("/etc/palpate/palpate.toml")
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
-    """Where the skin is and how it is read.
+    """Which skin it is, where, and how it is read.
 
+    skin: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" in place of the profile's, "" for that. rate_hz:
+    frames per second in place of the profile's, 0 for that. tare: send the profile's command for it whenever the skin
+    is found, which must be unloaded then.
     vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link: "vendor" (bulk transfers),
     "acm" (a serial port over USB, without the kernel's driver), or "serial" (any serial port, with the kernel's
-    driver). port: path of this serial port; "" finds the one with the ids. baud: its bits per second.
+    driver). port: path of this serial port; "" finds the one with the ids. baud: its bits per second, 0 takes the
+    profile's. Profiles of other protocols have ids of their own and use `port`, `serial` and `baud`.
     read_bytes: size of one read, in whole USB packets. timeout_ms: longest wait of one read. silence_ms: time without a
     frame after which the skin counts as lost. retry_ms: time between two searches for a missing skin.
     """
 
+    skin: str = "palpate"
+    grid: str = ""
+    rate_hz: float = number(0.0, 0.0, 100_000.0)
+    tare: bool = False
     vendor_id: int = number(0x1209, 1, 0xFFFF, hex=True)
     product_id: int = number(0x7AC7, 1, 0xFFFF, hex=True)
     serial: str = ""
     link: Literal["vendor", "acm", "serial"] = "vendor"
     port: str = ""
-    baud: int = number(115200, 1200, 4_000_000)
+    baud: int = number(0, 0, 4_000_000)
     read_bytes: int = number(4096, 512, 1 << 20, step=512)
     timeout_ms: int = number(100, 1, 1_000)
     silence_ms: int = number(500, 1, 60_000)
@@ -154,7 +162,7 @@ class StoreConfig:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All settings. board: the board file's name, "" for none.
+    """All settings. board: the board file's name, "" for none. folder: where the files are, skins/ among them.
 
     sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the file's name or "--board".
     """
@@ -168,6 +176,7 @@ class Config:
     classifier: ClassifierConfig
     store: StoreConfig
     sources: Mapping[str, str] = field(compare=False)
+    folder: Path = field(default=SITE.parent, compare=False)
 
 
 _SECTIONS: Mapping[str, Any] = MappingProxyType({n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)})
@@ -201,7 +210,7 @@ def load(board: str | None, sets: Sequence[str] = (), *, folder: Path | None = N
             values[name], sources[name] = value, where.name
     _check_lines(values, sources)
     groups = {s: group(**{f.name: values[f"{s}.{f.name}"] for f in fields(group)}) for s, group in _SECTIONS.items()}
-    return Config(board=board, sources=MappingProxyType(sources), **groups)
+    return Config(board=board, sources=MappingProxyType(sources), folder=folder, **groups)
 
 
 def describe(config: Config) -> str:

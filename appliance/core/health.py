@@ -13,7 +13,8 @@ class Health:
     time_ns: host monotonic. skin: sensor state (PROTOCOL.md). trouble: why the skin does not stream, "" where it does.
     streams: frames are arriving. The counts, since the program started, are those of the STA sentence: of the sensor
     from `frames` to `enumerations` and from `stale_frames` to `fifo_overflows` (see SensorCounters), of the serial line
-    `dropped`, of the trigger `glitches`, `lost_edges` and `storms` (see EdgeCounters).
+    `dropped`, of the trigger `glitches`, `lost_edges` and `storms` (see EdgeCounters). loss_known: the skin counts its
+    frames; without that, `lost_frames` holds what can be inferred.
     """
 
     time_ns: int
@@ -35,6 +36,7 @@ class Health:
     glitches: int
     lost_edges: int
     storms: int
+    loss_known: bool = True
 
     @property
     def text(self) -> str:

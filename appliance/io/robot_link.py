@@ -46,8 +46,8 @@ class Port(Protocol):
     dropped: int
     trouble: str
 
-    def send(self, verdict: Verdict) -> None:
-        """Send a verdict's sentence without waiting."""
+    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
+        """Send a verdict's sentence without waiting. loss_known: see `result`."""
         ...
 
     def say(self, line: bytes) -> None:
@@ -94,12 +94,17 @@ def sentence(kind: str, *fields: object) -> bytes:
     return f"${body}*{checksum(body)}\r\n".encode("ascii")
 
 
-def result(v: Verdict, source: str) -> bytes:
-    """The RES sentence of a verdict. source: where the frames came from (usb, sim, replay)."""
-    return sentence(
-        "RES", v.sweep, f"{v.time_ns / 1e9:.3f}", v.status, v.label, f"{v.probability:.3f}", f"{v.margin:.3f}",
-        v.fused, v.lost, f"{v.latency_ns / 1e6:.2f}", v.bundle, source, f"{v.share:.2f}", v.detail,
+def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
+    """The RES sentence of a verdict. source: where the frames came from (usb, sim, replay). loss_known: whether lost
+    frames of the skin can be seen; if not, a last field says so, for which the detail is cut if need be."""
+    fields = (
+        v.sweep, f"{v.time_ns / 1e9:.3f}", v.status, v.label, f"{v.probability:.3f}", f"{v.margin:.3f}",
+        v.fused, v.lost, f"{v.latency_ns / 1e6:.2f}", v.bundle, source, f"{v.share:.2f}",
     )  # fmt: skip
+    if loss_known:
+        return sentence("RES", *fields, v.detail)
+    room = MAX_LINE - len(sentence("RES", *fields, "", 1))
+    return sentence("RES", *fields, v.detail[: max(0, room)], 1)
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
@@ -150,9 +155,9 @@ class StdoutPort:
     def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
         self.dropped, self.trouble, self._source, self._commands = 0, "", source, commands
 
-    def send(self, verdict: Verdict) -> None:
+    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
         """Print a verdict's sentence."""
-        self.say(result(verdict, self._source))
+        self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
         """Print a sentence."""
@@ -186,9 +191,9 @@ class SerialSink:
         self._begun = 0  # bytes of the first sentence in the queue that were sent already
         self._rest = b""
 
-    def send(self, verdict: Verdict) -> None:
+    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
         """Queue a verdict's sentence and send what the port accepts now."""
-        self.say(result(verdict, self._source))
+        self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
         """Queue a sentence; if the queue is full the oldest one that was not begun is dropped and counted."""

@@ -23,6 +23,8 @@ from appliance.io import packets, serial_port
 from appliance.io.link import REPLY_MS, reply_to
 from appliance.io.serial_port import PortInfo
 
+BAUD = 115200
+"""Where nothing else is set; a port that is USB down to the microcontroller has no speed and ignores it."""
 COLLECT_NS = 4_000_000
 """Least time between two reads: a port at 2 Mbaud is ready some thousand times a second, and every turn of the loop
 costs the box more than the bytes of one. Times of frames do not suffer, since the fit takes the promptest arrivals."""
@@ -96,7 +98,7 @@ def open_board(
 ) -> BoardLink:
     """Open the configured port, or the one with the configured USB ids. Raises SensorError."""
     path = config.port or find(((config.vendor_id, config.product_id),), config.serial, ports())
-    return BoardLink(path, config.baud, clock)
+    return BoardLink(path, config.baud or BAUD, clock)
 
 
 def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[PortInfo]) -> str:

@@ -1,19 +1,63 @@
-"""Which skin there is. In: settings and devices. Out: the form of its sweeps, before there is a bundle."""
+"""The skin of a box, whatever it speaks. In: settings and devices. Out: its profile, its sensor, the form of its sweeps
+before there is a bundle."""
 
 from __future__ import annotations
 
 import re
 from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
 
-from appliance.core.config import SensorConfig
+from appliance.core.config import SITE, Config, SensorConfig
 from appliance.core.devices import Devices
 from appliance.core.errors import ConfigError, FormatError, SensorMismatch
 from appliance.core.types import SweepFormat
-from appliance.io import usb_sensor
+from appliance.io import skin_profile
+from appliance.io.skin_profile import SkinProfile
+from appliance.io.usb_sensor import LinkSensor, TransferObserver, UsbSensor, ask, open_link
 
-WINDOW_S = 2.0
-"""Length of a sweep's window where nothing else is asked for (paper, sec. II.B)."""
+OWN = SITE.parent / "skins"
+"""Profiles that the owner of the box has written; one of the name of a delivered profile replaces it."""
 _FORM = re.compile(r"(\d{1,9})x(\d{1,9})(?:x(\d{1,9}))?:(\w+):(\d{1,9}(?:\.\d+)?)", re.ASCII)
+
+
+def folders(settings: Config) -> list[Path]:
+    """Where profiles are; the first that has one of a name wins."""
+    return list(dict.fromkeys((OWN, settings.folder / "skins")))
+
+
+def profile(settings: Config) -> SkinProfile:
+    """The profile that the settings name, with what they change in it. Raises ConfigError."""
+    return skin_profile.adapted(skin_profile.load(settings.sensor.skin, folders(settings)), settings.sensor)
+
+
+def sensor(settings: Config, fmt: SweepFormat, devices: Devices, tap: TransferObserver | None = None) -> LinkSensor:
+    """The sensor for the skin of the settings, which has to send sweeps of `fmt`. Raises ConfigError."""
+    chosen = profile(settings)
+    if chosen.codec == "palpate":
+        return UsbSensor(_config(settings, chosen), fmt, devices.clock, devices.backend, tap)
+    # boxes with a board of PROTOCOL.md do without these modules
+    from appliance.io.serial_sensor import SerialSensor
+
+    return SerialSensor(settings.sensor, chosen, fmt, devices.clock, tap)
+
+
+def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = None) -> SweepFormat:
+    """The form of the skin's sweeps where no bundle says it: what the board announces, or what its profile says, with a
+    window of skin_profile.WINDOW_S. wanted: its rate is taken where the skin can be set to it.
+
+    Raises ConfigError, and SensorError where a board cannot be asked.
+    """
+    chosen = profile(settings)
+    if chosen.codec != "palpate":
+        settable = wanted and wanted.rate_hz in chosen.rates_hz
+        return replace(chosen, rate_hz=wanted.rate_hz).format if wanted and settable else chosen.format
+    with closing(open_link(_config(settings, chosen), devices.backend, devices.clock)) as board:
+        skin = ask(board)[1]
+    try:
+        return skin_profile.with_window(skin.rows, skin.cols, skin.rate_hz, skin.dtype, skin.axes)
+    except FormatError as e:
+        raise SensorMismatch(f"the skin announces a form that cannot be: {e}; check its firmware") from e
 
 
 def described(text: str) -> SweepFormat:
@@ -27,20 +71,10 @@ def described(text: str) -> SweepFormat:
         )
     rows, cols, axes, dtype, rate = found.groups()
     try:
-        return _form(int(rows), int(cols), dtype, float(rate), int(axes or 1))
+        return skin_profile.with_window(int(rows), int(cols), float(rate), dtype, int(axes or 1))
     except FormatError as e:
         raise ConfigError(f"--format {text}: {e}") from e
 
 
-def announced(settings: SensorConfig, devices: Devices) -> SweepFormat:
-    """The form that the skin announces, with a window of WINDOW_S. Raises SensorError if there is none that does."""
-    with closing(usb_sensor.open_link(settings, devices.backend, devices.clock)) as board:
-        _, skin = usb_sensor.ask(board)
-    try:
-        return _form(skin.rows, skin.cols, skin.dtype, skin.rate_hz, skin.axes)
-    except FormatError as e:
-        raise SensorMismatch(f"the skin announces a form that cannot be: {e}; check its firmware") from e
-
-
-def _form(rows: int, cols: int, dtype: str, rate_hz: float, axes: int) -> SweepFormat:
-    return SweepFormat(rows, cols, rate_hz, max(1, round(WINDOW_S * rate_hz)), dtype, axes)
+def _config(settings: Config, chosen: SkinProfile) -> SensorConfig:
+    return replace(settings.sensor, baud=chosen.baud)

@@ -5,6 +5,7 @@ No failure of the link makes `read` raise: it returns no frames, `state` and `tr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -68,6 +69,11 @@ class Sensor(Protocol):
         ...
 
     @property
+    def loss_known(self) -> bool:
+        """Whether each lost frame is seen. Where it is not, `lost_frames` holds what can be inferred from times."""
+        ...
+
+    @property
     def counters(self) -> SensorCounters:
         """Counts since the program started."""
         ...
@@ -89,12 +95,41 @@ class TransferObserver(Protocol):
         ...
 
 
+class FrameStream(Protocol):
+    """Converts the bytes of one skin to Frames with unwrapped numbers and host times; no I/O."""
+
+    @property
+    def loss_known(self) -> bool:
+        """Whether each lost frame is seen: the skin counts its frames."""
+        ...
+
+    @property
+    def clock(self) -> dict[str, float] | None:
+        """How well the skin's time is known: DeviceClock.quality."""
+        ...
+
+    def restart(self) -> None:
+        """Begin an enumeration, also the first: frame numbers get the next epoch, the clock starts again."""
+        ...
+
+    def feed(self, data: bytes, arrival_ns: int) -> Frames:
+        """The frames of what was read until `arrival_ns`. Raises SensorMismatch."""
+        ...
+
+
 class Stream:
     """Converts the bytes of one board to Frames with unwrapped numbers and host times; no I/O. Damaged data is
-    counted."""
+    counted. unpack: finds the packets in bytes, as `packets.unpack`."""
 
-    def __init__(self, fmt: SweepFormat, counters: SensorCounters) -> None:
-        self._format, self._counters = fmt, counters
+    loss_known = True
+
+    def __init__(
+        self,
+        fmt: SweepFormat,
+        counters: SensorCounters,
+        unpack: Callable[[bytes], packets.Unpacked] = packets.unpack,
+    ) -> None:
+        self._format, self._counters, self._unpack = fmt, counters, unpack
         self._shape, self._dtype = fmt.shape, fmt.numpy_type
         self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(
             np.int64
@@ -121,7 +156,7 @@ class Stream:
 
         Raises SensorMismatch if they have another format, or if the board's clock disagrees with its frame count.
         """
-        unpacked = packets.unpack(self._leftover + data)
+        unpacked = self._unpack(self._leftover + data)
         self._leftover = unpacked.leftover
         self._counters.garbage_bytes += unpacked.garbage
         for p in unpacked.packets:
@@ -174,11 +209,11 @@ class Stream:
             self._mark = first, start_ns
 
 
-class UsbSensor:
-    """The skin's readout board on USB or on a serial port (PROTOCOL.md, part 1).
+class LinkSensor:
+    """A skin behind a link: what all skins have in common.
 
     States: `streaming`, or `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent`, where `trouble` says what to do.
-    A board that is plugged in again is a new enumeration: its frames get a new epoch in `seq` and a new device clock.
+    A skin that is plugged in again is a new enumeration: its frames get a new epoch in `seq` and a new clock.
     """
 
     def __init__(
@@ -186,23 +221,29 @@ class UsbSensor:
         config: SensorConfig,
         fmt: SweepFormat,
         clock: Clock,
-        backend: Any = None,
+        stream: Callable[[SensorCounters], FrameStream],
         tap: TransferObserver | None = None,
     ) -> None:
         self.state = "absent"
         self.trouble: SensorError | None = None
         self.identity: packets.Identity | None = None
         self.counters = SensorCounters()
-        self._config, self._format, self._clock, self._backend, self._tap = config, fmt, clock, backend, tap
-        self._stream = Stream(fmt, self.counters)
+        self._config, self._format, self._clock, self._tap = config, fmt, clock, tap
+        self._stream = stream(self.counters)
         self._link: SkinLink | None = None
         self._retry_ns = clock.now_ns()
         self._quiet_ns = 0  # time spent reading since the last frame
+        self._unheard = 0  # bytes since then
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """How well the board's time is known: DeviceClock.quality."""
+        """How well the skin's time is known: DeviceClock.quality."""
         return self._stream.clock
+
+    @property
+    def loss_known(self) -> bool:
+        """Whether each lost frame is seen."""
+        return self._stream.loss_known
 
     def read(self) -> Frames:
         """Frames that have come since the last call; waits at most `timeout_ms`."""
@@ -213,53 +254,49 @@ class UsbSensor:
         now = self._clock.now_ns()
         # a read that took longer than its timeout was not scheduled: the skin may have been sending all the time
         self._quiet_ns += min(now - begun, self._config.timeout_ms * 1_000_000)
-        frames = Frames.empty(self._format)
+        frames, before = Frames.empty(self._format), self.counters.frames
         if data:
             if self._tap:
                 self._tap.transfer(now, data)
+            self._unheard += len(data)
             frames = self._frames(data, now)
-        if len(frames):
-            self._quiet_ns = 0
+        if self.counters.frames > before:
+            self._quiet_ns = self._unheard = 0
         self._check_silence()
         return frames
 
     def close(self) -> None:
-        """Stop the board and release it."""
+        """Stop the skin and release it."""
         if self._link:
-            board, self._link = self._link, None
-            board.close()
+            link, self._link = self._link, None
+            link.close()
+
+    def _open(self) -> tuple[SkinLink, packets.Identity]:
+        """Find, open, check and start the skin. Raises SensorError, with nothing left open."""
+        raise NotImplementedError
+
+    def _mute(self, quiet_ms: int, unheard: int) -> SensorError:
+        """Why no frame has come for `quiet_ms`. unheard: bytes that came in this time."""
+        return SensorSilent(f"the skin is there but sent no frame for {quiet_ms} ms; starting it again")
 
     def _connect(self) -> bool:
-        """Find, open, check and start the board; False, with state and trouble set, if that fails."""
+        """Find, open, check and start the skin; False, with state and trouble set, if that fails."""
         now = self._clock.now_ns()
         if now < self._retry_ns:
             self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
             return False
         try:
-            self._link = open_link(self._config, self._backend, self._clock)
-            self.identity = self._check(self._link)
-            self._link.request(packets.Request.START, 0)
+            self._link, self.identity = self._open()
         except SensorError as e:
             self._drop(e)
             return False
         self._stream.restart()
-        self._quiet_ns = 0
+        self._quiet_ns = self._unheard = 0
         self._set_state("streaming", None)
         return True
 
-    def _check(self, board: SkinLink) -> packets.Identity:
-        """Compare the board's identity and format with what this box and its bundle can use."""
-        who, skin = ask(board)
-        f = self._format
-        if not fits(skin, f):
-            raise SensorMismatch(
-                f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, the bundle wants {f}; "
-                "plug in the skin that it was trained for, or deploy a bundle for this one"
-            )
-        return who
-
     def _transfer(self) -> bytes:
-        """What one read gives; b"" if nothing came. If the board has failed the link is dropped."""
+        """What one read gives; b"" if nothing came. If the link has failed it is dropped."""
         assert self._link
         try:
             return self._link.read(self._config.read_bytes, self._config.timeout_ms)
@@ -277,13 +314,13 @@ class UsbSensor:
             return Frames.empty(self._format)
 
     def _check_silence(self) -> None:
-        """Restart a board that is connected but has sent no complete packet in `silence_ms` of reading."""
+        """Restart a skin that is connected but has sent no complete frame in `silence_ms` of reading."""
         quiet_ms = self._quiet_ns // 1_000_000
         if self._link and quiet_ms > self._config.silence_ms:
-            self._drop(SensorSilent(f"the skin is there but sent no frame for {quiet_ms} ms; starting it again"))
+            self._drop(self._mute(quiet_ms, self._unheard))
 
     def _drop(self, why: SensorError) -> None:
-        """Release the board, keep the reason, and try again after `retry_ms`."""
+        """Release the skin, keep the reason, and try again after `retry_ms`."""
         self.close()
         self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000
         self._set_state(why.state, why)
@@ -298,6 +335,36 @@ def fits(skin: packets.SkinFormat | SweepFormat, wanted: SweepFormat) -> bool:
     """Whether a skin sends what a bundle or a recording wants; the length of a window is no matter of the skin."""
     same_rate = abs(skin.rate_hz / wanted.rate_hz - 1) <= RATE_TOLERANCE
     return (skin.shape, skin.dtype) == wanted.skin and same_rate
+
+
+class UsbSensor(LinkSensor):
+    """The skin's readout board on USB or on a serial port (PROTOCOL.md, part 1)."""
+
+    def __init__(
+        self,
+        config: SensorConfig,
+        fmt: SweepFormat,
+        clock: Clock,
+        backend: Any = None,
+        tap: TransferObserver | None = None,
+    ) -> None:
+        super().__init__(config, fmt, clock, lambda counters: Stream(fmt, counters), tap)
+        self._backend = backend
+
+    def _open(self) -> tuple[SkinLink, packets.Identity]:
+        link = open_link(self._config, self._backend, self._clock)
+        try:
+            who, skin = ask(link)
+            if not fits(skin, self._format):
+                raise SensorMismatch(
+                    f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, the bundle wants "
+                    f"{self._format}; plug in the skin that it was trained for, or deploy a bundle for this one"
+                )
+            link.request(packets.Request.START, 0)
+        except SensorError:
+            link.close()
+            raise
+        return link, who
 
 
 def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:

@@ -20,10 +20,12 @@ from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
 from appliance.core.schema import typed
 from appliance.core.types import Edge, EdgeKind, Frames, SweepFormat
+from appliance.io import skin_profile, skin_stream
 from appliance.io.packets import Identity
 from appliance.io.robot_link import Command, command
+from appliance.io.skin_profile import PALPATE, SkinProfile
 from appliance.io.trigger import EdgeCounters
-from appliance.io.usb_sensor import SensorCounters, Stream
+from appliance.io.usb_sensor import SensorCounters
 
 MAGIC = b"PPLPCAP1"
 _RECORD = struct.Struct("<BQI")
@@ -46,11 +48,12 @@ class CaptureWriter(Observer):
     """Writes a capture while the box runs; a power failure loses at most what the system had not written yet.
 
     If the file cannot be written any more the capture ends, since one with a gap would replay differently; classifying
-    goes on. Raises ConfigError if the file cannot be opened.
+    goes on. profile: of the skin, which decides how its bytes are read. Raises ConfigError if the file cannot be opened.
     """
 
-    def __init__(self, path: Path, fmt: SweepFormat) -> None:
-        head = json.dumps(fmt.json()).encode()
+    def __init__(self, path: Path, fmt: SweepFormat, profile: SkinProfile = PALPATE) -> None:
+        # that of PROTOCOL.md is left out, so that captures remain those of earlier versions
+        head = json.dumps(fmt.json() | ({} if profile.codec == PALPATE.codec else {"skin": profile.json()})).encode()
         self._ended = False
         self._log = TroubleLog(f"capture: {path} cannot be written", "it ends here, classifying goes on")
         try:
@@ -104,8 +107,11 @@ class Playback:
             )
         begin = len(MAGIC) + 4 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 4], "little")
         try:
-            self.format = typed(SweepFormat, json.loads(data[len(MAGIC) + 4 : begin]))
-        except (ValueError, TypeError, RecursionError) as e:
+            head = json.loads(data[len(MAGIC) + 4 : begin])
+            skin = head.pop("skin", None) if isinstance(head, dict) else None
+            self.format = typed(SweepFormat, head)
+            profile = PALPATE if skin is None else skin_profile.from_json(skin, "skin")
+        except (ValueError, TypeError, RecursionError, ConfigError) as e:
             raise FormatError(f"{path}: the capture's head cannot be read: {e}; capture again") from e
         self.state = "absent"
         self.trouble: SensorError | None = None
@@ -113,7 +119,7 @@ class Playback:
         self.counters = SensorCounters()
         self.about = {"mode": "capture", "times": "as captured"}
         self.edge_counters = EdgeCounters()  # a capture holds the edges that were reported, none of the others
-        self._stream = Stream(self.format, self.counters)
+        self._stream = skin_stream.stream(profile, self.format, self.counters)
         self._records = deque(_records(path, data, begin))
         self._now_ns = self._records[0][1] if self._records else 0
 
@@ -126,6 +132,11 @@ class Playback:
     def clock(self) -> dict[str, float] | None:
         """Sensor: how well the board's time is known (DeviceClock.quality)."""
         return self._stream.clock
+
+    @property
+    def loss_known(self) -> bool:
+        """Sensor: whether each lost frame was seen."""
+        return self._stream.loss_known
 
     def now_ns(self) -> int:
         """Clock: the time of the last record that was played."""

@@ -18,11 +18,11 @@ from appliance.core.types import SweepFormat
 from appliance.deployment.store import Store
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
+from appliance.io import skins
 from appliance.io.gpio_lines import Lines
 from appliance.io.lineless_triggers import AnswerWatch, CommandTrigger, KeyTrigger, TimedTrigger, standard_input
 from appliance.io.robot_link import Port, SerialSink, StdoutPort
 from appliance.io.trigger import GpioTrigger, Trigger
-from appliance.io.usb_sensor import UsbSensor
 from appliance.io.verdict_lines import LineSink, check_bits
 from appliance.recording.capture import CaptureWriter
 from appliance.recording.sweep_check import SweepCheck
@@ -72,7 +72,7 @@ def _assembled(
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
     lines = _outputs(settings, devices, stack)
-    sensor = UsbSensor(settings.sensor, answerer.format, devices.clock, devices.backend, capture)
+    sensor = skins.sensor(settings, answerer.format, devices, capture)
     stack.callback(sensor.close)
     if port:
         stack.callback(port.close)

@@ -208,7 +208,7 @@ class Box:
 
     def _send(self, verdict: Verdict) -> None:
         if self._port:
-            self._port.send(verdict)
+            self._port.send(verdict, loss_known=self._sensor.loss_known)
         for answered in self._on_answered:
             answered(verdict)
         self.answered += 1
@@ -240,18 +240,20 @@ class Box:
             dropped=self._port.dropped if self._port else 0, bundle=self._answerer.model, source=self._source,
             stale_frames=counters.stale_frames, overflows=counters.overflows, fifo_overflows=counters.fifo_overflows,
             glitches=edges.glitches, lost_edges=edges.lost_edges, storms=edges.storms,
+            loss_known=sensor.loss_known,
         )  # fmt: skip
 
     def circumstances(self) -> dict[str, Any]:
         """What belongs into the sidecar of a recorded sweep beside its frames, as it is now: for JSON.
 
         device: the board's name, serial number and firmware, None before it was asked. clock: see DeviceClock.quality.
-        trigger: see Trigger.about.
+        trigger: see Trigger.about. loss_known: whether lost frames can be seen at all.
         """
         who = self._sensor.identity
         return {
             "device": asdict(who) if who else None,
             "clock": self._sensor.clock,
+            "loss_known": self._sensor.loss_known,
             "trigger": self._trigger.about,
             "source": self._source,
             **self._answerer.about(),
@@ -263,7 +265,7 @@ class Box:
         return [
             f"{h.time_ns / 1e9:.3f}", h.skin, int(h.sweeping), h.answered, h.frames, h.lost_frames, h.garbage_bytes,
             h.enumerations, h.dropped, h.bundle, h.source, h.stale_frames, h.overflows, h.fifo_overflows, h.glitches,
-            h.lost_edges, h.storms,
+            h.lost_edges, h.storms, *([] if h.loss_known else [1]),
         ]  # fmt: skip
 
     def _answer_to(self, command: Command) -> bytes:

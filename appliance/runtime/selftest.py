@@ -15,11 +15,11 @@ from appliance.core.errors import ApplianceError, PortError, SensorError, Sensor
 from appliance.core.types import SweepFormat, shown
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
+from appliance.io import skin_profile, skins
 from appliance.io.gpio_lines import Lines
 from appliance.io.robot_link import SerialSink
-from appliance.io.skins import announced
 from appliance.io.trigger import GpioTrigger
-from appliance.io.usb_sensor import UsbSensor, fits
+from appliance.io.usb_sensor import fits
 from appliance.runtime.assembly import gpio
 
 LISTEN_S = 1.0
@@ -70,18 +70,19 @@ def _try(component: str, look: Callable[[], str]) -> CheckResult:
 
 def _skin(settings: Config, wanted: SweepFormat | None, devices: Devices) -> str:
     """What the skin is and sends. wanted: by the bundle. Raises SensorError, also if the bundle is for another skin."""
-    fmt = announced(settings.sensor, devices)
+    fmt = skins.announced(settings, devices, wanted)
     sends = _listened(settings, fmt, devices)
     if wanted and not fits(fmt, wanted):
         raise SensorMismatch(
             f"{sends}; the bundle wants {wanted}: record sweeps of this skin and train one (palpate record needs none), "
             "or deploy a bundle for this skin"
         )
-    return sends
+    slow = skin_profile.warning(fmt)
+    return f"{sends}; warning: {slow}" if slow else sends
 
 
 def _listened(settings: Config, fmt: SweepFormat, devices: Devices) -> str:
-    sensor = UsbSensor(settings.sensor, fmt, devices.clock, devices.backend)
+    sensor = skins.sensor(settings, fmt, devices)
     until_ns = devices.clock.now_ns() + round(LISTEN_S * 1e9)
     try:
         while devices.clock.now_ns() < until_ns:
@@ -92,7 +93,8 @@ def _listened(settings: Config, fmt: SweepFormat, devices: Devices) -> str:
         counters = sensor.counters
         name = f"{who.board} {who.serial}" if who else ""
         form = f"{shown(fmt.shape)} {fmt.dtype} at {fmt.rate_hz:g} Hz"
-        return f"{name}, {form}, {counters.frames} frames in {LISTEN_S} s, {counters.lost_frames} lost"
+        lost = f"{counters.lost_frames} lost" if sensor.loss_known else "whether frames were lost cannot be seen"
+        return f"{name.strip()}, {form}, {counters.frames} frames in {LISTEN_S} s, {lost}"
     finally:
         sensor.close()
 

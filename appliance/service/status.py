@@ -138,7 +138,10 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
 
 
 def _skin(report: Mapping[str, Any]) -> str:
-    counted = f"{report['frames']:,} frames, {report['lost_frames']:,} lost"
+    lost = f"{report['lost_frames']:,} lost"
+    if not report.get("loss_known", True):
+        lost = f"at least {lost}: this skin does not count its frames"
+    counted = f"{report['frames']:,} frames, {lost}"
     if report["garbage_bytes"]:
         counted += f", {report['garbage_bytes']:,} bytes in no packet"
     if report["stale_frames"]:

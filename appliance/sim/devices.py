@@ -30,8 +30,8 @@ class SimDevices(Devices):
 
     def wire(self, settings: Config) -> Config:
         """The settings with the simulated lines and skin; a trigger without lines stays."""
-        ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": ""}
-        sensor = replace(settings.sensor, **ids, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
+        ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": "", "skin": "palpate", "grid": ""}
+        sensor = replace(settings.sensor, **ids, rate_hz=0.0, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
         wires = {"start": START, "stop": STOP, "new_object": NEW_OBJECT}
         trigger = replace(settings.trigger, **wires, active_low=False)  # type: ignore[arg-type]
         if trigger.by_lines:

@@ -28,7 +28,6 @@ from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle, Manifest
 from appliance.cli.main import main
 from appliance.core import config
-from appliance.core.config import SensorConfig
 from appliance.signal.contact import ContactPositions
 from appliance.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
@@ -46,7 +45,7 @@ def model(default_bundle: Bundle) -> Bundle:
 def views_of(simulated: devices.SimDevices, model: Bundle | Expected) -> Callable[[float], list[View]]:
     """A function that reads the skin of `simulated` for some seconds and returns the Views of this time."""
     settings = simulated.wire(config.load(None, [], site=NO_SITE))
-    alignment = Alignment(settings.sensor, model if isinstance(model, Expected) else Expected.by(model), simulated)
+    alignment = Alignment(settings, model if isinstance(model, Expected) else Expected.by(model), simulated)
 
     def views(seconds: float) -> list[View]:
         seen, end_ns, next_ns = [], simulated.clock.now_ns() + round(seconds * SECOND), simulated.clock.now_ns()
@@ -267,7 +266,7 @@ def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("appliance.alignment.terminal.LINE_NS", 0)
     settings = simulated.wire(config.load(None, [], site=NO_SITE))
     live.run(
-        settings.sensor,
+        settings,
         Expected.by(model),
         simulated,
         [Screen(out, simulated.clock)],
@@ -281,7 +280,7 @@ def test_a_denied_skin_is_named(model: Bundle):
     """The View says why the skin cannot be read and what helps; the command goes on."""
     simulated = idle_devices()
     simulated.backend.errors["open"] = errno.EACCES
-    alignment = Alignment(SensorConfig(), Expected.by(model), simulated)
+    alignment = Alignment(config.load(None, [], site=NO_SITE), Expected.by(model), simulated)
     alignment.read()
     view = alignment.view()
     assert (view.state, view.skin, view.message) == ("no-skin", "denied", "no skin: denied")

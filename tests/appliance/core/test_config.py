@@ -56,7 +56,7 @@ def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
     }
     for name, (value, want, source) in got.items():
         assert (value, c.sources[name]) == (want, source), name
-    assert len(c.sources) == 1 + sum(len(dataclasses.fields(getattr(c, s))) for s in config.Config.__slots__[1:-1])
+    assert len(c.sources) == 1 + sum(len(dataclasses.fields(getattr(c, s))) for s in config.Config.__slots__[1:-2])
 
 
 def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder: Path) -> None:
@@ -217,7 +217,7 @@ def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path)
     assert _load(folder) == c
 
 
-@pytest.mark.parametrize("section", [n for n in config.Config.__slots__ if n not in ("board", "sources")])
+@pytest.mark.parametrize("section", [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder")])
 def test_each_field_is_explained(section: str) -> None:
     """Every field's name stands in the docstring of its group."""
     group = type(getattr(_shipped(), section))

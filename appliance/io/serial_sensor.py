@@ -1,0 +1,124 @@
+"""A skin on a serial port that does not speak PROTOCOL.md, as its profile describes it. In: a port, a clock. Out: Frames.
+
+It only listens, but for the commands of the profile: a skin that is not the expected one is told nothing else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from appliance.core.clock import Clock
+from appliance.core.config import SensorConfig
+from appliance.core.errors import SensorError, SensorMismatch
+from appliance.core.types import Frames, SweepFormat, shown
+from appliance.io import packets, serial_port, skin_stream
+from appliance.io.link import SkinLink
+from appliance.io.serial_link import SerialLink, find
+from appliance.io.serial_port import PortInfo
+from appliance.io.skin_profile import SkinProfile
+from appliance.io.skin_stream import RATE_WANDER
+from appliance.io.usb_sensor import LinkSensor, TransferObserver
+
+
+class BytePort(Protocol):
+    """An opened port, as `SerialLink`."""
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`. Raises SensorError."""
+        ...
+
+    def read(self, size: int, timeout_ms: int) -> bytes:
+        """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorError."""
+        ...
+
+    def close(self) -> None:
+        """Release the port."""
+        ...
+
+
+class ProfileLink:
+    """A port whose skin is asked to stop before it is released, if its profile says how."""
+
+    def __init__(self, port: BytePort, stop: Iterable[bytes]) -> None:
+        self._port, self._stop = port, list(stop)
+        self.read = port.read
+
+    def request(self, request: packets.Request, length: int) -> bytes:
+        """These skins know no requests."""
+        raise SensorMismatch(f"this skin does not speak PROTOCOL.md, so it cannot be asked for {request.name}")
+
+    def close(self) -> None:
+        """Send the commands for stopping, unless the skin is gone, and release the port."""
+        with contextlib.suppress(SensorError):
+            for command in self._stop:
+                self._port.write(command)
+        self._port.close()
+
+
+class SerialSensor(LinkSensor):
+    """A skin on a serial port, read as its profile says.
+
+    open_port: makes a port from path and baud rate. ports: the serial ports that there are.
+    """
+
+    def __init__(
+        self,
+        config: SensorConfig,
+        profile: SkinProfile,
+        fmt: SweepFormat,
+        clock: Clock,
+        tap: TransferObserver | None = None,
+        *,
+        open_port: Callable[[str, int], BytePort] | None = None,
+        ports: Callable[[], list[PortInfo]] = serial_port.ports,
+    ) -> None:
+        super().__init__(config, fmt, clock, lambda counters: skin_stream.stream(profile, fmt, counters), tap)
+        self._profile, self._ports = profile, ports
+        self._open_port = open_port or (lambda path, baud: SerialLink(path, baud, clock))
+        self._deaf_ns = 0  # until then the skin tares itself
+
+    def read(self) -> Frames:
+        """Frames that have come since the last call; waits at most `timeout_ms`. None while the skin tares itself."""
+        frames = super().read()
+        return frames if self._clock.now_ns() >= self._deaf_ns else Frames.empty(self._format)
+
+    def _open(self) -> tuple[SkinLink, packets.Identity]:
+        self._check_format()
+        there = self._ports()
+        path = self._config.port or find(self._profile.ids, self._config.serial, there)
+        info = next((port for port in there if port.path == path), PortInfo(path))
+        port = self._open_port(path, self._profile.baud)
+        try:
+            for command in self._profile.commands(self._profile.start, self._format.rate_hz):
+                port.write(command)
+            if self._config.tare:
+                for command in self._profile.commands(self._profile.tare, self._format.rate_hz):
+                    port.write(command)
+                self._deaf_ns = self._clock.now_ns() + round(self._profile.tare_s * 1e9)
+        except SensorError:
+            port.close()
+            raise
+        link = ProfileLink(port, self._profile.commands(self._profile.stop, self._format.rate_hz))
+        return link, packets.Identity(0, (0, 0, 0), self._config.skin, info.serial)
+
+    def _check_format(self) -> None:
+        """Raises SensorMismatch where the bundle's format is not what the skin can send."""
+        sent, wanted = self._profile.format, self._format
+        able = wanted.rate_hz in self._profile.rates_hz or abs(sent.rate_hz / wanted.rate_hz - 1) <= RATE_WANDER
+        if sent.skin != wanted.skin or not able:
+            rates = " or ".join(f"{rate:g}" for rate in self._profile.rates_hz or (sent.rate_hz,))
+            raise SensorMismatch(
+                f"the profile {self._config.skin} sends {shown(sent.shape)} {sent.dtype} at {rates} Hz, the bundle wants "
+                f"{wanted}; correct sensor.skin, sensor.grid or sensor.rate_hz, or deploy a bundle for this skin"
+            )
+
+    def _mute(self, quiet_ms: int, unheard: int) -> SensorError:
+        if not unheard:
+            return super()._mute(quiet_ms, unheard)
+        return SensorMismatch(
+            f"the skin sent {unheard} bytes in {quiet_ms} ms, but no frame of profile {self._config.skin} "
+            f"({shown(self._profile.format.shape)} {self._profile.number}); correct sensor.skin, sensor.grid or "
+            "sensor.baud; `palpate skin detect` listens for what fits"
+        )

@@ -1,0 +1,132 @@
+"""Frames of a fixed length with a marker before or a trailer after each: FlexiTac, AnySkin, most matrices made at home."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.io.skin_codecs.frames import NONE, Decoded, Rest, arranged, collected
+from appliance.io.skin_profile import SkinProfile
+
+AMBIGUOUS_FRAMES = 32
+"""So many frames are kept while two places in them could be their beginning; then the oldest are given up."""
+
+
+@dataclass(frozen=True, slots=True)
+class FixedLayout:
+    """Frames of a fixed length. mark: what stands between two of them: the end of one and the beginning of the next.
+    period: bytes from one mark to the next. tail: bytes of the mark that belong to the frame before it."""
+
+    profile: SkinProfile
+    mark: bytes
+    tail: int
+    period: int
+    count: np.dtype[Any] | None
+    number: np.dtype[Any]
+
+
+@lru_cache(8)
+def _layout(p: SkinProfile) -> FixedLayout:
+    order: Literal["<", ">"] = "<" if p.byte_order == "little" else ">"
+    number = np.dtype(p.number).newbyteorder(order)
+    count = np.dtype(p.sequence).newbyteorder(order) if p.sequence else None
+    mark = p.trailer + p.marker
+    body = p.rows * p.cols * p.values * number.itemsize
+    return FixedLayout(p, mark, len(p.trailer), len(mark) + (count.itemsize if count else 0) + body, count, number)
+
+
+def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
+    """A frame is what stands between two marks exactly one period apart, once it is known where frames begin."""
+    layout = _layout(profile)
+    data, synced = rest.data + new, rest.synced
+    at = garbage = before = 0
+    runs: list[NDArray[np.uint8]] = []
+    ends: list[NDArray[np.int64]] = []
+    skipped: list[NDArray[np.int64]] = []
+    while True:
+        if not synced:
+            at, wasted, synced = _beginning(layout, data, at)
+            garbage += wasted
+            before += wasted
+            if not synced:
+                break
+        n, broken = _run(layout, data, at)
+        if n:
+            runs.append(np.frombuffer(data, np.uint8, n * layout.period, at).reshape(n, layout.period))
+            ends.append(at + layout.period * np.arange(1, n + 1) + layout.tail)
+            skipped.append(np.array([before, *[0] * (n - 1)], np.int64))
+            at, before = at + n * layout.period, 0
+        if not broken:
+            break
+        # a mark without another one at its distance: frames begin elsewhere now, or bytes are missing
+        at, garbage, before, synced = at + 1, garbage + 1, before + 1, False
+    left = Rest(data[at:], synced)
+    if not runs:
+        return collected(layout.profile, [], [], [], garbage, left, 0)
+    table = np.concatenate(runs) if len(runs) > 1 else runs[0]
+    taxels, counts = _columns(layout, table)
+    return Decoded(
+        taxels, np.concatenate(ends), np.concatenate(skipped), layout.period, garbage, left, counts
+    )  # fmt: skip
+
+
+def _columns(layout: FixedLayout, table: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Frames as bytes [n, period] -> raw counts, and sequence numbers where there are any."""
+    begin, counts = len(layout.mark), NONE
+    if layout.count:
+        end = begin + layout.count.itemsize
+        counts = np.ascontiguousarray(table[:, begin:end]).view(layout.count)[:, 0].astype(np.int64)
+        begin = end
+    return arranged(layout.profile, np.ascontiguousarray(table[:, begin:]).view(layout.number)), counts
+
+
+def _run(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:
+    """How many frames follow the mark at `at`, and whether the next one is broken (False: its end has not come)."""
+    mark, period = layout.mark, layout.period
+    n = 0
+    while (end := at + (n + 1) * period) + len(mark) <= len(data):
+        if not data.startswith(mark, end):
+            return n, True
+        n += 1
+    return n, False
+
+
+def _beginning(layout: FixedLayout, data: bytes, at: int) -> tuple[int, int, bool]:
+    """Where frames begin at or after `at`, the bytes before it, and whether that is certain.
+
+    A mark may occur among the numbers, in every frame at the same place as long as the skin is at rest. So a beginning
+    is certain once two periods have followed it, and no other place within the first has been followed as well.
+    """
+    mark, period, begun = layout.mark, layout.period, at
+    while (at := data.find(mark, at)) >= 0:
+        have = (len(data) - len(mark) - at) // period  # whole periods that follow
+        if not _repeats(layout, data, at, have):
+            at += 1
+            continue
+        if have < 2:
+            return at, at - begun, False
+        if not _rivals(layout, data, at):
+            return at, at - begun, True
+        if have < AMBIGUOUS_FRAMES:
+            return at, at - begun, False
+        at += period
+    kept = max(begun, len(data) - len(mark) + 1)
+    return kept, kept - begun, False
+
+
+def _repeats(layout: FixedLayout, data: bytes, at: int, periods: int) -> bool:
+    return all(data.startswith(layout.mark, at + i * layout.period) for i in range(1, periods + 1))
+
+
+def _rivals(layout: FixedLayout, data: bytes, at: int) -> bool:
+    """Whether frames may as well begin elsewhere in the period after `at`."""
+    other = at
+    while 0 <= (other := data.find(layout.mark, other + 1)) < at + layout.period:
+        have = (len(data) - len(layout.mark) - other) // layout.period
+        if _repeats(layout, data, other, have):
+            return True
+    return False

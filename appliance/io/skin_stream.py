@@ -1,0 +1,284 @@
+"""From the bytes of a skin to Frames, whatever its profile. In: what was read, and when. Out: Frames with numbers and host
+times, and counts of what was lost; no I/O.
+
+Skins with a clock and a count go the way of PROTOCOL.md (`usb_sensor.Stream`). For all others, frames are counted as they
+come, and their times are fitted to their arrivals.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.clock import DeviceClock
+from appliance.core.errors import SensorMismatch
+from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
+from appliance.io import packets, skin_codecs
+from appliance.io.skin_codecs import Codec, Decoded, Rest
+from appliance.io.skin_profile import SkinProfile
+from appliance.io.usb_sensor import FrameStream, SensorCounters, Stream
+
+RATE_WANDER = 0.05
+"""Largest relative difference between the measured rate and the expected one. Oscillators of microcontrollers differ by
+1 %, their loops by some more; from 5 % on, textures would be taken for others that are as much finer or coarser."""
+_FIT = {"settle_s": 0.5, "span_s": 2.5, "step_s": 0.1, "max_ppm": 1.2e6 * RATE_WANDER}
+"""Of the fit of arrivals (DeviceClock). A short past: a loop that becomes slower by 2 % is 20 ms late before it is followed."""
+SUSPECT_NS, SUSPECT_FRAMES = 60_000_000, 3
+"""Frames that come later than this are held back until it is known whether others are missing before them."""
+PILED_BYTES = 4095
+"""What a serial port gives at once while more is waiting."""
+_STEP_NS, _STEP_FRAMES = 250_000_000, 8
+"""Arrivals are judged by steps of this length."""
+_STEPS = 8
+_SLACK_NS = 5_000_000
+"""Delays of USB and of the host that say nothing about the skin."""
+_SAME_NS = 2_000_000
+"""Lateness that differs by less from one step to the next does not grow."""
+_STEADY = 0.25
+"""Largest difference between the paces of steps that are compared."""
+_PARTLY = 0.75
+"""Garbage of a quarter of a frame, or of so much more than whole frames, was one frame more."""
+
+
+def stream(profile: SkinProfile, fmt: SweepFormat, counters: SensorCounters) -> FrameStream:
+    """The stream of a profile that sends sweeps of `fmt`."""
+    if profile.codec == "palpate":
+        return Stream(fmt, counters)
+    codec = skin_codecs.codec(profile)
+    if not profile.lacks:
+        return Stream(fmt, counters, partial(_packets, codec, profile))
+    return CountedStream(profile, fmt, counters)
+
+
+def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacked:
+    """Frames with count and clock as packets of consecutive frames. Raises SensorMismatch for another grid."""
+    found = codec(Rest(), data)
+    if found.wrong:
+        raise SensorMismatch(_of_another(found.wrong))
+    made = []
+    if len(found):
+        cuts = np.flatnonzero(np.diff(found.counts) != 1) + 1
+        for part in np.split(np.arange(len(found)), cuts):
+            for at in range(part[0], part[-1] + 1, packets.MAX_FRAMES):
+                taxels = found.taxels[at : min(at + packets.MAX_FRAMES, part[-1] + 1)]
+                made.append(packets.Packet(int(found.counts[at]), int(found.times_us[at]), 0, taxels))
+    return packets.Unpacked(made, [], found.garbage, found.rest.data)
+
+
+def _of_another(why: str) -> str:
+    return f"the skin is another one: {why}; correct sensor.grid, or name its profile with sensor.skin"
+
+
+class CountedStream:
+    """Frames of a skin without a clock: numbered as they come, timed by a fit of their arrivals.
+
+    A frame is never taken for newer than it is: what piled up while nobody read keeps the times that its numbers give.
+    Where the driver has thrown bytes away, frames stay late for good. Then they are held back, and once that is certain
+    numbers begin a new epoch and the missing ones are counted, as far as the time that they take tells.
+    """
+
+    def __init__(self, profile: SkinProfile, fmt: SweepFormat, counters: SensorCounters) -> None:
+        self._profile, self._format, self._counters = profile, fmt, counters
+        self._codec = skin_codecs.codec(profile)
+        self._wrap = 1 << 8 * np.dtype(profile.sequence).itemsize if profile.sequence else 0
+        self._epoch, self._count, self._skipped = -1, 0, 0
+        self._rest, self._bytes = Rest(), 0
+        self._arrivals: deque[tuple[int, int]] = deque()  # (bytes read so far, when)
+        self._begin()
+
+    def restart(self) -> None:
+        """Begin an enumeration, also the first."""
+        self._counters.enumerations += 1
+        self._counters.garbage_bytes += 0 if self._count else self._skipped
+        self._begin()
+
+    @property
+    def loss_known(self) -> bool:
+        """Whether each lost frame is seen."""
+        return bool(self._wrap)
+
+    @property
+    def clock(self) -> dict[str, float] | None:
+        """How well the times are known: DeviceClock.quality."""
+        return self._fit.quality()
+
+    def feed(self, data: bytes, arrival_ns: int) -> Frames:
+        """The frames that a read has completed, which ended at `arrival_ns`.
+
+        Raises SensorMismatch if they are of another grid or come at another rate.
+        """
+        begin = self._bytes - len(self._rest.data)
+        self._bytes += len(data)
+        self._arrivals.append((self._bytes, arrival_ns))
+        found = self._codec(self._rest, data)
+        self._rest = found.rest
+        if found.wrong:
+            raise SensorMismatch(_of_another(found.wrong))
+        numbers = self._numbered(found)
+        if not len(numbers):
+            return Frames.empty(self._format)
+        arrived_ns = self._arrival(begin + int(found.ends[-1]))
+        return self._timed(numbers, found.taxels, arrived_ns, piled=len(data) >= PILED_BYTES)
+
+    def _begin(self) -> None:
+        """Begin a new epoch with the next bytes."""
+        self._rest, self._bytes = Rest(), 0
+        self._arrivals.clear()
+        self._count = self._skipped = 0  # frames so far, garbage after the last
+        self._sent: int | None = None  # the last sequence number of the skin
+        self._anew()
+
+    def _anew(self) -> None:
+        """Numbers and times begin anew."""
+        self._epoch += 1
+        self._next, self._last_ns = 0, 0
+        self._fit = DeviceClock(**_FIT)
+        self._watch = ArrivalWatch(self._format.period_ns)
+        self._held: list[Frames] = []
+        self._fitted = False
+
+    def _numbered(self, found: Decoded) -> NDArray[np.int64]:
+        """The number of each frame in this epoch. Counts frames, garbage, and what is missing between them."""
+        n, first = len(found), not self._count
+        before = self._skipped + (int(found.skipped[0]) if n else found.garbage)  # the next frame
+        if not n:
+            self._skipped = before
+            self._counters.garbage_bytes += 0 if first else found.garbage
+            return np.empty(0, np.int64)
+        self._skipped = found.garbage - int(found.skipped.sum())
+        # the rest of a frame that was under way when the port was opened is no garbage
+        uncounted = min(before, round(found.size)) - (before - int(found.skipped[0])) if first else 0
+        self._counters.garbage_bytes += found.garbage - uncounted
+        if len(found.counts):
+            missing = self._gaps(found.counts)
+        else:
+            skipped = np.array([0 if first else before, *found.skipped[1:]], np.int64)
+            missing = (skipped / found.size + _PARTLY).astype(np.int64)
+        numbers = self._next + np.cumsum(1 + missing) - 1
+        self._next = int(numbers[-1]) + 1
+        self._count += n
+        self._counters.frames += n
+        self._counters.lost_frames += int(missing.sum())
+        return numbers
+
+    def _gaps(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+        """How many sequence numbers are missing before each frame."""
+        before = int(counts[0]) - 1 if self._sent is None else self._sent
+        self._sent = int(counts[-1])
+        return (np.diff(counts, prepend=before) - 1) % self._wrap
+
+    def _arrival(self, end: int) -> int:
+        """When the read came that holds the byte before `end`; a frame may be known for one only with the next one."""
+        while self._arrivals[0][0] < end:
+            self._arrivals.popleft()
+        return self._arrivals[0][1]
+
+    def _timed(self, numbers: NDArray[np.int64], taxels: NDArray[Any], arrived_ns: int, *, piled: bool) -> Frames:
+        """Frames with times, after those that were held back; none while they are held back themselves."""
+        last = int(numbers[-1])
+        late_ns = self._late(last, arrived_ns)
+        suspect = late_ns > max(SUSPECT_NS, SUSPECT_FRAMES * self._format.period_ns)
+        frames = Frames(self._times(numbers), (self._epoch << EPOCH_BITS) + numbers, taxels)
+        missing = self._watch.missing(last, arrived_ns, late_ns, piled=piled)
+        if missing:
+            self._counters.lost_frames += missing + sum(map(len, self._held)) + len(frames)
+            self._anew()
+            return Frames.empty(self._format)
+        self._check_rate()
+        if suspect:
+            self._held.append(frames)
+            return Frames.empty(self._format)
+        held, self._held = self._held, []
+        return Frames.joined([*held, frames]) if held else frames
+
+    def _late(self, number: int, arrived_ns: int) -> int:
+        """How much later frame `number` came than it should have; the fit learns from it unless that is far too much."""
+        device_ns = round(number * self._format.period_ns)
+        if self._fitted:
+            late_ns = arrived_ns - self._fit.to_host_ns(device_ns)
+            if late_ns > max(SUSPECT_NS, SUSPECT_FRAMES * self._format.period_ns):
+                return late_ns
+        self._fit.update(device_ns, arrived_ns)
+        self._fitted = True
+        return arrived_ns - self._fit.to_host_ns(device_ns)
+
+    def _times(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Host times of frames [n]. A better fit may move them back; they never run backwards."""
+        first, last = int(numbers[0]), int(numbers[-1])
+        first_ns, last_ns = (self._fit.to_host_ns(number * self._format.period_ns) for number in (first, last))
+        within_ns = (numbers - first) * ((last_ns - first_ns) / max(1, last - first))
+        t_ns: NDArray[np.int64] = np.maximum(
+            first_ns + np.rint(within_ns).astype(np.int64), self._last_ns + 1 + np.arange(len(numbers))
+        )
+        self._last_ns = int(t_ns[-1])
+        return t_ns
+
+    def _check_rate(self) -> None:
+        """Compare the measured rate with the expected one. Raises SensorMismatch."""
+        pace = self._watch.pace
+        if pace and abs(pace - 1) > RATE_WANDER:
+            wanted = self._format.rate_hz
+            raise SensorMismatch(
+                f"the skin sends {pace * wanted:.1f} frames a second, {wanted:g} are expected ({100 * (pace - 1):+.0f} %, "
+                f"at most {100 * RATE_WANDER:g}); set sensor.rate_hz for new recordings, or let it send {wanted:g}"
+            )
+
+
+class ArrivalWatch:
+    """Decides from arrivals whether frames are missing that nobody has counted, and how fast they come.
+
+    While a backlog is read, frames come faster than the skin takes them and are less and less late. Where they come at
+    an even pace and stay as late as they are, nothing is piled up any more, so frames are missing. pace: frames a second
+    as a share of what is expected, over some steps of an even pace; 0 while that is not known.
+    """
+
+    def __init__(self, period_ns: float) -> None:
+        self._period_ns = period_ns
+        self._step_ns = max(_STEP_NS, round(_STEP_FRAMES * period_ns))
+        self._suspect_ns = max(SUSPECT_NS, SUSPECT_FRAMES * period_ns)
+        self._begun: tuple[int, int] | None = None  # (number, arrival) of the frame before the step
+        self._last_ns = 0  # the arrival before
+        self._least_ns = 0
+        self._piled = False
+        self._steps: deque[tuple[int, int, int]] = deque(maxlen=_STEPS)  # (frames, time in ns, least lateness in ns)
+        self.pace = 0.0
+
+    def missing(self, number: int, arrival_ns: int, late_ns: int, *, piled: bool) -> int:
+        """How many frames are missing, as far as is certain now; 0 if none. late_ns: lateness of the frame `number`.
+        piled: more was waiting when it was read."""
+        self.pace = 0.0
+        # a host that reads once in a while finds frames that came at any time since it last did
+        late_ns -= max(0, round(arrival_ns - self._last_ns - 1.5 * self._period_ns)) if self._begun else 0
+        self._last_ns = arrival_ns
+        if self._begun is None:
+            self._begun, self._least_ns = (number, arrival_ns), late_ns
+            return 0
+        self._least_ns, self._piled = min(self._least_ns, late_ns), self._piled or piled
+        passed_ns = arrival_ns - self._begun[1]
+        if passed_ns < self._step_ns:
+            return 0
+        if self._piled:
+            self._steps.clear()
+        else:
+            self._steps.append((number - self._begun[0], passed_ns, self._least_ns))
+        self._begun, self._least_ns, self._piled = (number, arrival_ns), late_ns, False
+        return self._judge()
+
+    def _judge(self) -> int:
+        """Set the pace if it is known; the number of missing frames."""
+        paces = [frames * self._period_ns / passed_ns for frames, passed_ns, _ in self._steps]
+        even = max(paces, default=0) < (1 + _STEADY) * min(paces, default=0)
+        if even and len(paces) == _STEPS:
+            frames, passed_ns = (sum(step[i] for step in self._steps) for i in (0, 1))
+            self.pace = frames * self._period_ns / passed_ns
+        if len(paces) < 2 or not abs(paces[-1] - 1) < _STEADY or not abs(paces[-2] - 1) < _STEADY:
+            return 0
+        before_ns, now_ns = self._steps[-2][2], self._steps[-1][2]
+        stays = min(before_ns, now_ns) > max(_SLACK_NS, 0.75 * self._period_ns) and abs(now_ns - before_ns) < _SAME_NS
+        # whatever it is: after some steps at the right pace, what is still late will not become prompt any more
+        stuck = bool(self.pace) and abs(self.pace - 1) <= RATE_WANDER and now_ns > self._suspect_ns
+        return max(1, round(now_ns / self._period_ns)) if stays or stuck else 0

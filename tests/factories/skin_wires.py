@@ -1,0 +1,236 @@
+"""Skins on a wire, for tests in virtual time. In: a profile's name. Out: what its frames must hold, their bytes as they are
+described by the makers, and a port that delivers them with a driver's buffer and every fault."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.config import SensorConfig
+from appliance.core.errors import SensorBusy, SensorLost
+from appliance.core.types import Frames, SweepFormat
+from appliance.io import skin_profile
+from appliance.io.serial_port import PortInfo
+from appliance.io.serial_sensor import SerialSensor
+from appliance.io.skin_profile import SkinProfile
+from appliance.sim.rig import VirtualClock
+from tests.factories.paths import ROOT
+
+FOLDER = ROOT / "firmware_config" / "skins"
+NAMES = sorted(path.stem for path in FOLDER.glob("*.toml") if path.stem != "palpate")
+PATH = "/dev/serial/by-id/skin"
+SECOND = 1_000_000_000
+TTY_BYTES = 4095
+"""What a tty gives in one read."""
+
+
+@cache
+def profile(name: str) -> SkinProfile:
+    """A delivered profile."""
+    return skin_profile.load(name, [FOLDER])
+
+
+def taxels(p: SkinProfile, i: int) -> NDArray[np.generic]:
+    """Raw counts of frame `i`: [R, C] or [R, C, A], different in every frame and taxel."""
+    fmt = p.format
+    shift = (np.arange(fmt.channels).reshape(fmt.shape) * 7 + i * 13) % 199
+    return (shift / 8 if fmt.dtype == "float32" else shift).astype(fmt.numpy_type)
+
+
+def numbers(p: SkinProfile, i: int) -> NDArray[np.generic]:
+    """Frame `i` with all that is on the wire [R, C, values]; what is not taken is 99."""
+    grid = np.full((p.rows, p.cols, p.values), 99, np.dtype(p.number))
+    grid[..., list(p.take)] = taxels(p, i).reshape(p.rows, p.cols, len(p.take))
+    return grid
+
+
+@lru_cache(20_000)
+def wire(name: str, i: int, period_ns: float = 1e6) -> bytes:
+    """Frame `i` of a delivered profile as bytes, put together from the makers' descriptions. period_ns: of its clock."""
+    grid = numbers(profile(name), i)
+    return papillarray(grid, i, period_ns=period_ns) if name == "papillarray" else _WIRES[name](grid, i)
+
+
+def _bytes_after_a_marker(grid: NDArray[np.generic], i: int) -> bytes:
+    return b"\xaa\x55" + grid.astype(np.uint8).tobytes()
+
+
+def _floats_and_crlf(grid: NDArray[np.generic], i: int) -> bytes:
+    return struct.pack(f"<{grid.size}f", *grid.ravel().tolist()) + b"\r\n"
+
+
+def _one_line(grid: NDArray[np.generic], i: int) -> bytes:
+    return " ".join(f"{value:.3f}" for value in grid.ravel().tolist()).encode() + b"\r\n"
+
+
+def _lines(grid: NDArray[np.generic], i: int) -> bytes:
+    return b"".join(" ".join(map(str, row)).encode() + b"\n" for row in grid[..., 0].tolist()) + b"\n"
+
+
+def papillarray(grid: NDArray[np.generic], i: int, sensors: int = 1, period_ns: float = 1e6) -> bytes:
+    """A PTS packet with blocks of type 1 and 3; offsets are one byte wide, counted from the byte that holds their width."""
+    pillars = grid.reshape(-1, 6)
+    each = len(pillars) // sensors
+    clock = struct.pack("<IQ", (1000 + i) % (1 << 32), 5_000_000 + round(i * period_ns / 1000))
+    body = struct.pack("<H", sensors) + bytes(sensors)
+    for k in range(sensors):
+        body += struct.pack("<H", each) + bytes(each)
+        body += b"".join(struct.pack("<H6f", 2, *row) for row in pillars[k * each : (k + 1) * each].tolist())
+    table = 1 + 2 * 3
+    content = bytes([1]) + struct.pack("<HBHB", 1, table, 3, table + len(clock)) + clock + body
+    return b"\x55\x66\x77\x88" + content + struct.pack("<H", sum(content) & 0xFFFF) + b"\xaa\xbb\xcc\xdd"
+
+
+def _can_lines(grid: NDArray[np.generic], i: int) -> bytes:
+    rows = grid.reshape(-1, 3).tolist()
+    return b"".join(
+        f"t{0x710 + k:03X}8{bytes([0]).hex()}{struct.pack('>3H', *row).hex().upper()}00\r".encode()
+        for k, row in enumerate(rows)
+    )
+
+
+def _tsf_packet(grid: NDArray[np.generic], i: int) -> bytes:
+    fields = b""
+    for finger, part in enumerate(grid.reshape(-1, 28).tolist()):
+        fields += bytes([0x10 | finger << 2]) + struct.pack(">28H", *part) + bytes([0x20 | finger << 2]) + b"\x00\x07"
+    return bytes([0x9A, 0, 0x61, len(fields)]) + fields
+
+
+_WIRES: dict[str, Callable[[NDArray[np.generic], int], bytes]] = {
+    "flexitac": _bytes_after_a_marker, "matrix": _bytes_after_a_marker, "anyskin": _floats_and_crlf,
+    "reskin": _one_line, "3d-vitac": _lines, "xela-can": _can_lines,
+    "robotiq-tsf": _tsf_packet,
+}  # fmt: skip
+
+
+@dataclass
+class WirePort:
+    """A serial port with a skin behind it, and the kernel's buffer between.
+
+    frames: bytes of frame i. period_ns: time between two. latency: from the end of a frame to the driver. capacity: bytes
+    that the driver keeps; what comes after is thrown away. mangle: changes the bytes of a frame on the cable. chunk: most
+    bytes of one read. sent: what the box wrote.
+    """
+
+    clock: VirtualClock
+    frames: Callable[[int], bytes]
+    period_ns: float
+    capacity: int = 1 << 30
+    latency: Callable[[], int] = lambda: 200_000
+    mangle: Callable[[bytes], bytes] = lambda data: data
+    chunk: Callable[[], int] = lambda: TTY_BYTES
+    silent: bool = False
+    gone: bool = False
+    busy: bool = False
+    sent: list[bytes] = field(default_factory=list)
+    is_open: bool = False
+    thrown_away: int = 0
+
+    def __post_init__(self) -> None:
+        self.begun_ns = self.clock.now_ns()
+        self._next, self._due_ns, self._buffer = 0, 0, b""
+        self._plan()
+
+    def taken_ns(self, i: int) -> int:
+        """Host time at which frame `i` is taken."""
+        return self.begun_ns + round((i + 1) * self.period_ns)
+
+    def open(self, path: str, baud: int) -> WirePort:
+        """Open it, in the middle of a frame, with what came before thrown away."""
+        if self.busy:
+            raise SensorBusy("port held by another program")
+        if self.gone:
+            raise SensorLost("it is gone (errno 19)")
+        self.is_open = True
+        self._fill()
+        self._buffer = self._buffer[-5:]
+        return self
+
+    def write(self, data: bytes) -> None:
+        """Remember it."""
+        if self.gone:
+            raise SensorLost("it is gone (errno 19)")
+        self.sent.append(data)
+
+    def close(self) -> None:
+        """Nothing is read any more."""
+        self.is_open = False
+
+    def read(self, size: int, timeout_ms: int) -> bytes:
+        """What has come, or b"" after the timeout."""
+        until_ns = self.clock.now_ns() + timeout_ms * 1_000_000
+        while True:
+            if self.gone:
+                raise SensorLost("the skin was unplugged (errno 19)")
+            self._fill()
+            if self._buffer:
+                n = min(size, self.chunk(), TTY_BYTES)
+                data, self._buffer = self._buffer[:n], self._buffer[n:]
+                return data
+            if self.clock.now_ns() >= until_ns:
+                return b""
+            self.clock.sleep_until(until_ns if self.silent else min(until_ns, self._due_ns))
+
+    def ports(self) -> list[PortInfo]:
+        """The port while it is plugged in."""
+        return [] if self.gone else [PortInfo(PATH, 0x1A86, 0x7523, "S1")]
+
+    def _plan(self) -> None:
+        self._due_ns = self.taken_ns(self._next) + self.latency()
+
+    def _fill(self) -> None:
+        while self._due_ns <= self.clock.now_ns():
+            data = b"" if self.silent else self.mangle(self.frames(self._next))
+            kept = data[: max(0, self.capacity - len(self._buffer))]
+            self.thrown_away += len(data) - len(kept)
+            self._buffer += kept
+            self._next += 1
+            self._plan()
+
+
+class WiredSkin:
+    """A sensor on a skin of a delivered profile, in virtual time."""
+
+    def __init__(self, name: str, fmt: SweepFormat | None = None, *, rate: float = 1.0, **settings: object) -> None:
+        self.name, self.profile, self.clock = name, profile(name), VirtualClock()
+        self.format = fmt or self.profile.format
+        period_ns = self.profile.format.period_ns / rate
+        self.port = WirePort(self.clock, lambda i: wire(name, i, period_ns), period_ns)
+        config = SensorConfig(skin=name, port=PATH, **{"retry_ms": 50} | settings)  # type: ignore[arg-type]
+        adapted = skin_profile.adapted(self.profile, config)
+        self.sensor = SerialSensor(
+            config, adapted, self.format, self.clock, open_port=self.port.open, ports=self.port.ports
+        )
+        self.states: list[str] = []
+        self.troubles: list[str] = []
+
+    def seconds(self, seconds: float) -> Frames:
+        """All frames of this time."""
+        end_ns, parts = self.clock.now_ns() + round(seconds * SECOND), [self.sensor.read()]
+        while self.clock.now_ns() < end_ns:
+            before = self.clock.now_ns()
+            parts.append(self.sensor.read())
+            if self.sensor.state not in self.states[-1:]:
+                self.states.append(self.sensor.state)
+                self.troubles.append(str(self.sensor.trouble or ""))
+            if self.clock.now_ns() == before:  # a turn takes some time
+                self.clock.sleep_until(before + 1_000_000)
+        return Frames.joined(parts)
+
+    def which(self, frames: Frames) -> NDArray[np.int64]:
+        """Which of the frames on the wire each one is [n], by its content; fails for a frame that was never sent."""
+        sent = {taxels(self.profile, i).tobytes(): i for i in range(199)}
+        low = np.array([sent[one.tobytes()] for one in frames.taxels], np.int64)
+        # the content repeats after 199 frames; the time tells which of them it is
+        about = (frames.t_ns - self.port.begun_ns) / self.port.period_ns
+        return low + 199 * np.rint((about - low) / 199).astype(np.int64)
+
+    def late_ms(self, frames: Frames) -> NDArray[np.float64]:
+        """How much later than it was taken each frame's time is [n], ms."""
+        taken = np.array([self.port.taken_ns(int(i)) for i in self.which(frames)])
+        return (frames.t_ns - taken) / 1e6
