@@ -113,8 +113,7 @@ def check(link: SkinLink, clock: Clock, seconds: float, *, port: bool) -> Iterat
     Raises SensorError if the link itself fails.
     """
     listener = Listener(link, clock)
-    link.request(Request.STOP, 0)
-    listener.quiet()  # an earlier program may have left it sending
+    link.request(Request.STOP, 0)  # an earlier program may have left it sending
     yield _identity(link)
     form, finding = _format(link)
     yield finding

@@ -282,3 +282,32 @@ def test_the_page_names_pins_and_settings_as_they_are() -> None:
     page = (pico.FIRMWARE / "README.md").read_text()
     for row in ("| GP2, GP3, GP4, GP5 | 4, 5, 6, 7 |", "| GP6, GP7, GP8, GP9 |", "| GP26 / ADC0 |", "| GP22 |"):
         assert row in page
+
+
+CTRL_C = """
+import sys
+sys.path.insert(0, {folder!r})
+import pico_shell, settings
+sys.modules["machine"] = pico_shell.PicoMachine(settings, pico_shell.OPTIONS)
+import main
+class Recorded:
+    def kbd_intr(self, char):
+        print("kbd_intr", char)
+served = []
+def serve(board, *streams):
+    print("serving")
+    served.append(board)
+    board.request(3)
+    raise OSError(5)
+main.micropython, main.readout.serve = Recorded(), serve
+try:
+    main.run(settings)
+except OSError:
+    print("still running", served[0].running)
+"""
+
+
+def test_ctrl_c_is_a_byte_while_it_serves() -> None:
+    """The number of START must not interrupt the program; after an error the prompt has its Ctrl-C again."""
+    done = pico.run("-c", CTRL_C.format(folder=str(pico.SHELL.parent)))
+    assert done.stdout.splitlines() == ["kbd_intr -1", "serving", "kbd_intr 3", "still running False"], done.stderr

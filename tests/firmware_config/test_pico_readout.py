@@ -292,12 +292,19 @@ class SlowPort:
 def test_replies_wait_for_the_end_of_a_packet(chunks):
     """However little the port takes at a time, no packet is torn apart by a request that comes in its middle."""
     made = DrivenBoard()
-    asked = {2: readout.START, 90: readout.IDENTITY, 111: readout.FORMAT, 112: 77, 200: readout.IDENTITY}
+    asked = {
+        2: readout.START,
+        90: readout.IDENTITY,
+        111: readout.FORMAT,
+        112: readout.IDENTITY,
+        113: 77,
+        200: readout.IDENTITY,
+    }
     port = SlowPort(made, asked, chunks)
     readout.serve(made.board, port, port, port.readable)
     read = packets.unpack(port.taken)
     assert read.garbage == 0
-    assert [r.request for r in read.replies] == [1, 2, 1]
+    assert [r.request for r in read.replies] == [1, 2, 1, 1]
     _, _, lost, stale = packets.follow(read.packets, packets.StreamPosition(0))
     assert (lost, stale) == (0, 0)
     assert len(read.packets) > 20

@@ -182,6 +182,15 @@ def test_a_sound_board_passes(acm: bool):
     assert {f.verdict for f in found.values()} == {"ok"}, found
 
 
+def test_a_board_that_was_left_sending_passes():
+    """A program that died without STOP is no fault of the board."""
+    simulated = idle_devices(acm=True)
+    simulated.backend.board.request(packets.Request.START)
+    simulated.clock.sleep_until(simulated.clock.now_ns() + 20_000_000_000)
+    found = findings(simulated)
+    assert {f.verdict for f in found.values()} == {"ok"}, found
+
+
 @pytest.mark.parametrize(("fault", "part", "words"), FAULTS.values(), ids=list(FAULTS))
 def test_each_fault_is_found(fault: Fault, part: str, words: str):
     """The part fails with words that say what to do, and parts that do not depend on it are ok."""
