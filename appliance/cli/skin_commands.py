@@ -9,7 +9,7 @@ import argparse
 from contextlib import closing
 
 from appliance.cli.commands import OpenDevices, load_settings
-from appliance.io.usb_sensor import open_link
+from appliance.io import skins
 
 
 def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
@@ -17,10 +17,10 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     from appliance.tools import skin_check
 
     devices = open_devices(None)
-    sensor = devices.wire(load_settings(args)).sensor
-    failed = 0
-    with closing(open_link(sensor, devices.backend, devices.clock)) as link:
-        for found in skin_check.check(link, devices.clock, args.seconds, port=sensor.link == "serial"):
+    settings = devices.wire(load_settings(args))
+    failed, port = 0, settings.sensor.link == "serial"
+    with closing(skins.open_board(settings, devices)) as link:
+        for found in skin_check.check(link, devices.clock, args.seconds, port=port):
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
             failed += found.verdict == "FAIL"
     return 1 if failed else 0

@@ -13,6 +13,7 @@ from appliance.core.devices import Devices
 from appliance.core.errors import ConfigError, FormatError, SensorMismatch
 from appliance.core.types import SweepFormat
 from appliance.io import skin_profile
+from appliance.io.link import SkinLink
 from appliance.io.skin_profile import SkinProfile
 from appliance.io.usb_sensor import LinkSensor, TransferObserver, UsbSensor, ask, open_link
 
@@ -42,6 +43,17 @@ def sensor(settings: Config, fmt: SweepFormat, devices: Devices, tap: TransferOb
     return SerialSensor(settings.sensor, chosen, fmt, devices.clock, tap)
 
 
+def open_board(settings: Config, devices: Devices) -> SkinLink:
+    """The opened board of a skin that speaks PROTOCOL.md. Raises ConfigError for another skin, SensorError if there is none."""
+    chosen = profile(settings)
+    if chosen.codec != "palpate":
+        raise ConfigError(
+            f'sensor.skin = "{settings.sensor.skin}" sends what its maker defines (codec "{chosen.codec}"), not PROTOCOL.md; '
+            'take sensor.skin = "palpate" for a board that does'
+        )
+    return open_link(_config(settings, chosen), devices.backend, devices.clock)
+
+
 def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = None) -> SweepFormat:
     """The form of the skin's sweeps where no bundle says it: what the board announces, or what its profile says, with a
     window of skin_profile.WINDOW_S. wanted: its rate is taken where the skin can be set to it.
@@ -52,7 +64,7 @@ def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = N
     if chosen.codec != "palpate":
         settable = wanted and wanted.rate_hz in chosen.rates_hz
         return replace(chosen, rate_hz=wanted.rate_hz).format if wanted and settable else chosen.format
-    with closing(open_link(_config(settings, chosen), devices.backend, devices.clock)) as board:
+    with closing(open_board(settings, devices)) as board:
         skin = ask(board)[1]
     try:
         return skin_profile.with_window(skin.rows, skin.cols, skin.rate_hz, skin.dtype, skin.axes)

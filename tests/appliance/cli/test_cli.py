@@ -436,6 +436,7 @@ def test_skin_check_fails_with_a_part(monkeypatch: pytest.MonkeyPatch, capsys: p
         (["--seconds", "0"], 2, "0 is no time to listen; use 1 to 3600 seconds"),
         (["--seconds", "long"], 2, "long is no time to listen"),
         (["--set", "sensor.link=serial", "--set", "sensor.port=/dev/none"], 69, "no port /dev/none"),
+        (["--set", "sensor.skin=anyskin"], 78, 'sensor.skin = "anyskin" sends what its maker defines (codec "fixed")'),
     ],
 )
 def test_skin_check_refuses(options: list[str], code: int, words: str, capsys: pytest.CaptureFixture[str]):
