@@ -237,6 +237,22 @@ def test_the_wheel_works_in_a_clean_environment(wheel: Path, tmp_path: Path):
     assert out.count("ok  ") == 4
 
 
+def test_the_desktop_is_installed_without_running_tests(tmp_path: Path):
+    """`make desktop` in a fresh checkout installs both commands and starts no test; the documents name it."""
+    (tmp_path / "train").mkdir()
+    for name in ("Makefile", "pyproject.toml", "train/pyproject.toml"):
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    (tmp_path / "appliance").mkdir()
+    (tmp_path / "appliance" / "requirements.lock").touch()
+    steps = run("make", "--dry-run", "desktop", cwd=tmp_path)
+    assert "-e 'train[minirocket,dask]'" in steps
+    assert "pytest" not in steps
+    for page in ("README.md", "CONTRIBUTING.md", "docs/manual.md", "docs/import.md"):
+        text = (ROOT / page).read_text()
+        assert "make desktop" in text
+        assert ".venv/bin/activate" in text
+
+
 def test_the_lock_covers_both_processors():
     """Every requirement is pinned with hashes; the binary ones have wheels for x86_64 and aarch64 among them."""
     text = (ROOT / "appliance" / "requirements.lock").read_text()

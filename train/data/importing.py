@@ -170,7 +170,7 @@ def _named(folder: Path, plan: ImportPlan, left_out: list[LeftOut]) -> dict[str,
     for fields in found.values():
         fields["material"] = plan.renames.get(fields["material"], fields["material"])
     if why := labels.unsendable(sorted({fields["material"] for fields in found.values()})):
-        raise FormatError(f"{folder}: {why}")
+        raise FormatError(f"{folder}: {why}; {labels.REMEDY}")
     return found
 
 

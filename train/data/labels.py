@@ -13,20 +13,21 @@ from appliance.core.schema import closest
 from train.data.sets import Dataset
 
 ALLOWED = "1 to 24 letters, digits, spaces, '.', '_' or '-', the first a letter or a digit"
+REMEDY = "give each another name with --rename OLD=NEW"
 
 
 def unsendable(names: Iterable[str]) -> str:
-    """Which of `names` the box cannot send, all in a line with the remedy; "" where it can send all."""
+    """Which of `names` the box cannot send, all in a line with what a label may be; "" where it can send all."""
     if not (bad := [name for name in names if not LABEL.fullmatch(name)]):
         return ""
     listed = ", ".join(f"{name!r} ({len(name)} characters)" for name in bad)
-    return f"the box cannot send {listed}; a label is {ALLOWED}; give each another name with --rename '{bad[0]}=NEW'"
+    return f"the box cannot send {listed}; a label is {ALLOWED}"
 
 
 def check(sweeps: Dataset) -> Dataset:
     """The set itself. Raises FormatError listing every material that the box cannot send."""
     if why := unsendable(sweeps.materials):
-        raise FormatError(f"{sweeps.source}: {why}")
+        raise FormatError(f"{sweeps.source}: {why}; {REMEDY}")
     return sweeps
 
 

@@ -49,7 +49,7 @@ def describe(spec: str) -> str:
 
 def _unsendable(materials: Iterable[str]) -> list[str]:
     """A line where `fit` refuses names of materials."""
-    return [f"  cannot be trained on yet: {why}"] if (why := labels.unsendable(materials)) else []
+    return [f"  cannot be trained on yet: {why}; {labels.REMEDY}"] if (why := labels.unsendable(materials)) else []
 
 
 def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Names]:

@@ -20,6 +20,7 @@ from appliance.bundle.bundle import LABEL
 from appliance.core.errors import FormatError
 from appliance.core.schema import closest, custom, keys, number, read_table
 from train.data import sets
+from train.data.labels import unsendable
 from train.data.sets import Dataset
 from train.evaluation import corruptions
 from train.models import methods
@@ -118,11 +119,8 @@ class Scene:
         kept = [m for m in known if m in (self.materials or known)]
         new = {m: name for name, names in self.merge.items() for m in names}
         labels = tuple(dict.fromkeys(new.get(m, m) for m in kept))
-        for label in labels:
-            if not LABEL.fullmatch(label):
-                raise FormatError(
-                    f"{self.path.name}: label {label!r} cannot be sent by the box; name it anew in [merge]"
-                )
+        if bad := unsendable(labels):
+            raise FormatError(f"{self.path.name}: {bad}; name each anew in [merge]")
         at = np.array([labels.index(new.get(m, m)) if m in kept else -1 for m in known])[whole.labels]
         part = whole.take(at >= 0)
         part = replace(part, labels=at[at >= 0], materials=labels).require_materials().require_pure_recordings()
