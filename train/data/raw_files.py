@@ -19,24 +19,16 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from appliance.core.types import UNREADABLE
+from train.data import mat_files
 from train.data.readers import HDF5, array_in
 
 Array = NDArray[Any]
 COMMENTS = ("#", "%")
 DELIMITERS = ("\t", ";", ",")
 """The first that a line has separates its columns; else blanks do."""
-UNREADABLE = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    EOFError,
-    SyntaxError,
-    RuntimeError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What readers of damaged files raise; scipy's own errors are among them."""
+DAMAGED = (*UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What readers of damaged files raise."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +56,8 @@ def read(path: Path, variable: str = "") -> Table:
         if suffix in HDF5 or h5py.is_hdf5(path):
             return _chosen(_hdf5(path), variable)
         return _text(path.read_bytes())
-    except UNREADABLE as e:
-        raise FormatError(f"cannot be read: {e}") from e
+    except DAMAGED as e:
+        raise FormatError(f"cannot be read: {' '.join(str(e).split())}") from e
 
 
 def _plain(values: Array) -> Table:
@@ -78,9 +70,7 @@ def _mat(path: Path) -> dict[str, Array]:
     """Arrays of a MAT file of any version; those of version 7.3 are HDF5 and have their axes the other way round."""
     if h5py.is_hdf5(path):
         return {name: values.T for name, values in _hdf5(path).items()}
-    from scipy.io import loadmat  # here: it takes a while, and most folders have no MAT files
-
-    return {name: values for name, values in loadmat(path).items() if not name.startswith("__")}
+    return mat_files.arrays(path.read_bytes())
 
 
 def _hdf5(path: Path) -> dict[str, Array]:

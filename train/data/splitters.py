@@ -157,7 +157,7 @@ def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Ar
     return np.flatnonzero(train), np.flatnonzero(test)
 
 
-OF_THE_SET = ("recording", "set", "split", "world")
+OF_THE_SET = ("recording", "set", "split", "trial", "world")
 """Groups that say where a sweep is from, and no condition that a user would vary."""
 RANDOM_PARTS = 5
 

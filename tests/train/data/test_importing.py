@@ -229,7 +229,11 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         ("npy", lambda p: np.save(p, np.zeros((20, 3, 3))), "holds frames [3, 3]; leave --columns out"),
         ("npz", lambda p: p.write_bytes(b"PK\3\4"), "cannot be read: "),
         ("npz", lambda p: np.savez(p, a=COUNTS, b=COUNTS), "holds 2 arrays of frames; name one with --variable"),
-        ("mat", lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)), "cannot be read: "),
+        (
+            "mat",
+            lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)),
+            "is no MAT file of version 5 to 7.3; save it with -v7",
+        ),
         ("h5", lambda p: p.write_bytes(b"nothing"), "cannot be read: "),
         (
             "h5",

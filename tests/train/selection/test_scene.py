@@ -167,7 +167,9 @@ def test_a_label_that_the_box_cannot_send_is_refused_at_once(tmp_path: Path):
     """Before hours of training; [merge] gives it another name."""
     samples = np.arange(40, dtype=np.int16).reshape(4, 10, 1, 1)
     Dataset(samples, np.array([0, 0, 1, 1]), ("wood, oiled", "b"), 50.0).save(tmp_path / "a.npz")
-    with pytest.raises(FormatError, match=r"cannot send 'wood, oiled' \(11 characters\); .* name each anew in \[merge\]"):
+    with pytest.raises(
+        FormatError, match=r"cannot send 'wood, oiled' \(11 characters\); .* name each anew in \[merge\]"
+    ):
         scene.read(written(tmp_path, 'sets = ["a.npz"]')).sweeps()
     renamed = scene.read(written(tmp_path, 'sets = ["a.npz"]\n[merge]\n"oiled wood" = ["wood, oiled"]')).sweeps()
     assert renamed.materials == ("oiled wood", "b")

@@ -127,10 +127,12 @@ def test_the_method_names_materials_that_it_never_saw_last():
 
 
 def test_groups_that_can_be_left_out_judge():
-    """Each group in parts, the first ones first; one that cuts recordings does not, and recordings do where there is none."""
+    """Each group in parts, the first ones first; one that cuts recordings or counts trials does not, and recordings do where
+    there is none."""
     n = 24
     labels, recording = np.arange(n) % 2, np.arange(n) // 2
     groups = {"recording": recording, "speed": recording % 3, "force": recording % 2, "odd": np.arange(n) % 2}
+    groups["trial"] = recording % 4
     sweeps = Dataset(np.zeros((n, 16, 1, 1), np.uint8), labels, ("a", "b"), 10.0, groups, "x")
     assert [part.group for part in inner_parts(sweeps)] == ["force", "speed", "force", "speed", "speed"]
     for part in inner_parts(sweeps):

@@ -1,0 +1,92 @@
+"""MAT files: what scipy writes is read as scipy reads it; damage is told and never reaches memory."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from appliance.core.errors import FormatError
+from train.data import mat_files
+
+TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
+
+
+def saved(compressed: bool, **values: object) -> bytes:
+    """What scipy writes."""
+    file = io.BytesIO()
+    scipy.io.savemat(file, values, do_compression=compressed)
+    return file.getvalue()
+
+
+CONTENT = {
+    **{f"a{kind.replace('?', 'logical')}": (np.arange(12).reshape(4, 3) % 2).astype(kind) for kind in TYPES},
+    "cube": np.arange(24.0).reshape(2, 3, 4), "one": 7.0, "empty": np.empty((0, 3)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_numbers_are_read_as_scipy_reads_them(compressed: bool):
+    """Every class of numbers, cubes, scalars, nothing; what is no plain array of numbers is passed over."""
+    others = {"text": "abc", "cell": np.array([1, "a"], object), "record": {"x": 1.0}, "complex": np.array([1j])}
+    data = saved(compressed, **CONTENT, **others)
+    found, second = mat_files.arrays(data), scipy.io.loadmat(io.BytesIO(data))
+    assert found.keys() == CONTENT.keys()
+    for name, values in found.items():
+        assert values.dtype == second[name].dtype, name
+        np.testing.assert_array_equal(values, second[name])
+
+
+def test_the_other_byte_order_is_read():
+    """A file of a big-endian machine, put together by hand: flags, shape, name in its tag, two doubles."""
+    flags = b"\0\0\0\6" + b"\0\0\0\x08" + b"\0\0\0\6" + bytes(4)
+    shape = b"\0\0\0\5" + b"\0\0\0\x08" + b"\0\0\0\1" + b"\0\0\0\2"
+    values = b"\0\0\0\x09" + b"\0\0\0\x10" + np.array([1.5, -2.0], ">f8").tobytes()
+    body = flags + shape + b"\0\1\0\1" + b"x\0\0\0" + values
+    data = bytes(124) + b"\1\0MI" + b"\0\0\0\x0e" + len(body).to_bytes(4, "big") + body
+    np.testing.assert_array_equal(mat_files.arrays(data)["x"], [[1.5, -2.0]])
+
+
+WHOLE = {
+    compressed: saved(compressed, frames=np.arange(40).reshape(10, 4), t=np.arange(10.0))
+    for compressed in (False, True)
+}
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.booleans(), st.integers(0, 2000), st.lists(st.tuples(st.integers(100, 2000), st.integers(0, 255)), max_size=6)
+)
+def test_damage_is_told(compressed: bool, cut: int, changes: list[tuple[int, int]]):
+    """Cut anywhere, bytes altered: arrays that fit their shapes, or a FormatError; nothing else."""
+    data = bytearray(WHOLE[compressed][: len(WHOLE[compressed]) - cut])
+    for at, value in changes:
+        if at < len(data):
+            data[at] = value
+    try:
+        found = mat_files.arrays(bytes(data))
+    except FormatError:
+        return
+    assert sum(values.size for values in found.values()) <= 8 * len(data) + 50
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "is no MAT file of version 5 to 7.3; save it with -v7"),
+        (WHOLE[False][:-40], "is damaged or cut off: .* bytes at .* go beyond its end"),
+        (WHOLE[True][:-9], "is damaged"),
+        (
+            WHOLE[False][:160] + b"\x09" + WHOLE[False][161:],
+            r"is damaged: array 'frames' \[9, 4\] holds 320 bytes of int64",
+        ),
+    ],
+)
+def test_each_damage_has_its_message(data: bytes, message: str):
+    """What is wrong, and where."""
+    with pytest.raises(FormatError, match=message):
+        mat_files.arrays(data)
