@@ -126,6 +126,6 @@ def _on_lines(settings: Config) -> Config:
 
 
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
-    "demo": run_demo, "bench": run_bench, **commands.RUNS, **bundle_commands.RUNS,
+    "demo": run_demo, "bench": run_bench, **commands.RUNS, **bundle_commands.RUNS, **skin_commands.RUNS,
     **{name: partial(_with_devices, run) for name, run in {**commands.WITH_DEVICES, **skin_commands.WITH_DEVICES}.items()},
 }  # fmt: skip

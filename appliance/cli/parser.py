@@ -156,6 +156,10 @@ def _local_commands(
 
 def _skin_commands(add: Callable[..., Any], devices: argparse.ArgumentParser) -> None:
     """The commands `palpate skin ...`."""
+    add("skin list", "all skin profiles, with what each skin lacks and whether it was measured")
+    detect = add("skin detect", "what is plugged in, and which profile fits; it only listens")
+    detect.add_argument("--port", default="", metavar="PATH", help="this port alone")
+    detect.add_argument("--write", action="store_true", help="with --port: also ask, and send commands for starting")
     check = add("skin check", "whether the skin's firmware keeps to PROTOCOL.md, part by part", devices)
     check.add_argument(
         "--seconds", type=_seconds, default=10.0, metavar="S",
