@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -15,9 +16,17 @@ from appliance.io.robot_link import SerialSink
 from appliance.runtime import assembly
 from appliance.sim import devices, rig, script, skin
 from appliance.tools import pseudo_terminal
+from tests.factories import browser as browsers
 from tests.factories import log_lines
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import OnSweep, Rigged
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser, for the tests of pages."""
+    with browsers.launched() as one:
+        yield one
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,5 @@
-"""Serves a page that shows where the skin is touched. In: Views. Out: the page and its state, to browsers on this
-machine.
+"""Serves a page that shows a state that changes: of `palpate align`, of `palpate skin show`. In: States. Out: the page
+and the newest of them, to browsers on this machine.
 
 It listens on 127.0.0.1 alone and only answers GET on two paths; of a request nothing beyond the head is read. The
 server runs in its own thread, so that no slow browser keeps the loop from reading the skin. The two share one value,
@@ -18,9 +18,8 @@ import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
-from appliance.alignment.view import View
 from appliance.core.clock import Clock
 from appliance.core.errors import ConfigError
 
@@ -154,12 +153,21 @@ class Server(ThreadingHTTPServer):
         """Ignore a browser that has closed its connection."""
 
 
-class Page:
-    """Shows Views at http://127.0.0.1:`port`, 0 for any that is free. Raises ConfigError where it cannot be used."""
+class State(Protocol):
+    """What a page shows."""
 
-    def __init__(self, port: int, clock: Clock) -> None:
+    def json(self) -> dict[str, Any]:
+        """It as the page reads it."""
+        ...
+
+
+class Page:
+    """Shows States on the page of the file `page` at http://127.0.0.1:`port`, 0 for any that is free. Raises
+    ConfigError where it cannot be used."""
+
+    def __init__(self, port: int, clock: Clock, page: Path = PAGE) -> None:
         try:
-            self._server = Server(port, clock, PAGE.read_text(encoding="utf-8"))
+            self._server = Server(port, clock, page.read_text(encoding="utf-8"))
         except (OSError, OverflowError) as e:
             raise ConfigError(f"port {port} of {HERE} cannot be used: {e}; name another with --web PORT") from e
         self.address = f"http://{HERE}:{self._server.server_address[1]}"
@@ -172,6 +180,6 @@ class Page:
         self._server.shutdown()
         self._server.server_close()
 
-    def show(self, view: View) -> None:
+    def show(self, view: State) -> None:
         """Make `view` the newest state."""
         self._server.content["/state"] = "application/json", json.dumps(view.json(), allow_nan=False).encode()

@@ -156,16 +156,29 @@ def _local_commands(
 
 def _skin_commands(add: Callable[..., Any], devices: argparse.ArgumentParser) -> None:
     """The commands `palpate skin ...`."""
-    add("skin list", "all skin profiles, with what each skin lacks and whether it was measured")
-    detect = add("skin detect", "what is plugged in, and which profile fits; it only listens")
-    detect.add_argument("--port", default="", metavar="PATH", help="this port alone")
-    detect.add_argument("--write", action="store_true", help="with --port: also ask, and send commands for starting")
     check = add("skin check", "whether the skin's firmware keeps to PROTOCOL.md, part by part", devices)
     check.add_argument(
         "--seconds", type=_seconds, default=10.0, metavar="S",
         help="how long frames are listened to, 1 to 3600 (default 10); the longer, the surer of the clock",
     )  # fmt: skip
-    check.set_defaults(sweeps=None)
+    show = add("skin show", "the skin live: heat map, rate, noise, dead and stuck taxels", devices)
+    show.add_argument(
+        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        help=f"also as a page on localhost (default port {WEB_PORT})",
+    )  # fmt: skip
+    for command in (check, show):
+        command.set_defaults(sweeps=None)
+    new = add("skin new", "listen to a skin that has no profile, propose one and write it; nothing is sent to it")
+    new.add_argument("name", metavar="NAME", help="of the profile")
+    new.add_argument(
+        "--grid", metavar="RxC[xA]", help="rows, columns and axes; without it, proposals are printed alone"
+    )
+    new.add_argument(
+        "--proposal", type=_count, metavar="N", help="which of the proposals (default: the first that has this grid)"
+    )
+    new.add_argument("--seconds", type=_seconds, default=3.0, metavar="S", help="how long it listens (default 3)")
+    new.add_argument("--out", type=Path, metavar="DIR", help="folder of the profile (default: /etc/palpate/skins)")
+    new.add_argument("--replace", action="store_true", help="replace a profile of this name")
 
 
 def _seconds(text: str) -> float:

@@ -31,7 +31,8 @@ SLIDE_MM_S = 20
 NUMBERS = Literal["uint8", "int16", "uint16", "float32"]
 MARKS = ("sequence", "time", "checksum")
 """What a skin may lack."""
-_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
+NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
+"""Names of profiles, and so of their files."""
 _GRID = re.compile(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})")
 _USB_ID = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
 _TURNS = ("transpose", "flip-rows", "flip-columns")
@@ -233,7 +234,7 @@ def names(folders: Sequence[Path]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for folder in folders:
         for path in sorted(folder.glob("*.toml")):
-            if _NAME.fullmatch(path.stem):
+            if NAME.fullmatch(path.stem):
                 found.setdefault(path.stem, path)
     return found
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -27,15 +25,14 @@ from appliance.bundle.bundle import Manifest
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ConfigError
 from appliance.signal.contact import ContactPositions
+from tests.factories.browser import WAIT_S, BrowsedPage, until
 
-BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PLACE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 LOADS = tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4))
 VIEW = View(
     7, "usb", "tubes 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1", "move the skin", (4, 4),
     LOADS, 80.0, (3.8, 6.0), (6.0, 6.0), PLACE,
 )  # fmt: skip
-WAIT_S = 10
 
 
 @pytest.fixture
@@ -191,14 +188,6 @@ def test_one_who_reads_nothing_holds_nobody_up(page: Page, monkeypatch: pytest.M
         until(lambda: threading.active_count() == before)
 
 
-def until(done: Any) -> None:
-    """Wait for `done()`; fails after WAIT_S."""
-    end = time.monotonic() + WAIT_S
-    while not done():
-        assert time.monotonic() < end, "nothing happened"
-        time.sleep(0.02)
-
-
 def test_the_page_holds_everything_it_shows():
     """It is one file: no address but the namespace of SVG, no src, no import, and nothing that could send data."""
     text = web.PAGE.read_text(encoding="utf-8")
@@ -226,38 +215,6 @@ def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
         yield run, address
         run.stdout.close()
         run.kill()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A browser of this system, else the one that playwright has installed."""
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (make test installs it)")
-    with api.sync_playwright() as tool:
-        path = next(filter(None, map(shutil.which, BROWSERS)), tool.chromium.executable_path)
-        if not Path(path).exists():
-            pytest.skip("no browser: apt-get install chromium-headless-shell, or playwright install chromium")
-        one = tool.chromium.launch(executable_path=path)
-        yield one
-        one.close()
-
-
-class BrowsedPage:
-    """The page as a person sees it. errors: messages of the browser. requests: addresses that it asked for."""
-
-    def __init__(self, context: Any, address: str) -> None:
-        self.page, self.errors, self.requests = context.new_page(), [], []
-        self.page.on("console", lambda message: self.errors.append(message.text))
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(address)
-
-    def state(self, wanted: str) -> None:
-        """Wait for this state of the page."""
-        until(lambda: self.page.evaluate("document.body.dataset.state") == wanted)
-
-    def text(self, where: str) -> str:
-        """The text of an element, with plain spaces."""
-        return str(self.page.inner_text(where)).replace("\xa0", " ")
 
 
 @pytest.mark.slow

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,21 +10,7 @@ import pytest
 from tests.factories.chart_data import DOTS, FRONT
 from train.reports import chart_report, pareto
 
-api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (make test installs it)")
-BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 NAMES = [pareto.name(one) for one in DOTS]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A browser of the system's, else the one that playwright has installed."""
-    with api.sync_playwright() as tool:
-        path = next(filter(None, map(shutil.which, BROWSERS)), tool.chromium.executable_path)
-        if not Path(path).exists():
-            pytest.skip("no browser: apt-get install chromium-headless-shell, or playwright install chromium")
-        one = tool.chromium.launch(executable_path=path)
-        yield one
-        one.close()
 
 
 @pytest.fixture(scope="module")

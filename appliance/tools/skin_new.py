@@ -1,0 +1,136 @@
+"""A profile for a skin that nobody has described, for `palpate skin new`. In: what its port sends. Out: proposals in
+words, and the text of the profile.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from appliance.core.clock import Clock
+from appliance.core.errors import ConfigError, SensorMismatch, SensorSilent
+from appliance.io import skin_codecs, skin_profile
+from appliance.io.serial_port import PortInfo
+from appliance.io.serial_sensor import BytePort
+from appliance.tools.stream_analysis import Grid, Proposal, Read, analyse
+
+READ_BYTES = 65_536
+BAUDS = 115_200, 2_000_000, 921_600, 1_000_000, 460_800, 230_400
+"""Speeds that makers use, the most frequent first; over a port that is USB down to the microcontroller any of them does."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortSample:
+    """What a port sent at a speed, and how it can be understood, the most likely first."""
+
+    baud: int
+    reads: Sequence[Read]
+    proposals: Sequence[Proposal]
+
+
+def listen(open_port: Callable[[int], BytePort], bauds: Sequence[int], seconds: float, clock: Clock) -> PortSample:
+    """What comes within `seconds` at the first of the `bauds` at which there is a pattern; nothing is written.
+
+    open_port: opens the port at a speed. Raises SensorError: SensorSilent where nothing comes, SensorMismatch where no
+    speed shows a pattern.
+    """
+    count, tried = 0, ", ".join(map(str, bauds))
+    for baud in bauds:
+        port = open_port(baud)
+        try:
+            reads = _reads(port, seconds, clock)
+        finally:
+            port.close()
+        count += sum(len(read.data) for read in reads)
+        if found := analyse(reads):
+            return PortSample(baud, reads, found)
+    if not count:
+        raise SensorSilent(
+            f"nothing came in {seconds:g} s at {tried} baud; if the skin waits for a command, copy matrix.toml and write it there"
+        )
+    raise SensorMismatch(
+        f"{count} bytes at {tried} baud have no pattern; name the skin's speed with --set sensor.baud=N, or listen longer"
+    )
+
+
+def _reads(port: BytePort, seconds: float, clock: Clock) -> list[Read]:
+    reads, until_ns = [], clock.now_ns() + round(seconds * 1e9)
+    while (now_ns := clock.now_ns()) < until_ns:
+        if data := port.read(READ_BYTES, max(1, (until_ns - now_ns) // 1_000_000)):
+            reads.append(Read(clock.now_ns(), data))
+    return reads[1:]  # the first holds what had piled up before, and may begin anywhere
+
+
+def words(proposal: Proposal) -> str:
+    """A proposal in one line."""
+    mark = proposal.mark.hex(" ")
+    order = ", high byte first" * proposal.big_endian
+    numbers = f"{proposal.values} x {proposal.dtype}{order}"
+    count = f", a {proposal.sequence} that counts the frames" * bool(proposal.sequence)
+    frame = {
+        "marker": f"{proposal.length} bytes: marker {mark}{count}, {numbers}",
+        "trailer": f"{proposal.length} bytes: {numbers}, trailer {mark}",
+        "text": f"{proposal.length} line{'s' * (proposal.length > 1)} of text: {numbers}",
+    }[proposal.framing]
+    fits = ", ".join(map(grid_text, proposal.grids)) or "none"
+    return f"{frame}; {proposal.rate_hz:.1f} Hz, {proposal.share:.0%} of the bytes; grids: {fits}"
+
+
+def grid_text(grid: Grid) -> str:
+    """4x4, or 3x3x3 where there are several axes."""
+    rows, cols, axes = grid
+    return f"{rows}x{cols}" + f"x{axes}" * (axes > 1)
+
+
+def choose(heard: PortSample, text: str, number: int) -> tuple[Proposal, Grid]:
+    """The proposal `number`, from 1, with the grid that `text` names; the first that has as many values for 0.
+
+    Raises ConfigError where there is none.
+    """
+    if number > len(heard.proposals):
+        raise ConfigError(f"--proposal {number} is not there; use 1 to {len(heard.proposals)}")
+    parts = text.split("x")
+    offered = heard.proposals[number - 1 : number] if number else heard.proposals
+    if len(parts) in (2, 3) and all(part.isdecimal() and 1 <= int(part) <= 255 for part in parts):
+        rows, cols, axes = (*map(int, parts), 1)[:3]
+        for proposal in offered:
+            if rows * cols * axes == proposal.values:
+                return proposal, (rows, cols, axes)
+    fits = ", ".join(grid_text(grid) for proposal in offered for grid in proposal.grids) or "rows x columns"
+    raise ConfigError(f"--grid {text} has as many values as no proposal; use one such as {fits}")
+
+
+def profile(proposal: Proposal, grid: Grid, baud: int, port: PortInfo) -> str:
+    """The text of the profile's file (firmware_config/skins/matrix.toml explains each key)."""
+    rows, cols, axes = grid
+    values: dict[str, Any] = {
+        "about": f"{rows} x {cols} taxels" + f" with {axes} axes" * (axes > 1),
+        "source": "palpate skin new: what the skin sent",
+        "codec": "text" if proposal.framing == "text" else "fixed",
+        "baud": baud,
+    }
+    if port.vendor_id:
+        values["usb_ids"] = [f"{port.vendor_id:04x}:{port.product_id:04x}"]
+    if proposal.framing == "text":
+        values["lines"] = "frames" if proposal.length == 1 else "rows"
+    else:
+        values[proposal.framing] = proposal.mark.hex(" ")
+    if proposal.sequence:
+        values["sequence"] = proposal.sequence
+    values |= {"number": proposal.dtype, "rows": rows, "cols": cols, "rate_hz": float(f"{proposal.rate_hz:.3g}")}
+    if proposal.big_endian:
+        values["byte_order"] = "big"
+    if axes > 1:
+        values |= {"values": axes, "take": list(range(axes))}
+    head = "# Written by `palpate skin new`. Compare it with what the maker says; matrix.toml explains each key.\n"
+    return head + "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in values.items())
+
+
+def decoded(text: str, reads: Sequence[Read]) -> tuple[int, int]:
+    """(frames, bytes in no frame) of `reads`, read as the profile `text` says. Raises ConfigError where it cannot be."""
+    codec = skin_codecs.codec(skin_profile.from_json(tomllib.loads(text), "the new profile"))
+    found = codec(skin_codecs.Rest(), b"".join(read.data for read in reads))
+    return len(found), found.garbage

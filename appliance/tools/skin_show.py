@@ -1,0 +1,38 @@
+"""`palpate skin show`: a skin live, in the terminal and on a page. In: a Sensor. Out: LiveViews, five times a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from appliance.alignment.live import VIEW_NS
+from appliance.core.clock import Clock
+from appliance.core.types import SweepFormat
+from appliance.io.usb_sensor import Sensor
+from appliance.tools.skin_monitor import LiveView, SkinDisplay, SkinMonitor
+
+PAGE = Path(__file__).with_name("skin_page.html")
+
+
+def run(
+    sensor: Sensor, fmt: SweepFormat, name: str, source: str, clock: Clock, displays: Iterable[SkinDisplay],
+    stopped: Callable[[], bool],
+) -> None:  # fmt: skip
+    """Show on `displays` what `sensor` sends, until `stopped()`. name: of the skin's profile."""
+    shown_on, monitor, number = tuple(displays), SkinMonitor(fmt), 0
+    enumerations, next_ns = sensor.counters.enumerations, clock.now_ns()
+    while not stopped():
+        frames = sensor.read()
+        if sensor.counters.enumerations != enumerations:
+            enumerations = sensor.counters.enumerations
+            monitor.reset()
+        monitor.put(frames)
+        if (now := clock.now_ns()) >= next_ns:
+            next_ns, number = now + VIEW_NS, number + 1
+            counters = sensor.counters
+            view = LiveView(
+                number, source, f"{name} {fmt}", sensor.state, str(sensor.trouble or ""), (fmt.rows, fmt.cols, fmt.axes),
+                frames=counters.frames, lost=counters.lost_frames if sensor.loss_known else None, **monitor.measured(),
+            )  # fmt: skip
+            for display in shown_on:
+                display.show(view)

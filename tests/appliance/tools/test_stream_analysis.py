@@ -1,0 +1,135 @@
+"""An unknown stream's marker, length, type, grid and rate are found in its bytes, or nothing is proposed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from appliance.tools.stream_analysis import Proposal, Read, analyse, grids
+
+PERIOD_NS = 10_000_000
+
+
+def reads(frames: list[bytes], cut: int = 0) -> list[Read]:
+    """One read a frame, 10 ms apart; or reads of `cut` bytes, wherever frames begin."""
+    if not cut:
+        return [Read(i * PERIOD_NS, frame) for i, frame in enumerate(frames)]
+    data = b"".join(frames)
+    span = (len(frames) - 1) * PERIOD_NS
+    pieces = [data[i : i + cut] for i in range(0, len(data), cut)]
+    return [Read(round(i * span / (len(pieces) - 1)), piece) for i, piece in enumerate(pieces)]
+
+
+def matrix(seed: int, n: int, size: int, most: int) -> np.ndarray:
+    """Slow waves and noise [n, size], 0 to `most`, as pressure is."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n)[:, None]
+    waves = 0.5 + 0.4 * np.sin(t / rng.uniform(5, 30, size) + rng.uniform(0, 6, size))
+    return (waves * most * rng.uniform(0.2, 0.9, size) + rng.normal(0, most / 100, (n, size))).clip(0, most)
+
+
+def first(found: list[Proposal]) -> Proposal:
+    """The most likely proposal."""
+    assert found
+    return found[0]
+
+
+@pytest.mark.parametrize("cut", [0, 64, 333])
+def test_a_marker_and_bytes_however_reads_are_cut(cut: int) -> None:
+    """A marker and bytes however reads are cut."""
+    frames = [b"\xaa\x55" + frame.astype("u1").tobytes() for frame in matrix(1, 120, 512, 255)]
+    best = first(analyse(reads(frames, cut)))
+    assert (best.framing, best.mark, best.length, best.dtype, best.values) == ("marker", b"\xaa\x55", 514, "uint8", 512)
+    assert best.grids[0] == (16, 32, 1)
+    assert best.rate_hz == pytest.approx(100, rel=0.05)
+
+
+def test_an_untouched_skin_sends_zeros_and_they_are_not_taken_for_the_marker() -> None:
+    """An untouched skin sends zeros and they are not taken for the marker."""
+    touched = matrix(2, 80, 16, 200)
+    touched[:, :5] = 0
+    frames = [b"\xaa\x55" + frame.astype("u1").tobytes() for frame in touched]
+    assert (first(analyse(reads(frames))).mark, first(analyse(reads(frames))).values) == (b"\xaa\x55", 16)
+
+
+@pytest.mark.parametrize(("wire", "dtype"), [("<u2", "uint16"), (">u2", "uint16"), ("<i2", "int16"), (">i2", "int16")])
+def test_sixteen_bits_and_their_byte_order(wire: str, dtype: str) -> None:
+    """Sixteen bits and their byte order."""
+    values = matrix(3, 100, 24, 900) - (450 if "i" in wire else 0)
+    frames = [b"\x7e\x81" + frame.astype(wire).tobytes() for frame in values]
+    best = first(analyse(reads(frames)))
+    assert (best.dtype, best.big_endian, best.values) == (dtype, wire[0] == ">", 24)
+    assert best.grids[0] == (4, 6, 1)
+    assert (2, 4, 3) in best.grids
+
+
+def test_floats_with_a_trailer_where_reads_begin_with_a_frame() -> None:
+    """Floats with a trailer where reads begin with a frame."""
+    frames = [(frame - 300).astype("<f4").tobytes() + b"\r\n" for frame in matrix(4, 60, 20, 900)]
+    best = first(analyse(reads(frames)))
+    assert (best.framing, best.mark, best.length, best.dtype) == ("trailer", b"\r\n", 82, "float32")
+    assert best.values == 20
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_a_count_of_the_frames_behind_the_marker_is_no_taxel(size: int) -> None:
+    """A count of the frames behind the marker is no taxel."""
+    values = matrix(5, 600, 16, 200).astype("u1")
+    values[:, 0] = 0  # an untouched taxel, which could be the count's next byte
+    frames = [
+        b"\xa5\x5a" + (i % 256**size).to_bytes(size, "little") + frame.tobytes() for i, frame in enumerate(values)
+    ]
+    best = first(analyse(reads(frames)))
+    assert (best.mark, best.sequence, best.values) == (b"\xa5\x5a", f"uint{8 * size}", 16)
+
+
+def test_lost_and_foreign_bytes_do_not_hide_the_pattern() -> None:
+    """Lost and foreign bytes do not hide the pattern."""
+    frames = [b"\xaa\x55" + frame.astype("u1").tobytes() for frame in matrix(6, 200, 16, 255)]
+    frames[50], frames[90] = frames[50][:7], frames[90] + b"boot\n"
+    best = first(analyse(reads(frames, 64)))
+    assert (best.mark, best.length) == (b"\xaa\x55", 18)
+    assert 0.9 < best.share <= 1
+
+
+@pytest.mark.parametrize(
+    ("number", "dtype"), [(lambda v: f"{v:.0f}", "uint16"), (lambda v: f"{v - 100:.0f}", "int16"), (str, "float32")]
+)
+def test_lines_of_numbers_are_frames(number, dtype: str) -> None:
+    """Lines of numbers are frames."""
+    frames = [(",".join(number(float(v)) for v in frame) + "\n").encode() for frame in matrix(7, 50, 16, 200)]
+    best = first(analyse(reads(frames)))
+    assert (best.framing, best.length, best.values, best.dtype) == ("text", 1, 16, dtype)
+    assert best.grids[0] == (4, 4, 1)
+    assert best.rate_hz == pytest.approx(100, rel=0.1)
+
+
+def test_lines_that_a_shorter_one_ends_are_one_frame() -> None:
+    """Lines that a shorter one ends are one frame."""
+
+    def frame(values: np.ndarray) -> bytes:
+        """frame"""
+        return b"".join(" ".join(f"{v:.0f}" for v in row).encode() + b"\n" for row in values.reshape(16, 16)) + b"\n"
+
+    best = first(analyse(reads([frame(v) for v in matrix(8, 40, 256, 200)])))
+    assert (best.length, best.values, best.grids[0]) == (16, 256, (16, 16, 1))
+
+
+@pytest.mark.parametrize("data", [b"", b"\xaa\x55" * 3, bytes(4000), b"hello\nworld\n" * 40])
+def test_what_has_no_frames_gets_no_proposal(data: bytes) -> None:
+    """What has no frames gets no proposal."""
+    assert analyse([Read(0, data[:5]), Read(10**9, data[5:])]) == []
+
+
+def test_noise_gets_no_proposal() -> None:
+    """Noise gets no proposal."""
+    noise = np.random.default_rng(9).integers(0, 256, 20_000).astype("u1").tobytes()
+    assert analyse(reads([noise[i : i + 100] for i in range(0, 20_000, 100)])) == []
+
+
+def test_grids_are_the_squarest_first_and_fit_the_format() -> None:
+    """Grids are the squarest first and fit the format."""
+    assert grids(16)[0] == (4, 4, 1)
+    assert grids(45)[:1] == ((5, 9, 1),)
+    assert (3, 5, 3) in grids(45)
+    assert all(max(grid) <= 255 for grid in grids(1024))

@@ -1,0 +1,55 @@
+"""A real browser for the tests of pages, and a page as a person sees it in one."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+WAIT_S = 10
+
+
+@contextmanager
+def launched() -> Iterator[Any]:
+    """A browser of this system, else the one that playwright has installed; skips the test where there is none."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (make test installs it)")
+    with api.sync_playwright() as tool:
+        path = next(filter(None, map(shutil.which, BROWSERS)), tool.chromium.executable_path)
+        if not Path(path).exists():
+            pytest.skip("no browser: apt-get install chromium-headless-shell, or playwright install chromium")
+        one = tool.chromium.launch(executable_path=path)
+        yield one
+        one.close()
+
+
+def until(done: Callable[[], bool]) -> None:
+    """Wait for `done()`; fails after WAIT_S."""
+    end = time.monotonic() + WAIT_S
+    while not done():
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.02)
+
+
+class BrowsedPage:
+    """The page as a person sees it. errors: messages of the browser. requests: addresses that it asked for."""
+
+    def __init__(self, context: Any, address: str) -> None:
+        self.page, self.errors, self.requests = context.new_page(), [], []
+        self.page.on("console", lambda message: self.errors.append(message.text))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(address)
+
+    def state(self, wanted: str) -> None:
+        """Wait for this state of the page."""
+        until(lambda: self.page.evaluate("document.body.dataset.state") == wanted)
+
+    def text(self, where: str) -> str:
+        """The text of an element, with plain spaces."""
+        return str(self.page.inner_text(where)).replace("\xa0", " ")
