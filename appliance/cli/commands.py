@@ -26,7 +26,7 @@ from appliance.core.errors import ApplianceError, BundleError, ConfigError, Form
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
-from appliance.io import skins
+from appliance.io import skin_profile, skins
 from appliance.io.robot_link import Port
 from appliance.io.usb_sensor import fits
 from appliance.recording.capture import CaptureWriter
@@ -118,6 +118,8 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         recording = RecordingSession(folder, fmt, labels, devices.clock, _sentences(port), args.target)
         stack.callback(recording.close)
         log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:g} s")
+        if slow := skin_profile.warning(fmt):
+            log.warning(f"record: {slow}")
         status = _status(settings, {"model": lambda: "none: sweeps are recorded"})
         box = assembly.recorder(
             settings, fmt, devices, port, stack, capture=_capture(args, settings, fmt, stack),

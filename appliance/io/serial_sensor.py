@@ -110,7 +110,7 @@ class SerialSensor(LinkSensor):
         if sent.skin != wanted.skin or not able:
             rates = " or ".join(f"{rate:g}" for rate in self._profile.rates_hz or (sent.rate_hz,))
             raise SensorMismatch(
-                f"the profile {self._config.skin} sends {shown(sent.shape)} {sent.dtype} at {rates} Hz, the bundle wants "
+                f"the profile {self._config.skin} sends {shown(sent.shape)} {sent.dtype} at {rates} Hz, wanted is "
                 f"{wanted}; correct sensor.skin, sensor.grid or sensor.rate_hz, or deploy a bundle for this skin"
             )
 

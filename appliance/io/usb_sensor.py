@@ -357,7 +357,7 @@ class UsbSensor(LinkSensor):
             who, skin = ask(link)
             if not fits(skin, self._format):
                 raise SensorMismatch(
-                    f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, the bundle wants "
+                    f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, wanted is "
                     f"{self._format}; plug in the skin that it was trained for, or deploy a bundle for this one"
                 )
             link.request(packets.Request.START, 0)

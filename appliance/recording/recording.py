@@ -140,6 +140,7 @@ class RecordingSession(Observer):
         self._clock, self._say = clock, say
         # (valid from, labels): a command that comes during a sweep does not apply to it
         self._labels = deque([(0, labels)], MOST_CHANGES)
+        self._answered = False
         self._stored: list[tuple[int, Labels, Status]] = []
         self._log = TroubleLog("record")
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
@@ -154,6 +155,7 @@ class RecordingSession(Observer):
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and report the outcome in a REC sentence."""
+        self._answered = True
         labels = next((labels for since_ns, labels in reversed(self._labels) if since_ns <= sweep.start_ns), Labels())
         sweep = replace(sweep, material=labels.material, position=labels.position, session=labels.session)
         outcome, detail = "skipped", f"{verdict.status}"
@@ -167,8 +169,10 @@ class RecordingSession(Observer):
         )
 
     def close(self) -> None:
-        """Release the folder, and log how many sweeps were stored."""
+        """Release the folder, and log how many sweeps were stored, if there was one to store."""
         self._folder.close()
+        if not self._answered:
+            return
         log.info(f"record: sweeps of this run in {self._folder.folder}: {self.stored}; {self._progress.missing()}")
 
     def _count_earlier(self, fmt: SweepFormat) -> None:

@@ -185,7 +185,7 @@ def test_wrong_format_of_the_bundle(name: str):
     skin = WiredSkin(name, replace(p.format, rows=p.format.rows + 1))
     skin.seconds(0.3)
     assert skin.sensor.state == "mismatch"
-    assert "the bundle wants" in str(skin.sensor.trouble)
+    assert "wanted is" in str(skin.sensor.trouble)
     assert skin.port.sent == []
 
 
