@@ -31,7 +31,7 @@ def test_the_five_commands_of_the_page_make_a_bundle(
 ):
     """As they stand there, on simulated sweeps written as CSV: the sweeps come back, and most of the rest is named."""
     monkeypatch.chdir(tmp_path)
-    folder = csv_folder(tmp_path / "recordings", each=3)
+    folder = csv_folder(tmp_path / "recordings", each=3, positions=6)
     assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in PAGE
     commands = five()
     assert len(commands) == 5
@@ -40,17 +40,17 @@ def test_the_five_commands_of_the_page_make_a_bundle(
         assert main(args) == 0, capsys.readouterr()
     made = sets.load("build/mine.npz")
     samples, labels, position = skin.sweep_set("T-REAL", 5, 3)
-    expected = samples[(labels < 3) & (position < 4)]
-    assert len(made) == len(expected) == 36
+    expected = samples[(labels < 3) & (position < 6)]
+    assert len(made) == len(expected) == 54
     assert {s.tobytes() for s in made.samples} == {s.tobytes() for s in expected}
     out = capsys.readouterr().out
     assert "they helped to choose the model" in out
     assert "which no part of the fit has seen; after export: palpate-train score BUNDLE --set build/rest.npz\n" in out
     assert f"what it names of the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
     assert "left out: README.md: its name does not fit the pattern" in out
-    found = re.search(r"named rightly: (\d+) of 9: ", out)
+    found = re.search(r"named rightly: (\d+) of 18: ", out)
     assert found
-    assert int(found[1]) >= 6
+    assert int(found[1]) >= 12
 
 
 def test_a_broken_file_is_told_and_the_others_are_imported(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
