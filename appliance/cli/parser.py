@@ -156,6 +156,10 @@ def _local_commands(
 
 def _skin_commands(add: Callable[..., Any], devices: argparse.ArgumentParser) -> None:
     """The commands `palpate skin ...`."""
+    add("skin list", "all skin profiles, with what each skin lacks and whether it was measured")
+    detect = add("skin detect", "what is plugged in, and which profile fits; it only listens")
+    detect.add_argument("--port", default="", metavar="PATH", help="this port alone")
+    detect.add_argument("--write", action="store_true", help="with --port: also ask, and send commands for starting")
     check = add("skin check", "whether the skin's firmware keeps to PROTOCOL.md, part by part", devices)
     check.add_argument(
         "--seconds", type=_seconds, default=10.0, metavar="S",
@@ -170,6 +174,7 @@ def _skin_commands(add: Callable[..., Any], devices: argparse.ArgumentParser) ->
         command.set_defaults(sweeps=None)
     new = add("skin new", "listen to a skin that has no profile, propose one and write it; nothing is sent to it")
     new.add_argument("name", metavar="NAME", help="of the profile")
+    new.add_argument("--port", required=True, metavar="PATH", help="where it is; `palpate skin detect` lists the ports")
     new.add_argument(
         "--grid", metavar="RxC[xA]", help="rows, columns and axes; without it, proposals are printed alone"
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from functools import partial
 
@@ -16,7 +17,9 @@ from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.errors import ConfigError
 from appliance.core.log import log
-from appliance.io import skin_profile, skins
+from appliance.io import serial_port, skin_profile, skins
+from appliance.io.serial_port import PortInfo
+from appliance.io.skin_profile import DEFAULT, SkinProfile
 
 
 def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
@@ -31,6 +34,57 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
             failed += found.verdict == "FAIL"
     return 1 if failed else 0
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """`palpate skin list`: all profiles, one line each; 1 where one cannot be read."""
+    from appliance.tools import skin_detect
+
+    broken = 0
+    for name, profile in _profiles(load_settings(args)):
+        broken += isinstance(profile, ConfigError)
+        print(f"{name:<14} {profile}" if isinstance(profile, ConfigError) else skin_detect.listed(name, profile))
+    return 1 if broken else 0
+
+
+def run_detect(args: argparse.Namespace) -> int:
+    """`palpate skin detect`: what is plugged in, and which profile fits; 1 where none does."""
+    from appliance.io.serial_link import SerialLink
+    from appliance.tools import skin_detect
+
+    if args.write and not args.port:
+        raise ConfigError("--write writes commands to a port, so it has to be named: add --port /dev/...")
+    settings, clock = load_settings(args), SystemClock()
+    profiles = {name: p for name, p in _profiles(settings) if not isinstance(p, ConfigError)}
+    there = serial_port.ports()
+    if args.port:
+        there = [port for port in there if port.path == args.port] or [PortInfo(args.port)]
+    # a port that is soldered on may lead to the robot, or to nothing: only the named one is opened
+    usb = [port for port in there if port.vendor_id or args.port]
+    found = 0
+    for line in skin_detect.on_usb(settings.sensor):
+        print(line, flush=True)
+        found += 1
+    for one in skin_detect.detect(
+        usb, profiles, lambda path, baud: SerialLink(path, baud, clock), clock,
+        write=args.write, seconds=skin_detect.LISTEN_S,
+    ):  # fmt: skip
+        print(f"{one.port}: {one.profile or 'no profile fits'}: {one.detail}", flush=True)
+        found += bool(one.profile)
+    if not found and not usb:
+        others = ", ".join(port.path for port in there) or "none"
+        print(f"no skin on USB; plug it in, or name another port with --port (there are: {others})")
+    return 0 if found else 1
+
+
+def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError]]:
+    """All profiles by name; the error of one that cannot be read."""
+    folders = skins.folders(settings)
+    for name in sorted({DEFAULT, *skin_profile.names(folders)}):
+        try:
+            yield name, skin_profile.load(name, folders)
+        except ConfigError as e:
+            yield name, e
 
 
 def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
@@ -56,13 +110,12 @@ def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
 
 def run_new(args: argparse.Namespace) -> int:
     """`palpate skin new`: listens to a port, and writes a profile where the grid is named; else says how it can be."""
-    from appliance.io import serial_port
     from appliance.io.serial_link import SerialLink
     from appliance.tools import skin_new
 
     settings = load_settings(args)
     path = (args.out or skins.OWN) / f"{_new_name(args, settings)}.toml"
-    port, clock = settings.sensor.port, SystemClock()
+    port, clock = args.port, SystemClock()
     bauds = (settings.sensor.baud,) if settings.sensor.baud else skin_new.BAUDS
     heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, args.seconds, clock)
     for number, proposal in enumerate(heard.proposals, 1):
@@ -71,7 +124,7 @@ def run_new(args: argparse.Namespace) -> int:
         print(f"at {heard.baud} baud; give the same command with --grid, and --proposal if the first is not right")
         return 0
     chosen, grid = skin_new.choose(heard, args.grid, args.proposal or 0)
-    there = next((one for one in serial_port.ports() if one.path == port), serial_port.PortInfo(port))
+    there = next((one for one in serial_port.ports() if one.path == port), PortInfo(port))
     text = skin_new.profile(chosen, grid, heard.baud, there)
     frames, garbage = skin_new.decoded(text, heard.reads)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,19 +136,15 @@ def run_new(args: argparse.Namespace) -> int:
 
 
 def _new_name(args: argparse.Namespace, settings: Config) -> str:
-    """The name of the new profile. Raises ConfigError where it cannot be used, or no port is named."""
+    """The name of the new profile. Raises ConfigError where it cannot be used."""
     name: str = args.name
     if not skin_profile.NAME.fullmatch(name):
         raise ConfigError(f"{name!r} cannot name a profile; use up to 32 small letters, digits and hyphens")
     folders = [args.out] if args.out else skins.folders(settings)
     if name in skin_profile.names(folders) and not args.replace:
         raise ConfigError(f"there is a profile {name} already; take another name, or --replace")
-    if not settings.sensor.port:
-        raise ConfigError(
-            "no port is named; use --set sensor.port=/dev/serial/by-id/..., `palpate skin detect` lists them"
-        )
     return name
 
 
 WITH_DEVICES = {"skin check": run_check, "skin show": run_show}
-RUNS = {"skin new": run_new}
+RUNS = {"skin list": run_list, "skin detect": run_detect, "skin new": run_new}

@@ -16,7 +16,7 @@ from typing import Literal
 
 from appliance.core.clock import Clock, DeviceClock
 from appliance.core.errors import FormatError, SensorError, SensorMismatch, SensorOverflow
-from appliance.core.types import SweepFormat
+from appliance.core.types import SweepFormat, shown
 from appliance.io import packets
 from appliance.io.link import SkinLink
 from appliance.io.packets import Packet, Request, SkinFormat
@@ -259,10 +259,9 @@ def _stream(heard: Reception, form: SkinFormat) -> Iterator[PartResult]:
 
 def _packets(heard: Reception, form: SkinFormat) -> PartResult:
     """Whether packets are as FORMAT has announced them."""
-    shape = (form.rows, form.cols) if form.axes == 1 else (form.rows, form.cols, form.axes)
     for _, p in heard.packets:
-        if p.taxels.shape[1:] != shape or p.taxels.dtype != _sweep_format(form).numpy_type:
-            sent = f"{'x'.join(map(str, p.taxels.shape[1:]))} {p.taxels.dtype}"
+        if p.taxels.shape[1:] != form.shape or p.taxels.dtype != _sweep_format(form).numpy_type:
+            sent = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
             return PartResult(
                 "packets", "FAIL", f"it sends {sent}, FORMAT says otherwise; bytes 8 to 11 must be those of FORMAT"
             )

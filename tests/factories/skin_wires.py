@@ -18,6 +18,7 @@ from appliance.io import skin_profile
 from appliance.io.serial_port import PortInfo
 from appliance.io.serial_sensor import SerialSensor
 from appliance.io.skin_profile import SkinProfile
+from appliance.io.usb_sensor import TransferObserver
 from appliance.sim.rig import VirtualClock
 from tests.factories.paths import ROOT
 
@@ -196,15 +197,18 @@ class WirePort:
 class WiredSkin:
     """A sensor on a skin of a delivered profile, in virtual time."""
 
-    def __init__(self, name: str, fmt: SweepFormat | None = None, *, rate: float = 1.0, **settings: object) -> None:
-        self.name, self.profile, self.clock = name, profile(name), VirtualClock()
+    def __init__(
+        self, name: str, fmt: SweepFormat | None = None, *, rate: float = 1.0, clock: VirtualClock | None = None,
+        tap: TransferObserver | None = None, **settings: object,
+    ) -> None:  # fmt: skip
+        self.name, self.profile, self.clock = name, profile(name), clock or VirtualClock()
         self.format = fmt or self.profile.format
         period_ns = self.profile.format.period_ns / rate
         self.port = WirePort(self.clock, lambda i: wire(name, i, period_ns), period_ns)
         config = SensorConfig(skin=name, port=PATH, **{"retry_ms": 50} | settings)  # type: ignore[arg-type]
         adapted = skin_profile.adapted(self.profile, config)
         self.sensor = SerialSensor(
-            config, adapted, self.format, self.clock, open_port=self.port.open, ports=self.port.ports
+            config, adapted, self.format, self.clock, tap, open_port=self.port.open, ports=self.port.ports
         )
         self.states: list[str] = []
         self.troubles: list[str] = []

@@ -99,34 +99,33 @@ def _beginning(layout: FixedLayout, data: bytes, at: int) -> tuple[int, int, boo
     """Where frames begin at or after `at`, the bytes before it, and whether that is certain.
 
     A mark may occur among the numbers, in every frame at the same place as long as the skin is at rest. So a beginning
-    is certain once two periods have followed it, and no other place within the first has been followed as well.
+    is certain once two periods have followed it, and marks go on there for longer than anywhere else in the period.
     """
-    mark, period, begun = layout.mark, layout.period, at
-    while (at := data.find(mark, at)) >= 0:
-        have = (len(data) - len(mark) - at) // period  # whole periods that follow
-        if not _repeats(layout, data, at, have):
+    begun = at
+    while (at := data.find(layout.mark, at)) >= 0:
+        run, ended = _run(layout, data, at)
+        if run < 2 and ended:
             at += 1
             continue
-        if have < 2:
+        if run < 2:
             return at, at - begun, False
-        if not _rivals(layout, data, at):
+        rivals = [_run(layout, data, other) for other in _others(layout, data, at)]
+        best, best_ended = max(rivals, key=lambda rival: (not rival[1], rival[0]), default=(0, True))
+        if (not ended, run) > (not best_ended, best) and (ended or best_ended):
             return at, at - begun, True
-        if have < AMBIGUOUS_FRAMES:
+        if ended:  # elsewhere marks go on for longer, or nobody can tell these frames
+            at += 1 if (not best_ended, best) > (False, run) else layout.period
+        elif run < AMBIGUOUS_FRAMES:
             return at, at - begun, False
-        at += period
-    kept = max(begun, len(data) - len(mark) + 1)
+        else:
+            at += layout.period
+    kept = max(begun, len(data) - len(layout.mark) + 1)
     return kept, kept - begun, False
 
 
-def _repeats(layout: FixedLayout, data: bytes, at: int, periods: int) -> bool:
-    return all(data.startswith(layout.mark, at + i * layout.period) for i in range(1, periods + 1))
-
-
-def _rivals(layout: FixedLayout, data: bytes, at: int) -> bool:
-    """Whether frames may as well begin elsewhere in the period after `at`."""
-    other = at
+def _others(layout: FixedLayout, data: bytes, at: int) -> list[int]:
+    """Other places in the period after `at` with a mark."""
+    found, other = [], at
     while 0 <= (other := data.find(layout.mark, other + 1)) < at + layout.period:
-        have = (len(data) - len(layout.mark) - other) // layout.period
-        if _repeats(layout, data, other, have):
-            return True
-    return False
+        found.append(other)
+    return found

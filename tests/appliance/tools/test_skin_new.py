@@ -135,7 +135,7 @@ def test_emulated_skins_are_described_and_read_again(
     """The command, on the terminal of an emulated skin: without --grid it proposes, with it the profile is written."""
     with played(name) as player:
         common = ["skin", "new", "mine", "--seconds", "2", "--out", str(tmp_path)]
-        common += ["--set", f"sensor.port={player.path}", "--set", "sensor.baud=115200"]
+        common += ["--port", str(player.path), "--set", "sensor.baud=115200"]
         assert main(common) == 0
         assert not list(tmp_path.iterdir())
         first = capsys.readouterr().out.splitlines()[0]
@@ -156,10 +156,9 @@ def test_emulated_skins_are_described_and_read_again(
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (["Mine"], "'Mine' cannot name a profile"),
-        (["mine"], "no port is named"),
-        (["matrix", "--set", "sensor.port=/dev/null"], "there is a profile matrix already"),
-        (["mine", "--set", "sensor.port=/dev/no-such-port", "--grid", "4x4"], "no port /dev/no-such-port"),
+        (["Mine", "--port", "p"], "'Mine' cannot name a profile"),
+        (["matrix", "--port", "/dev/null"], "there is a profile matrix already"),
+        (["mine", "--port", "/dev/no-such-port", "--grid", "4x4"], "no port /dev/no-such-port"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(options: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,6 +172,6 @@ def test_clock_of_the_command_is_the_systems() -> None:
     clock = SystemClock()
     begun = clock.now_ns()
     with played("flexitac", paced=False) as player:
-        assert main(["skin", "new", "mine", "--seconds", "1", "--set", f"sensor.port={player.path}",
+        assert main(["skin", "new", "mine", "--seconds", "1", "--port", str(player.path),
                      "--set", "sensor.baud=115200"]) == 0  # fmt: skip
     assert clock.now_ns() - begun < 60_000_000_000

@@ -1,0 +1,213 @@
+"""Which skins are plugged in (`palpate skin detect`), and all profiles in lines (`palpate skin list`).
+
+In: ports, profiles. Out: what was found on each port: ids first, then by listening. Nothing is written to a port that was
+not named for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from appliance.core.clock import Clock
+from appliance.core.config import SensorConfig
+from appliance.core.errors import FormatError, SensorError
+from appliance.core.types import SweepFormat, shown
+from appliance.io import packets, skin_codecs
+from appliance.io.link import reply_to
+from appliance.io.serial_port import PortInfo
+from appliance.io.serial_sensor import BytePort
+from appliance.io.skin_codecs import Rest
+from appliance.io.skin_profile import DEFAULT, SkinProfile
+
+LISTEN_S = 2.0
+"""How long each speed of a port is listened to: 56 frames of the slowest skin."""
+FITS = 0.9
+"""Share of the bytes that must be in frames of a profile."""
+FEWEST = 4
+"""Frames that are no chance any more."""
+SAME_RATE = 0.02
+"""A measured rate that differs by less from the profile's needs no setting."""
+OpenPort = Callable[[str, int], BytePort]
+
+
+@dataclass(frozen=True, slots=True)
+class PortFinding:
+    """What is on a port. profile: its name, "" where none fits. detail: how that is known, and what to set or do."""
+
+    port: PortInfo
+    profile: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class HeardBytes:
+    """What came from a port. reads: (bytes, when it came in ns)."""
+
+    reads: list[tuple[bytes, int]]
+
+    @property
+    def data(self) -> bytes:
+        """All of it."""
+        return b"".join(data for data, _ in self.reads)
+
+
+def listed(name: str, profile: SkinProfile) -> str:
+    """A profile in a line: what it is, what it lacks, whether anybody has compared it with a device."""
+    form = "as its board says" if profile.codec == DEFAULT else form_of(profile.format)
+    lacks = f"lacks {', '.join(profile.lacks)}" if profile.lacks else "lacks nothing"
+    measured = f"measured: {profile.measured}" if profile.measured else "not measured on a device"
+    return f"{name:<14} {profile.about}; {form}; {lacks}; {measured}"
+
+
+def form_of(fmt: SweepFormat) -> str:
+    """Shape, type and rate for a person."""
+    return f"{shown(fmt.shape)} {fmt.dtype} at {fmt.rate_hz:g} Hz"
+
+
+def detect(
+    ports: Iterable[PortInfo], profiles: Mapping[str, SkinProfile], open_port: OpenPort, clock: Clock, *,
+    write: bool = False, seconds: float = LISTEN_S,
+) -> Iterator[PortFinding]:  # fmt: skip
+    """What is on each of the ports. profiles: as the settings have them. write: also ask, and send start commands."""
+    for port in ports:
+        try:
+            yield from _on_port(port, profiles, open_port, clock, write, seconds)
+        except SensorError as e:
+            yield PortFinding(port, "", str(e))
+
+
+def _on_port(
+    port: PortInfo, profiles: Mapping[str, SkinProfile], open_port: OpenPort, clock: Clock, write: bool, seconds: float
+) -> Iterator[PortFinding]:
+    by_ids = [name for name, p in profiles.items() if (port.vendor_id, port.product_id) in p.ids]
+    known = f"ids as {', '.join(by_ids)}; " if by_ids else ""
+    others = {name: p for name, p in profiles.items() if p.codec != DEFAULT}
+    heard: dict[int, HeardBytes] = {}
+    # those with its ids first; one speed after the other, each for all profiles that have it
+    for baud in dict.fromkeys(others[name].baud for name in sorted(others, key=lambda n: n not in by_ids)):
+        these = {name: p for name, p in others.items() if p.baud == baud}
+        for starter in [None, *(n for n in these if write and these[n].start)]:
+            heard[baud] = listen(port.path, baud, these[starter] if starter else None, open_port, clock, seconds)
+            fitting = [n for n in these if fits(these[n], heard[baud])]
+            if fitting:
+                yield PortFinding(port, fitting[0], known + _settings(port, fitting, these, heard[baud]))
+                return
+    for name, p in others.items():
+        if taxels := other_grid(p, heard[p.baud]):
+            grid = f"the marks of {name}, but {taxels} taxels a frame; set sensor.grid to their rows x columns"
+            yield PortFinding(port, name, f'{known}{grid}, sensor.skin = "{name}", sensor.port = "{port.path}"')
+            return
+    if write and (who := _asked(port.path, open_port, clock)):
+        yield PortFinding(port, DEFAULT, f'{known}{who}; set sensor.link = "serial", sensor.port = "{port.path}"')
+        return
+    yield PortFinding(port, "", known + _nothing(max(len(one.data) for one in heard.values()), others, write))
+
+
+def listen(
+    path: str, baud: int, starter: SkinProfile | None, open_port: OpenPort, clock: Clock, seconds: float
+) -> HeardBytes:
+    """What comes from a port at this speed. starter: whose start and stop commands are written. Raises SensorError."""
+    port = open_port(path, baud)
+    reads: list[tuple[bytes, int]] = []
+    try:
+        for command in starter.commands(starter.start, starter.rate_hz) if starter else ():
+            port.write(command)
+        until_ns = clock.now_ns() + round(seconds * 1e9)
+        while (left_ns := until_ns - clock.now_ns()) > 0:
+            if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
+                reads.append((data, clock.now_ns()))
+    finally:
+        with contextlib.suppress(SensorError):
+            for command in starter.commands(starter.stop, starter.rate_hz) if starter else ():
+                port.write(command)
+        port.close()
+    return HeardBytes(reads)
+
+
+def fits(profile: SkinProfile, heard: HeardBytes) -> bool:
+    """Whether nearly all that was heard is frames of a profile."""
+    found = skin_codecs.codec(profile)(Rest(), heard.data)
+    # the first frame was under way when the port was opened, the last one when it was closed
+    most = len(heard.data) - len(found.rest.data) - found.size
+    return len(found) >= FEWEST and len(found) * found.size >= FITS * most
+
+
+def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
+    """Frames per second of what was heard, from the arrivals of the first and the last frame; 0 for fewer than two."""
+    codec, rest, seen = skin_codecs.codec(profile), Rest(), []
+    for data, t_ns in heard.reads:
+        found = codec(rest, data)
+        rest = found.rest
+        if len(found):
+            seen.append((len(found), t_ns))
+    if len(seen) < 2:
+        return 0.0
+    return sum(n for n, _ in seen[1:]) * 1e9 / (seen[-1][1] - seen[0][1])
+
+
+def _settings(port: PortInfo, fitting: list[str], profiles: Mapping[str, SkinProfile], heard: HeardBytes) -> str:
+    """What was measured, and what to set."""
+    profile = profiles[fitting[0]]
+    hz = measured_hz(profile, heard)
+    sets = [f'sensor.skin = "{fitting[0]}"', f'sensor.port = "{port.path}"']
+    if hz and not profile.rates_hz and abs(hz / profile.rate_hz - 1) > SAME_RATE:
+        sets.append(f"sensor.rate_hz = {hz:.1f}")
+    more = f" (and as {', '.join(fitting[1:])})" if len(fitting) > 1 else ""
+    form = replace(profile.format, rate_hz=round(hz, 1)) if hz else profile.format
+    return f"sends {form_of(form)}{more}; set {', '.join(sets)}"
+
+
+def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
+    """A board of PROTOCOL.md that answers, "" if none does."""
+    port = open_port(path, SkinProfile().baud)
+    try:
+        port.write(bytes([packets.Request.IDENTITY]))
+        who = packets.unpack_identity(reply_to(packets.Request.IDENTITY, port.read, clock))
+        return f"board {who.board} {who.serial} speaks PROTOCOL.md, version {who.protocol}"
+    except (SensorError, FormatError):
+        return ""
+    finally:
+        port.close()
+
+
+def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool) -> str:
+    """Why no profile fits, and what to do."""
+    if heard:
+        return (
+            f"sends {heard} bytes, but no frames of a profile; try sensor.grid, or describe it with `palpate skin new`"
+        )
+    if write:
+        return "sends nothing and answers nothing"
+    asking = ", ".join(name for name, p in profiles.items() if p.start)
+    return f"sends nothing unasked; {asking} and boards of PROTOCOL.md may have to be asked: add --write --port with its path"
+
+
+def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
+    """Taxels in a frame of a profile with marks, as the distance between marks in what was heard tells; 0 if it does not."""
+    mark, data = profile.trailer + profile.marker, heard.data
+    places = [at for at in range(len(data)) if mark and data.startswith(mark, at)]
+    steps = Counter(later - at for at, later in pairwise(places))
+    if not steps:
+        return 0
+    (step, times), size = steps.most_common(1)[0], SweepFormat(1, 1, 1, 1, profile.number).numpy_type.itemsize
+    each = size * profile.values
+    whole = times >= FEWEST and times * step >= FITS * (len(data) - 2 * step) and (step - len(mark)) % each == 0
+    return (step - len(mark)) // each if whole else 0
+
+
+def on_usb(config: SensorConfig) -> list[str]:
+    """A line for each board of PROTOCOL.md on USB with the configured ids; it is not opened."""
+    import usb.core
+
+    try:
+        found = list(usb.core.find(True, idVendor=config.vendor_id, idProduct=config.product_id))
+    except usb.core.NoBackendError:
+        return []
+    ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
+    return [
+        f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: has the ids of sensor.vendor_id and product_id" for d in found
+    ]

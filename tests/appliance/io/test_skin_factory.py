@@ -1,0 +1,105 @@
+"""The factory: which sensor a profile gets, the form of its sweeps, and a real terminal with an emulated skin."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+
+from appliance.core import config
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
+from appliance.core.errors import ConfigError
+from appliance.core.types import SweepFormat
+from appliance.io import skins
+from appliance.io.serial_sensor import SerialSensor
+from appliance.io.usb_sensor import UsbSensor
+from appliance.sim import skin
+from appliance.tools import pseudo_terminal
+from tests.factories.paths import NO_SITE
+from tests.factories.simulated_box import idle_devices
+from tests.factories.skin_wires import NAMES, profile, taxels, wire
+
+
+def settings(*sets: str) -> Config:
+    """The delivered settings with these."""
+    return config.load(None, sets, site=NO_SITE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_profile_has_its_sensor_and_form(name: str):
+    """Skins of other protocols are read from a serial port; the form is the profile's, without asking anything."""
+    simulated = idle_devices()
+    chosen = settings(f"sensor.skin={name}")
+    assert skins.announced(chosen, simulated) == profile(name).format
+    assert isinstance(skins.sensor(chosen, profile(name).format, simulated), SerialSensor)
+
+
+def test_the_protocol_has_the_old_sensor():
+    """palpate is read as before, and its board is asked for the form."""
+    simulated = idle_devices()
+    chosen = simulated.wire(settings("sensor.skin=flexitac", "sensor.grid=3x3"))
+    assert isinstance(skins.sensor(chosen, skin.FORMAT, simulated), UsbSensor)
+    assert skins.announced(chosen, simulated) == skin.FORMAT
+
+
+def test_a_rate_that_can_be_set_is_that_of_the_bundle():
+    """A bundle for 250 Hz sets a skin that can do that; another rate is not promised."""
+    simulated, chosen = idle_devices(), settings("sensor.skin=papillarray")
+    wanted = SweepFormat(3, 3, 250, 500, "float32", 3)
+    assert skins.announced(chosen, simulated, wanted) == wanted
+    assert skins.announced(chosen, simulated, replace(wanted, rate_hz=300)).rate_hz == 1000
+
+
+def test_a_wrong_profile_is_named():
+    """Nothing is guessed."""
+    with pytest.raises(ConfigError, match="did you mean flexitac"):
+        skins.sensor(settings("sensor.skin=flexitak"), skin.FORMAT, idle_devices())
+
+
+@pytest.fixture
+def playing() -> Iterator[str]:
+    """Path of a terminal on which a FlexiTac sends frame after frame, as fast as they are read."""
+    with pseudo_terminal.pair() as (far, path):
+        ended = threading.Event()
+
+        def play() -> None:
+            rest, i = b"", 0
+            while not ended.is_set():
+                if not rest:
+                    rest, i = wire("flexitac", i), i + 1
+                try:
+                    rest = rest[os.write(far, rest) :]
+                except BlockingIOError:
+                    ended.wait(0.001)
+                else:
+                    ended.wait(0.01 if not rest else 0)
+
+        thread = threading.Thread(target=play)
+        thread.start()
+        yield path
+        ended.set()
+        thread.join()
+
+
+def test_on_a_real_terminal(playing: str):
+    """The real pyserial on a real terminal: frames as they were sent; the port is free again after that."""
+    clock = SystemClock()
+    chosen = settings("sensor.skin=flexitac", f"sensor.port={playing}")
+    known = {taxels(profile("flexitac"), i).tobytes() for i in range(199)}
+    for _ in range(2):
+        with closing(skins.sensor(chosen, profile("flexitac").format, Devices(clock, None))) as sensor:
+            end_ns, n = clock.now_ns() + 20_000_000_000, 0
+            while n < 50:
+                assert clock.now_ns() < end_ns, f"{sensor.state}: {sensor.trouble}"
+                frames = sensor.read()
+                assert all(one.tobytes() in known for one in frames.taxels)
+                n += len(frames)
+            assert sensor.identity
+            assert sensor.identity.board == "flexitac"
+            assert not sensor.loss_known
