@@ -38,9 +38,13 @@ def sensor(settings: Config, fmt: SweepFormat, devices: Devices, tap: TransferOb
     if chosen.codec == "palpate":
         return UsbSensor(_config(settings, chosen), fmt, devices.clock, devices.backend, tap)
     # boxes with a board of PROTOCOL.md do without these modules
+    from appliance.io.serial_link import SerialLink
     from appliance.io.serial_sensor import SerialSensor
 
-    return SerialSensor(settings.sensor, chosen, fmt, devices.clock, tap)
+    def opened(path: str, baud: int) -> SerialLink:
+        return SerialLink(path, baud, devices.clock, wait=devices.wait)
+
+    return SerialSensor(settings.sensor, chosen, fmt, devices.clock, tap, open_port=opened)
 
 
 def open_board(settings: Config, devices: Devices) -> SkinLink:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -96,36 +97,37 @@ def _run(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:
 
 
 def _beginning(layout: FixedLayout, data: bytes, at: int) -> tuple[int, int, bool]:
-    """Where frames begin at or after `at`, the bytes before it, and whether that is certain.
-
-    A mark may occur among the numbers, in every frame at the same place as long as the skin is at rest. So a beginning
-    is certain once two periods have followed it, and marks go on there for longer than anywhere else in the period.
-    """
+    """Where frames begin at or after `at`, the bytes before it, and whether that is certain."""
     begun = at
     while (at := data.find(layout.mark, at)) >= 0:
-        run, ended = _run(layout, data, at)
-        if run < 2 and ended:
-            at += 1
-            continue
-        if run < 2:
-            return at, at - begun, False
-        rivals = [_run(layout, data, other) for other in _others(layout, data, at)]
-        best, best_ended = max(rivals, key=lambda rival: (not rival[1], rival[0]), default=(0, True))
-        if (not ended, run) > (not best_ended, best) and (ended or best_ended):
-            return at, at - begun, True
-        if ended:  # elsewhere marks go on for longer, or nobody can tell these frames
-            at += 1 if (not best_ended, best) > (False, run) else layout.period
-        elif run < AMBIGUOUS_FRAMES:
-            return at, at - begun, False
-        else:
-            at += layout.period
+        certain = _begins(layout, data, at)
+        if certain is not False:
+            return at, at - begun, bool(certain)
+        at += 1
     kept = max(begun, len(data) - len(layout.mark) + 1)
     return kept, kept - begun, False
 
 
-def _others(layout: FixedLayout, data: bytes, at: int) -> list[int]:
-    """Other places in the period after `at` with a mark."""
-    found, other = [], at
-    while 0 <= (other := data.find(layout.mark, other + 1)) < at + layout.period:
-        found.append(other)
-    return found
+def _begins(layout: FixedLayout, data: bytes, at: int) -> bool | None:
+    """Whether frames begin with the mark at `at`; None as long as more bytes are needed to tell.
+
+    A mark may occur among the numbers, in every frame at the same place as long as the skin is at rest. So a beginning
+    is certain once two periods have followed it, and no other place within the first is followed for as long. The
+    answer does not depend on how many bytes have come beyond those that it needs.
+    """
+    mark, period, rivals = layout.mark, layout.period, [at]
+    for i in range(1, AMBIGUOUS_FRAMES + 1):
+        if (end := at + i * period) + len(mark) > len(data):
+            return None
+        if not data.startswith(mark, end):
+            return False
+        if i == 1:
+            rivals = [
+                at + 1 + m.start() for m in re.finditer(b"(?=%b)" % re.escape(mark), data[at + 1 : end + len(mark) - 1])
+            ]
+        if rivals and rivals[-1] + i * period + len(mark) > len(data):
+            return None
+        rivals = [other for other in rivals if data.startswith(mark, other + i * period)]
+        if i >= 2 and not rivals:
+            return True
+    return False

@@ -15,6 +15,8 @@ _BETWEEN = bytes.maketrans(b",;\t", b"   ")
 _WHOLE = re.compile(rb"[+-]?[0-9]{1,9}")
 _DECIMAL = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?|(?i:nan)")
 
+_MOST_FLOAT = float(np.finfo(np.float32).max)
+
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """Numbers between spaces, commas, semicolons or tabs; a line is a frame, or a row of one that a shorter line ends."""
@@ -56,7 +58,8 @@ def _numbers(profile: SkinProfile, line: bytes, most: int) -> NDArray[Any] | Non
     if profile.number == "float32":
         if not all(map(_DECIMAL.fullmatch, words)):
             return None
-        return np.array([float(word) for word in words], np.float32)
+        numbers = np.array([float(word) for word in words])
+        return None if (np.abs(numbers) > _MOST_FLOAT).any() else numbers.astype(np.float32)
     if not all(map(_WHOLE.fullmatch, words)):
         return None
     values = [int(word) for word in words]
