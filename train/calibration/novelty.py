@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.covariance import ledoit_wolf
 
 from appliance.bundle.bundle import Classes
 from appliance.core.errors import FormatError
@@ -121,10 +121,22 @@ def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embed
 
 def _whitening(x: Array, labels: Array) -> tuple[Array, Array]:
     """The inverse root of the covariance within materials and the root itself, symmetric [F, F] both."""
-    lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", store_covariance=True).fit(x, labels)
-    variances, directions = np.linalg.eigh(lda.covariance_)
+    variances, directions = np.linalg.eigh(_covariance(x, labels))
     spread = np.sqrt(np.maximum(variances, max(FLAT * float(variances.max()), FLAT)))
     return (directions / spread) @ directions.T, (directions * spread) @ directions.T
+
+
+def _covariance(x: Array, labels: Array) -> Array:
+    """Within materials [F, F], as LinearDiscriminantAnalysis(shrinkage="auto") has it, which also solves equations of it:
+    Ledoit and Wolf's of each material's features, scaled to the same spread, and their mean, each as often as it occurs."""
+    total = np.zeros((x.shape[1],) * 2)
+    for label in np.unique(labels):
+        own = x[labels == label]
+        spread = own.std(axis=0)
+        spread[spread <= 10 * np.finfo(float).eps * np.abs(own).max(axis=0)] = 1
+        shrunk = ledoit_wolf((own - own.mean(axis=0)) / spread)[0]
+        total += len(own) / len(x) * spread[:, None] * shrunk * spread
+    return total
 
 
 def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Array, Array]]:

@@ -6,7 +6,7 @@ import argparse
 import json
 import shlex
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,14 @@ from train.calibration.posthoc import calibrate
 from train.cli import options
 from train.cli.options import Add
 from train.data import labels
-from train.data.sets import Dataset
+from train.data.sets import Dataset, digest
+from train.evaluation.evaluate import CACHE
+from train.evaluation.fold import fingerprint
 from train.export import bundle_score, measure, pack, quantized_bundle, sign
 from train.models import methods
 from train.models.compact import recipe
 from train.models.compact.architectures import ARCHITECTURES
-from train.models.compact.augment import default_augmentation
+from train.models.compact.augment import Augmentation, default_augmentation
 from train.models.compact.fitted import Fit
 
 STEPS = recipe.Settings().steps
@@ -143,9 +145,10 @@ def run_fit(args: argparse.Namespace) -> None:
         sweeps, rest = sweeps.split(by, share, args.seed)
     if args.rest and rest:
         rest.save(args.rest)
-    made = _fitted(args, sweeps)
+    made, unfinished = _fitted(args, sweeps)
     made = replace(made, about=made.about | ({"rest": str(args.rest)} if args.rest else {}))
     made.save(args.out)
+    unfinished.unlink(missing_ok=True)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
     _print_held_out(made)
     if args.rest and rest:
@@ -153,11 +156,15 @@ def run_fit(args: argparse.Namespace) -> None:
         print(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; after export: {command}")
 
 
-def _fitted(args: argparse.Namespace, sweeps: Dataset) -> Fit:
-    """The fit that the options ask for. Raises FormatError where they contradict one another."""
+def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
+    """The fit that the options ask for, and the file that keeps its training until it is written.
+
+    Raises FormatError where they contradict one another.
+    """
     changes = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
     architecture = ARCHITECTURES.get(args.size, recipe.FIXED)
     augmentation = replace(default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes)
+    unfinished = _unfinished(args, sweeps, augmentation)
     if args.size in ARCHITECTURES:
         if args.steps < LEAST_STEPS:
             raise FormatError(
@@ -166,14 +173,21 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> Fit:
         from train.models.compact import fit  # here: the default recipe needs no PyTorch
 
         trained = fit.FitRecipe(steps=args.steps, augmentation=augmentation, keep_means=args.keep_means)
-        return fit.fit(sweeps, args.seed, trained, options.Log(), architecture)
+        return fit.fit(sweeps, args.seed, trained, options.Log(), architecture, unfinished), unfinished
     if args.keep_means:
         raise FormatError(
             f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default recipe removes means"
         )
-    made = recipe.fit(sweeps, args.seed, recipe.Settings(args.steps, augmentation), options.Log())
+    settings = recipe.Settings(args.steps, augmentation, unfinished=unfinished)
+    made = recipe.fit(sweeps, args.seed, settings, options.Log())
     print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
-    return made
+    return made, unfinished
+
+
+def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augmentation) -> Path:
+    """Where a training is kept until the fit is written: its name is a fingerprint of all that it depends on."""
+    about = [digest(sweeps), args.seed, args.size, args.steps, asdict(augmentation)]
+    return CACHE / f"{fingerprint(about, 'train.models.compact.recipe', 'train.models.compact.fit')}.pt"
 
 
 def _print_held_out(made: Fit) -> None:

@@ -17,8 +17,9 @@ from torch import Generator
 
 from appliance.core.storage import put
 
-EVERY_S = 180.0
-"""How often an unfinished training is written; the paper's CNN takes 250 MB and half a second each time."""
+EVERY_S, WRITING = 10.0, 0.003
+"""How often an unfinished training is written, and the share of the time that writing may take: the paper's CNN takes
+250 MB and half a second each time."""
 
 
 class Stateful(Protocol):
@@ -41,7 +42,7 @@ class Checkpoint:
 
     def __init__(self, path: Path | None, parts: Mapping[str, Stateful], generators: Sequence[Generator]) -> None:
         self._path, self._parts, self._generators = path, parts, generators
-        self._written = time.monotonic()
+        self._next = time.monotonic() + wait(0.0)
 
     def load(self) -> list[tuple[int, float]]:
         """Bring all parts and generators to the state in the file, and give the cost so far; [] where there is none."""
@@ -65,14 +66,19 @@ class Checkpoint:
         return kept
 
     def save(self, cost: list[tuple[int, float]]) -> None:
-        """Write the state, where the last time was EVERY_S ago. cost: of every step done. Raises OSError."""
-        if self._path is None or time.monotonic() - self._written < EVERY_S:
+        """Write the state, where the last time was long enough ago. cost: of every step done. Raises OSError."""
+        if self._path is None or (start := time.monotonic()) < self._next:
             return
         packed = io.BytesIO()
         states: dict[str, Any] = {name: part.state_dict() for name, part in self._parts.items()}
         torch.save(states | {"generators": [g.get_state() for g in self._generators], "cost": cost}, packed)
         put(self._path, packed.getvalue(), parents=True)
-        self._written = time.monotonic()
+        self._next = (end := time.monotonic()) + wait(end - start)
+
+
+def wait(took: float) -> float:
+    """Seconds until it is written again, where writing `took` so long."""
+    return max(EVERY_S, took / WRITING)
 
 
 def default_generators(device: str) -> tuple[Generator, ...]:

@@ -76,12 +76,12 @@ class BundleCost:
 
 
 def candidates(scene: Scene) -> list[str]:
-    """The scene's methods, or the usual ones: the paper's classical ones that are cheap, and the family of compact."""
+    """The scene's methods, or the usual ones: the paper's classical ones that are cheap, the family of compact, and the default."""
     if scene.methods:
         return list(scene.methods)
     known = methods.every()
     family = [name for name in known if name.startswith("compact-")] or ["compact"]
-    family.append("filter-bank")
+    family += ["filter-bank", "default"]
     return [name for name in ("L-gauss", "L-svm", "H-svm", *family) if name in known]
 
 

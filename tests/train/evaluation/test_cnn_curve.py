@@ -31,7 +31,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cnn_curve, "ATTACHMENTS", 2)
     monkeypatch.setattr(cnn_curve, "EACH", FEW)
     monkeypatch.setattr(cnn_curve, "FIRST_MARK", 2)
-    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+    monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
 
 
 def follow(out: Path, seed: int = 1, stop_at: int = 0, **options: Any) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def test_an_interrupted_training_gives_the_same_bits(
     recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Interrupted twice; dropout, noise, gains, batch norms, the rate and the moving average go on where they were."""
-    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+    monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
     path = tmp_path / "deeper" / "half.pt"
     for stop in (3, 7):
         with pytest.raises(Interrupted):
@@ -81,7 +81,7 @@ def test_a_file_that_cannot_be_read_counts_as_none(
     """Empty, other bytes, or cut off: the training begins anew."""
     path = tmp_path / "half.pt"
     if broken is None:
-        monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+        monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
         with pytest.raises(Interrupted):
             fit(RECIPE, path, 3)
         broken = path.read_bytes()[:-2000]
@@ -98,7 +98,7 @@ def test_it_is_written_from_time_to_time(tmp_path: Path):
 @pytest.mark.slow
 def test_an_interrupted_fold_of_the_paper_s_cnn_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Its file lies beside the folds, and is removed when the fold is kept."""
-    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+    monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
     plan = Plan(("paper-cnn",), ("split:session=0->1",), effort=Effort(paper_steps=4))
     where, steps = Where(jobs=1, cache=tmp_path), []
     plain = training.backward

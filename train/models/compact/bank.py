@@ -27,7 +27,7 @@ from train.onnx_tools.quantize import PERCENTILE
 
 Array = NDArray[Any]
 TAPS, DILATIONS = 9, (1, 2, 4, 8, 16)
-MOST_FILTERS, LEAST_FILTERS = 512, 32
+MOST_FILTERS, LEAST_FILTERS = 512, 64
 MOST_TAPS = 43_200
 """Of all filters of a kind together: 300 filters of sixteen taxels, 512 of ten and fewer."""
 LARGEST, SPREAD = 8, 3.0

@@ -7,7 +7,7 @@ being the best for them, and every group counts the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,8 @@ Array = NDArray[Any]
 TINY = 1e-12
 ERRORS = 2.0
 """Standard errors by which a candidate must be better than the first: it is the best of about ten."""
+MOST_LOST, MOST_WORSE = 0.005, 0.02
+"""Share of the sweeps, and cross entropy, that fewer filters may cost."""
 Columns = tuple[int, ...]
 
 
@@ -50,7 +52,7 @@ class Court:
         self._logits: dict[tuple[Columns, bool], Array] = {}
 
     def judge(self, parts: Sequence[HeadPart]) -> Judged:
-        """The candidate that adds the logits of `parts`, each scaled to the same size."""
+        """The candidate that adds the logits of `parts`, each scaled to the same size; what factors they had does not count."""
         logits = [self._of(part) for part in parts]
         factors = [1 / max(float(np.abs(x - x.mean(axis=1, keepdims=True)).mean()), TINY) for x in logits]
         total = np.sum([x * f for x, f in zip(logits, factors, strict=True)], axis=0)
@@ -68,23 +70,27 @@ class Court:
         return float(self.weights @ self._right(judged))
 
     def better(self, one: Judged, other: Judged) -> bool:
-        """Whether `one` names no fewer sweeps rightly, and its loss is lower by more than ERRORS standard errors of the paired
+        """Whether `one` has less loss and names more sweeps rightly, by more than ERRORS standard errors of the paired
         difference.
 
-        The error is that over held-out parts, or over sweeps where it is larger: a few parts may agree by chance.
+        The error is that over held-out parts, or over sweeps where it is larger: a few parts may agree by chance. Loss alone
+        is no reason: that of a sum of discriminants changes with how sure each is.
         """
-        if self.accuracy(one) < self.accuracy(other):
-            return False
-        gain = (other.losses - one.losses) * self.weights
+        gain = self._lost(other, one)
         by_part = np.bincount(self.clusters, gain)
-        spread = [np.sqrt(n / max(n - 1, 1) * ((x - x.mean()) ** 2).sum()) for x in (gain, by_part) if (n := len(x))]
-        return bool(gain.sum() > ERRORS * max(spread))
+        return self.loss(one) < self.loss(other) and bool(gain.sum() > ERRORS * max(map(_error, (gain, by_part))))
 
-    def costs(self, one: Judged, other: Judged) -> bool:
-        """Whether `one` names fewer sweeps rightly than `other`, by more than a standard error of the paired difference."""
-        lost = self.weights * (self._right(other).astype(float) - self._right(one))
-        error = np.sqrt(((lost - lost.mean()) ** 2).sum())
-        return bool(lost.sum() > error)
+    def holds(self, one: Judged, other: Judged) -> bool:
+        """Whether held-out sweeps show that `one` loses no more than MOST_LOST of those that `other` names rightly, and
+        MOST_WORSE of its cross entropy: a standard error of the paired difference is added, at least one sweep."""
+        lost = self._lost(one, other)
+        worse = self.loss(one) - self.loss(other)
+        return bool(max(lost.sum(), 0) + max(_error(lost), 1 / len(lost)) <= MOST_LOST and worse <= MOST_WORSE)
+
+    def _lost(self, one: Judged, other: Judged) -> Array:
+        """What each sweep [n] adds to the accuracy of `other` less that of `one`."""
+        lost: Array = self.weights * (self._right(other).astype(float) - self._right(one))
+        return lost
 
     def _right(self, judged: Judged) -> Array:
         right: Array = judged.logits.argmax(axis=1) == self.labels
@@ -111,19 +117,26 @@ class Court:
         return self._logits[key]
 
     def _tested(self, part: HeadPart, known: HeadData, out: Array) -> Array:
-        weight, bias = part.fit(known.take(~out).given(), self._classes)
+        weight, bias = replace(part, factor=1.0).fit(known.take(~out).given(), self._classes)
         return known.features[out] @ weight.T + bias
 
 
+def _error(x: Array) -> float:
+    """Standard error of the sum of `x` [n]."""
+    return float(np.sqrt(len(x) / max(len(x) - 1, 1) * ((x - x.mean()) ** 2).sum()))
+
+
 def choose(
-    court: Court, kinds: Mapping[str, Sequence[Array]], pools: Sequence[Array], bands: Array, log: Callable[[str], None]
+    court: Court, kinds: Sequence[Array], pools: Sequence[Array], bands: Array, log: Callable[[str], None]
 ) -> Judged:
     """The candidate with the least loss, where it is `better` than the usual one; else the usual one.
 
-    What the sweeps are too few to tell apart is not chosen among. The usual one is the first kind, pooled in both ways.
-    Filters and pools are chosen first; then whether these see the spectrum and copies, or the spectrum is enough alone.
-    kinds: sets of filters by name, each a list of filters [n] that get a discriminant of their own. pools: the features
-    [F] of every filter's magnitude, then of its share. bands: numbers of the spectrum's features, which may be none.
+    What the sweeps are too few to tell apart is not chosen among. The usual one adds two discriminants for each kind of
+    filters: one sees their magnitudes, one their shares as well. An average is seldom worse than the better of two, and
+    no held-out part need show which that is. Filters' pools are chosen first; then whether these see the spectrum and
+    copies, or the spectrum is enough alone.
+    kinds: filters [n] of each kind. pools: the features [F] of every filter's magnitude, then of its share. bands:
+    numbers of the spectrum's features, which may be none.
     """
 
     def judged(named: str, parts: Sequence[HeadPart]) -> Judged:
@@ -133,28 +146,42 @@ def choose(
     def best(of: Sequence[Judged]) -> Judged:
         return min(of, key=court.loss)
 
-    plain = [
-        judged(f"{name} filters, {', '.join(('magnitudes', 'shares')[: len(pooled)])}", _parts(filters, pooled))
-        for name, filters in kinds.items()
-        for pooled in (pools, pools[:1])[: len(pools)]
-    ]
-    first = [part.columns for part in best(plain).plan.parts]
+    sizes, both = (views(kinds, pools[:n]) for n in (1, len(pools)))
+    plain = [judged("magnitudes; magnitudes and shares", [*sizes, *both]), judged("magnitudes", sizes)]
+    first = best(plain).plan.parts
     seen = {"without the spectrum": first}
     if len(bands):
         seen |= {
-            "with the spectrum": [(*first[0], *bands.tolist()), *first[1:]],
-            "the spectrum alone": [tuple(bands.tolist())],
+            "with the spectrum": tuple(replace(p, columns=(*p.columns, *bands.tolist())) for p in first),
+            "the spectrum alone": (HeadPart(tuple(bands.tolist()), False),),
         }
     more = [
-        judged(f"{name}{', with copies' * copies}", [HeadPart(columns, copies) for columns in sets])
-        for name, sets in seen.items()
+        judged(f"{name}{', with copies' * copies}", [replace(part, copies=copies) for part in parts])
+        for name, parts in seen.items()
         for copies in (False, True)
-        if copies or sets is not first
+        if copies or parts is not first
     ]
     chosen = best([*plain, *more])
     return chosen if court.better(chosen, plain[0]) else plain[0]
 
 
-def _parts(sets: Sequence[Array], pools: Sequence[Array]) -> list[HeadPart]:
-    """A discriminant for each of `sets` of filters, pooled in some ways."""
-    return [HeadPart(tuple(np.concatenate([pool[filters] for pool in pools]).tolist()), False) for filters in sets]
+def fewer(court: Court, chosen: Judged, filters: Array, least: int, log: Callable[[str], None]) -> Judged:
+    """`chosen` with half of its filters, a quarter and so on, at least `least`, as long as held-out parts show that this
+    `holds`. filters: of each feature [F] the number of its filter, -1 where it has none."""
+    full, used = chosen, np.unique(filters[chosen.plan.columns()])
+    used = used[used >= 0]
+    while len(used) >= 2 * least:
+        used = used[::2]
+        log(f"choosing: {len(used)} filters")
+        kept = (filters < 0) | np.isin(filters, used)
+        parts = [replace(p, columns=tuple(c for c in p.columns if kept[c])) for p in full.plan.parts]
+        less = court.judge(parts)
+        if not court.holds(less, full):
+            break
+        chosen = less
+    return chosen
+
+
+def views(kinds: Sequence[Array], pools: Sequence[Array]) -> list[HeadPart]:
+    """A discriminant for each of `kinds`, filters [n] that are pooled in some ways."""
+    return [HeadPart(tuple(np.concatenate([pool[filters] for pool in pools]).tolist()), False) for filters in kinds]

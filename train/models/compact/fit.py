@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain, product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,9 +64,16 @@ class FitRecipe(training.TrainingRecipe):
         return fields | {"scene": fields.pop("augmentation")}
 
 
-def fit(sweeps: Dataset, seed: int, recipe: FitRecipe, log: Log = no_log, architecture: Architecture = DEFAULT) -> Fit:
+def fit(
+    sweeps: Dataset,
+    seed: int,
+    recipe: FitRecipe,
+    log: Log = no_log,
+    architecture: Architecture = DEFAULT,
+    unfinished: Path | None = None,
+) -> Fit:
     """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it does, and for windows too short."""
-    return fit_on(*hold_out(sweeps, seed), seed, recipe, log, architecture)
+    return fit_on(*hold_out(sweeps, seed), seed, recipe, log, architecture, unfinished)
 
 
 def fit_on(
@@ -76,8 +84,10 @@ def fit_on(
     recipe: FitRecipe,
     log: Log = no_log,
     architecture: Architecture = DEFAULT,
+    unfinished: Path | None = None,
 ) -> Fit:
-    """Train on `train`; `held` gives temperature and validation. by: the group that separates the two, for the record."""
+    """Train on `train`; `held` gives temperature and validation. by: the group that separates the two, for the record.
+    unfinished: see training.learn."""
     form, bands = train.format, spectrum.count(train.format)
     if not (architecture.channels or bands):
         raise FormatError(f"a window of {form.window} frames is too short for a spectrum; take another size")
@@ -88,7 +98,8 @@ def fit_on(
         model, cost = Compact(form, len(train.materials), scale, architecture=architecture), Cost()
         if architecture.channels:
             with torch.enable_grad():
-                model, cost = learn(model, train, recipe, seed, log, augment=augmenter(form, augmentation))
+                change = augmenter(form, augmentation)
+                model, cost = learn(model, train, recipe, seed, log, augment=change, unfinished=unfinished)
         else:
             model = model.fused()
         model.keep_means, model.architecture = recipe.keep_means, replace(architecture, spectrum=bands > 0)
@@ -104,17 +115,24 @@ def fit_on(
 
 
 def train_stages(
-    sweeps: Dataset, seed: int, recipe: FitRecipe, log: Log, architecture: Architecture
-) -> tuple[dict[str, Array], float, graph.Ranges]:
-    """Stages trained on all of `sweeps`: their weights as graph.trunk_graph takes them, the scale, and ranges for int8."""
+    sweeps: Dataset,
+    scale: float,
+    seed: int,
+    recipe: FitRecipe,
+    log: Log,
+    architecture: Architecture,
+    unfinished: Path | None = None,
+) -> tuple[dict[str, Array], graph.Ranges]:
+    """Stages trained on all of `sweeps`, whose counts are multiplied by `scale`: their weights as graph.trunk_graph takes
+    them, and ranges for int8. unfinished: see training.learn."""
     assert recipe.augmentation
     with one_thread(), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        scale, change = texture_scale(sweeps.samples), augmenter(sweeps.format, recipe.augmentation)
+        change = augmenter(sweeps.format, recipe.augmentation)
         model = Compact(sweeps.format, len(sweeps.materials), scale, architecture=architecture)
-        model, _ = learn(model, sweeps, recipe, seed, log, augment=change)
+        model, _ = learn(model, sweeps, recipe, seed, log, augment=change, unfinished=unfinished)
         weights = {name: values for name, values in model.weights().items() if name.startswith("convs.")}
-        return weights, scale, model.ranges(sweeps.samples)
+        return weights, model.ranges(sweeps.samples)
 
 
 def _head_inputs(

@@ -7,7 +7,7 @@ an unseen condition than one that was fitted to all features at once, and togeth
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -75,7 +75,7 @@ class HeadPlan:
 
     def cooled(self, temperature: float) -> HeadPlan:
         """The same, its logits divided by `temperature`."""
-        return HeadPlan(tuple(HeadPart(p.columns, p.copies, p.factor / temperature) for p in self.parts))
+        return HeadPlan(tuple(replace(p, factor=p.factor / temperature) for p in self.parts))
 
     def uncooled(self) -> HeadPlan:
         """The same with logits as sure as discriminants are by themselves, which is never too modest."""
@@ -87,9 +87,7 @@ class HeadPlan:
 
     def renumbered(self, kept: Array) -> HeadPlan:
         """The same for a trunk with only the features `kept` (ascending numbers), which include `columns`."""
-        return HeadPlan(
-            tuple(HeadPart(tuple(np.searchsorted(kept, p.columns).tolist()), p.copies, p.factor) for p in self.parts)
-        )
+        return HeadPlan(tuple(replace(p, columns=tuple(np.searchsorted(kept, p.columns).tolist())) for p in self.parts))
 
     def json(self) -> list[dict[str, Any]]:
         """For a fit's record."""

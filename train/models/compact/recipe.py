@@ -1,8 +1,8 @@
 """The default recipe: a trunk and its heads, chosen by held-out groups of the training sweeps. In: a Dataset. Out: a Fit.
 
-The bank and the spectrum are fixed, so that choosing among them takes seconds and no PyTorch. Trained stages are tried
-beside what was chosen, where PyTorch is installed: trained without a held-out part of each group, they join in if they
-help there. What the heads do not use is left out of the trunk.
+The bank and the spectrum are fixed, so that choosing among them takes seconds and no PyTorch. Trained stages join what was
+chosen, where PyTorch is installed and sweeps are many, unless that names nearly everything. What the heads do not use is
+left out of the trunk.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,11 +36,11 @@ from train.onnx_tools.quantize import calibration_sweeps
 
 Array = NDArray[Any]
 STAGES = ARCHITECTURES["50k"]
-"""The stages that are tried."""
-TRIALS = 3
-"""Parts without which stages are trained, to judge them."""
+"""The stages that are trained."""
 LEAST_SWEEPS = 200
 """For training stages: fewer than a few batches give stages that know them by heart."""
+ENOUGH = 0.99
+"""Accuracy on held-out parts that leaves stages too little to mend for what they take of a bundle and of its time."""
 FIXED = Architecture((), planned=len(STAGES.channels), fewest=0)
 """A trunk without stages that prepares counts as one with STAGES does."""
 
@@ -47,11 +48,13 @@ FIXED = Architecture((), planned=len(STAGES.channels), fewest=0)
 @dataclass(frozen=True)
 class Settings:
     """What a user may set. steps: of the training of stages; 0 to try none. augmentation: None for the usual one. choose:
-    whether anything is chosen; else it is the first candidate."""
+    whether anything is chosen; else all zero-sum filters are seen by one discriminant. unfinished: a file that keeps the
+    training of stages from time to time, from which it goes on with the same bits."""
 
     steps: int = 600
     augmentation: Augmentation | None = None
     choose: bool = True
+    unfinished: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -85,16 +88,18 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     augmentation = settings.augmentation or default_augmentation(FIXED.zero_sum(sweeps.format.window))
     fixed = fixed_trunk(sweeps, seed)
     changed = list(copies(sweeps, augmentation, seed, COPIES))
-    parts, classes = inner_parts(sweeps), len(sweeps.materials)
-    known = _known(fixed, sweeps, changed)
+    known, classes = _known(fixed, sweeps, changed), len(sweeps.materials)
+    parts = inner_parts(sweeps)
     court = Court([known] * len(parts), parts, classes)
-    chosen = _choose(court, fixed, settings.choose, log)
-    staged = None
-    if settings.steps and len(sweeps) >= LEAST_SWEEPS and find_spec("torch"):
-        staged = _with_stages(sweeps, changed, seed, settings, augmentation, known, parts, chosen, log)
-    train, held, by = hold_out_or_all(sweeps, seed)
-    judged, court = staged or (chosen, court)
-    stages = _stages(train, seed, settings, augmentation, log) if staged else None
+    judged, stages = _choose(court, fixed, settings.choose, log), None
+    out, by = _held_out(sweeps, seed)
+    train, held = (sweeps.take(~out), sweeps.take(out)) if by != "nothing" else (sweeps, sweeps)
+    wanted = settings.steps and len(sweeps) >= LEAST_SWEEPS and court.accuracy(judged) < ENOUGH
+    if wanted and by != "nothing" and find_spec("torch"):
+        stages = _stages(train, fixed.scale, seed, replace(settings, augmentation=augmentation), log)
+        both = _side_by_side(_known(stages, sweeps, changed), known)
+        court = Court([both], [InnerPart(by, out)], classes)
+        judged = court.judge(_with_stages(judged.plan))
     trunk, plan = _pruned(fixed, stages, judged.plan)
     heads: dict[str, Array] = {}
     for name, int8 in (("head", False), ("int8", True)):
@@ -140,13 +145,14 @@ def _choose(court: Court, trunk: Trunk, choosing: bool, log: Log) -> Judged:
     layout, filters = trunk.layout(), Bank.of(trunk.weights)
     pools = [np.arange(layout[name].start, layout[name].stop) for name in ("sizes", "shares")]
     bands = np.arange(layout["bands"].start, layout["bands"].stop) if "bands" in layout else np.empty(0, int)
-    zero_sum, free = np.flatnonzero(~filters.free), np.flatnonzero(filters.free)
+    kinds = [which for free in (False, True) if len(which := np.flatnonzero(filters.free == free))]
     if not choosing:
-        return court.judge([HeadPart(tuple(np.concatenate([pool[zero_sum] for pool in pools]).tolist()), False)])
-    kinds = {"zero-sum": [zero_sum]}
-    if len(free):  # a half of each: a bundle has room for as many filters as one kind has
-        kinds |= {"free": [free], "both": [zero_sum[::2], free[::2]]}
-    return choice.choose(court, kinds, pools, bands, log)
+        return court.judge(choice.views([np.flatnonzero(~filters.free)], pools))
+    chosen = choice.choose(court, kinds, pools, bands, log)
+    number = np.full(max(part.stop for part in layout.values()), -1)
+    for pool in pools:
+        number[pool] = np.arange(len(pool))
+    return choice.fewer(court, chosen, number, bank.LEAST_FILTERS, log)
 
 
 def _known(trunk: Trunk, sweeps: Dataset, changed: Sequence[Dataset], int8: bool = True) -> HeadData:
@@ -155,38 +161,38 @@ def _known(trunk: Trunk, sweeps: Dataset, changed: Sequence[Dataset], int8: bool
     return HeadData(features[0], sweeps.labels, np.concatenate(features[1:]), source)
 
 
-def _with_stages(
-    sweeps: Dataset, changed: Sequence[Dataset], seed: int, settings: Settings, augmentation: Augmentation,
-    known: HeadData, parts: Sequence[InnerPart], chosen: Judged, log: Log,
-) -> tuple[Judged, Court] | None:  # fmt: skip
-    """`chosen` with trained stages, whose features come before all others, and the court that judged it; None
-    where that names clearly fewer sweeps rightly. TRIALS parts judge, of each group in turn.
+def _held_out(sweeps: Dataset, seed: int) -> tuple[Array, str]:
+    """Which sweeps [N] stages never see, and by which group; see linear_head.hold_out_or_all."""
+    numbered = replace(sweeps, groups=sweeps.groups | {"index": np.arange(len(sweeps))})
+    _, held, by = hold_out_or_all(numbered, seed)
+    return np.isin(np.arange(len(sweeps)), held.group("index")), by
+
+
+def _side_by_side(stages: HeadData, fixed: HeadData) -> HeadData:
+    """The same sweeps with the features of both, those of stages first."""
+    return replace(
+        fixed,
+        features=np.hstack([stages.features, fixed.features]),
+        copied=np.hstack([stages.copied, fixed.copied]),
+    )
+
+
+def _with_stages(plan: HeadPlan) -> list[HeadPart]:
+    """`plan` with a discriminant of trained stages, whose features come before all others; it sees copies, as stages do.
 
     What differs so much in kind errs on other sweeps: the two together stand a condition that nobody recorded better than
-    either alone, which no held-out part shows. So stages join in unless they cost something."""
-    classes, size = len(sweeps.materials), sum(STAGES.channels)
-    plain = [replace(p, columns=tuple(np.add(p.columns, size).tolist()), factor=1.0) for p in chosen.plan.parts]
-    stages = HeadPart(tuple(range(size)), True)
-    joined: list[HeadData] = []
-    for part in parts[:TRIALS]:
-        trained = _stages(sweeps.take(~part.out), seed, settings, augmentation, log)
-        own = _known(trained, sweeps, changed)
-        both = (np.hstack([own.features, known.features]), np.hstack([own.copied, known.copied]))
-        joined.append(HeadData(both[0], known.labels, both[1], known.source))
-        court = Court(joined, parts[: len(joined)], classes)
-        without = court.judge(plain)
-        best = court.judge([stages, *plain])
-        if court.costs(best, without):
-            return None
-    return best, court
+    either alone, which no held-out part shows. So nothing is asked."""
+    size = sum(STAGES.channels)
+    fixed = [replace(part, columns=tuple(np.add(part.columns, size).tolist())) for part in plan.parts]
+    return [HeadPart(tuple(range(size)), True), *fixed]
 
 
-def _stages(sweeps: Dataset, seed: int, settings: Settings, augmentation: Augmentation, log: Log) -> Trunk:
+def _stages(sweeps: Dataset, scale: float, seed: int, settings: Settings, log: Log) -> Trunk:
     """Stages trained on `sweeps`, as a trunk of their own."""
     from train.models.compact import fit as training  # here: the rest of the recipe needs no PyTorch
 
-    recipe = training.FitRecipe(steps=settings.steps, augmentation=augmentation)
-    weights, scale, ranges = training.train_stages(sweeps, seed, recipe, log, STAGES)
+    recipe = training.FitRecipe(steps=settings.steps, augmentation=settings.augmentation)
+    weights, ranges = training.train_stages(sweeps, scale, seed, recipe, log, STAGES, settings.unfinished)
     return Trunk(sweeps, scale, weights, STAGES, ranges)
 
 

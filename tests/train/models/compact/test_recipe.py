@@ -6,14 +6,18 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
 from tests.factories.sweep_sets import easy
+from train.cli import bundles
+from train.cli.main import main
 from train.data.sets import Dataset
 from train.data.splitters import inner_parts
+from train.models import checkpoint, training
 from train.models.compact import default, recipe
 from train.models.compact.bank import Bank
 from train.models.compact.fitted import Fit
@@ -21,6 +25,7 @@ from train.models.compact.recipe import Settings
 from train.onnx_tools.graph_builder import run, with_head
 
 CLOSED = Settings(steps=0)
+INTERRUPTED = 130
 
 
 @pytest.fixture(scope="module")
@@ -78,17 +83,71 @@ def test_the_same_seed_gives_the_same_fit(fitted: Fit):
 
 
 @pytest.mark.slow
-def test_stages_join_in_where_they_help(monkeypatch: pytest.MonkeyPatch):
-    """Where the court lets them: their features come first, and a fifth of the sweeps is held out from them."""
-    monkeypatch.setattr(recipe.Court, "loss", lambda court, judged: -len(judged.plan.parts))
-    monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
+def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
+    """From LEAST_SWEEPS on, where filters leave something to mend: their features come first, with a discriminant of their own; a fifth of the sweeps is held out
+    from them, and their scale is that of the filters."""
+    for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
+        assert not recipe.fit(easy(), 1, Settings(steps=20)).architecture.channels
+        monkeypatch.setattr(recipe, name, value)
     fit = recipe.fit(easy(), 1, Settings(steps=20))
     assert fit.architecture.channels == recipe.STAGES.channels
     stages = sum(recipe.STAGES.channels)
     assert fit.plan.parts[0].columns == tuple(range(stages))
     assert len(fit.plan.parts) > 1
+    assert 0 < len(fit.held) < len(fit.train) < len(easy())
+    assert fit.about["validation"]["n"] == len(fit.held)
     logits = run(with_head(fit.trunk(), *fit.int8_head()), easy().samples)
     assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
+
+
+def refused(fit: Fit) -> NoReturn:
+    """As where too few sweeps judge; it would take longer than the fit."""
+    raise FormatError("not here")
+
+
+@pytest.mark.slow
+def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The command, interrupted in its training: the next one begins after the last step that was kept, and gives the same
+    bits as one that was never interrupted. Another seed begins anew. Nothing is left in the cache."""
+    monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
+    monkeypatch.setattr(recipe, "ENOUGH", 1.01)
+    monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
+    monkeypatch.setattr(bundles, "CACHE", tmp_path / "cache")
+    monkeypatch.setattr(bundles, "calibrate", refused)
+    easy().save(tmp_path / "easy.npz")
+    plain, steps = training.backward, []
+
+    def backward(*args):
+        if len(steps) == stop:
+            raise KeyboardInterrupt
+        steps.append("")
+        return plain(*args)
+
+    def fitted(name: str, seed: int = 1) -> Fit | None:
+        out = tmp_path / f"{name}.npz"
+        args = ["--set", str(tmp_path / "easy.npz"), "--seed", str(seed), "--steps", "12", "--out", str(out)]
+        assert main(["fit", *args]) == (0 if stop < 0 else INTERRUPTED)
+        return Fit.load(out) if stop < 0 else None
+
+    monkeypatch.setattr(training, "backward", backward)
+    stop = 7
+    fitted("first")
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    stop = -1
+    steps.clear()
+    other = fitted("other", seed=2)
+    assert len(steps) == 12
+    steps.clear()
+    resumed = fitted("first")
+    assert len(steps) == 12 - 7
+    assert not list((tmp_path / "cache").iterdir())
+    whole = fitted("whole")
+    assert other
+    assert resumed
+    assert whole
+    for name, values in whole.weights.items():
+        np.testing.assert_array_equal(resumed.weights[name], values)
+    assert not np.array_equal(other.weights["convs.0.weight"], whole.weights["convs.0.weight"])
 
 
 def test_filters_need_no_pytorch(tmp_path: Path):
