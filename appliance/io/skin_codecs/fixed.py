@@ -16,6 +16,9 @@ from appliance.io.skin_profile import SkinProfile
 AMBIGUOUS_FRAMES = 32
 """So many frames are kept while two places in them could be their beginning; then the oldest are given up."""
 
+MOST_RIVALS = 8
+"""Places in a frame where marks may repeat; real frames have none or one."""
+
 
 @dataclass(frozen=True, slots=True)
 class FixedLayout:
@@ -100,34 +103,36 @@ def _beginning(layout: FixedLayout, data: bytes, at: int) -> tuple[int, int, boo
     """Where frames begin at or after `at`, the bytes before it, and whether that is certain."""
     begun = at
     while (at := data.find(layout.mark, at)) >= 0:
-        certain = _begins(layout, data, at)
-        if certain is not False:
-            return at, at - begun, bool(certain)
-        at += 1
+        skip = _begins(layout, data, at)
+        if not skip:
+            return at, at - begun, skip == 0
+        at += skip
     kept = max(begun, len(data) - len(layout.mark) + 1)
     return kept, kept - begun, False
 
 
-def _begins(layout: FixedLayout, data: bytes, at: int) -> bool | None:
-    """Whether frames begin with the mark at `at`; None as long as more bytes are needed to tell.
+def _begins(layout: FixedLayout, data: bytes, at: int) -> int | None:
+    """0 if frames begin with the mark at `at`, else the bytes to pass over; None as long as more are needed to tell.
 
     A mark may occur among the numbers, in every frame at the same place as long as the skin is at rest. So a beginning
     is certain once two periods have followed it, and no other place within the first is followed for as long. The
-    answer does not depend on how many bytes have come beyond those that it needs.
+    answer does not depend on how many bytes have come beyond those that it needs. Frames whose beginning cannot be told
+    are passed over as a whole, and so are those full of marks, which would cost more time than their bytes take to come.
     """
     mark, period, rivals = layout.mark, layout.period, [at]
     for i in range(1, AMBIGUOUS_FRAMES + 1):
         if (end := at + i * period) + len(mark) > len(data):
             return None
         if not data.startswith(mark, end):
-            return False
+            return 1
         if i == 1:
-            rivals = [
-                at + 1 + m.start() for m in re.finditer(b"(?=%b)" % re.escape(mark), data[at + 1 : end + len(mark) - 1])
-            ]
+            places = re.finditer(b"(?=%b)" % re.escape(mark), data[at + 1 : end + len(mark) - 1])
+            rivals = [at + 1 + place.start() for place in places]
         if rivals and rivals[-1] + i * period + len(mark) > len(data):
             return None
         rivals = [other for other in rivals if data.startswith(mark, other + i * period)]
         if i >= 2 and not rivals:
-            return True
-    return False
+            return 0
+        if i >= 2 and len(rivals) > MOST_RIVALS:
+            return period
+    return period

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.io.skin_codecs import Decoded, Rest, arranged, codec
+from appliance.io.skin_codecs import Decoded, Rest, arranged, codec, fixed
 from appliance.io.skin_profile import SkinProfile
 from tests.factories.skin_wires import NAMES, papillarray, profile, taxels, wire
 
@@ -199,3 +199,16 @@ def test_what_is_left_over_stays_small(name: str):
         for _ in range(300):
             rest = decode(rest, fill * 500).rest
             assert len(rest.data) < 200_000
+
+
+@pytest.mark.parametrize("name", ["matrix", "flexitac", "anyskin"])
+def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyPatch):
+    """Frames full of marks have no beginning that can be told. They are passed over whole, not byte by byte, which would
+    cost more time than they take to come: so many places are looked at."""
+    p, looked = profile(name), []
+    begins = fixed._begins
+    monkeypatch.setattr(fixed, "_begins", lambda *args: looked.append(1) or begins(*args))
+    data = (p.trailer + p.marker) * 15_000
+    found = decoded(p, data)
+    assert len(found) == 0
+    assert len(looked) <= len(data) // fixed._layout(p).period + 1
