@@ -26,12 +26,13 @@ from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.log import to_stderr
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
+from appliance.io import skins
 from appliance.io.robot_link import SerialSink
 from appliance.runtime import assembly
 from appliance.runtime.loop import Box
 
 if TYPE_CHECKING:
-    from appliance.sim.devices import SimDevices
+    from appliance.sim.devices import RobotDevices, SimDevices
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -63,20 +64,31 @@ def _with_devices(run: Callable[[argparse.Namespace, OpenDevices], int], args: a
 def _open_devices(args: argparse.Namespace, fmt: Callable[[], SweepFormat] | None) -> Devices:
     """The real devices, or simulated ones where `--sim` names them; `fmt` gives what the simulated skin has to send."""
     if args.sim:
-        return _simulated(args.sim, fmt() if fmt else None, args, remember=False)
+        return _simulated(args.sim, fmt() if fmt else None, args, load_settings(args), remember=False)
     if args.virtual:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
     return Devices(SystemClock())
 
 
 def _simulated(
-    name: str, fmt: SweepFormat | None, args: argparse.Namespace, *, remember: bool = True, spread: bool = False
-) -> SimDevices:
+    name: str, fmt: SweepFormat | None, args: argparse.Namespace, settings: Config, *, remember: bool = True,
+    spread: bool = False,
+) -> RobotDevices:  # fmt: skip
+    """A simulated robot with the skin that the settings name: a readout board on USB, or one on a terminal."""
     from appliance.sim import devices, rig, script
 
-    acts, source, fmt = script.named(name, fmt, args.seed, spread=spread)
     clock = rig.VirtualClock() if args.virtual else SystemClock()
-    return devices.build(fmt, islice(acts, args.sweeps), clock, source, remember=remember)
+    profile = skins.profile(settings)
+    if profile.codec == "palpate":
+        acts, source, fmt = script.named(name, fmt, args.seed, spread=spread)
+        return devices.build(fmt, islice(acts, args.sweeps), clock, source, remember=remember)
+    from appliance.sim.skins import devices as terminal
+    from appliance.sim.skins import sweeps
+
+    seen = sweeps.view(settings.sensor.skin, profile.format)
+    acts, source, fmt = script.named(name, fmt, args.seed, spread=spread, seen=seen)
+    acts = islice(acts, args.sweeps)
+    return terminal.build(settings.sensor.skin, profile, fmt, acts, clock, source, remember=remember)
 
 
 def run_demo(args: argparse.Namespace) -> int:
@@ -86,7 +98,7 @@ def run_demo(args: argparse.Namespace) -> int:
     settings = load_settings(args)
     bundle = load_bundle(settings)
     args.sweeps = args.sweeps or 12
-    devices = _simulated(args.sim or "skin", bundle.format, args, spread=True)
+    devices = _simulated(args.sim or "skin", bundle.format, args, settings, spread=True)
     stopped = stop_flag()
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())

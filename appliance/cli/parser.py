@@ -34,9 +34,10 @@ def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argpars
     devices = argparse.ArgumentParser(add_help=False)
     devices.add_argument(
         "--sim",
-        metavar="skin|rest|replay:FILE",
-        help="simulated tubes, a finger at rest on one, or a sweep set, instead of the devices",
+        metavar="skin[:MATERIAL]|rest|replay:FILE",
+        help="simulated tubes, one of them, a finger at rest on one, or a sweep set, instead of the devices",
     )
+    devices.add_argument("--skin", metavar="NAME", help="profile of the skin (sensor.skin); with --sim an emulated one")
     devices.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
     devices.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
     answers = argparse.ArgumentParser(add_help=False)

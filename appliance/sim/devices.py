@@ -21,17 +21,14 @@ BITS = tuple(f"CLASS-{i}" for i in range(8))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SimDevices(Devices):
-    """Simulated lines and skin, with the robot that acts on them. robot.played: what it did, for scoring."""
+class RobotDevices(Devices):
+    """Simulated lines with the robot that acts on them. robot.played: what it did, for scoring."""
 
     gpio: gpio.SimGpio
-    backend: usb.RigBackend
     robot: rig.Robot
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the simulated lines and skin; a trigger without lines stays."""
-        ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": "", "skin": "palpate", "grid": ""}
-        sensor = replace(settings.sensor, **ids, rate_hz=0.0, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
+        """The settings with the simulated lines; a trigger without lines stays."""
         wires = {"start": START, "stop": STOP, "new_object": NEW_OBJECT}
         trigger = replace(settings.trigger, **wires, active_low=False)  # type: ignore[arg-type]
         if trigger.by_lines:
@@ -40,11 +37,36 @@ class SimDevices(Devices):
             settings.output, ready=READY, busy=BUSY, result_valid=RESULT_VALID, fault=FAULT, decided=DECIDED,
             class_bits=BITS,
         )  # fmt: skip
-        return replace(settings, sensor=sensor, trigger=trigger, output=output)
+        return replace(settings, trigger=trigger, output=output)
 
     def finished(self, answered: int) -> bool:
         """True when the script has ended and each of its sweeps was answered."""
         return self.robot.finished and answered >= self.robot.acts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimDevices(RobotDevices):
+    """The robot's cell with a readout board on a simulated USB bus."""
+
+    backend: usb.RigBackend
+
+    def wire(self, settings: Config) -> Config:
+        """The settings with the simulated lines and skin."""
+        ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": "", "skin": "palpate", "grid": ""}
+        sensor = replace(settings.sensor, **ids, rate_hz=0.0, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
+        return replace(RobotDevices.wire(self, settings), sensor=sensor)
+
+
+def robot_on_lines(
+    acts: Iterable[rig.Act], clock: Clock, *, stops: bool = True, remember: bool = True
+) -> tuple[rig.Robot, gpio.SimGpio]:
+    """A robot that plays `acts`, and the lines that it drives. stops, remember: see `build`."""
+    outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
+    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember)
+    robot = rig.Robot(iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT, remember=remember)
+    if stops:
+        lines.watchers[DECIDED] = robot.react
+    return robot, lines
 
 
 def build(
@@ -56,11 +78,6 @@ def build(
 
     remember: keep all acts and all output levels, to examine them later; without it memory does not grow.
     """
-    outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
-    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember)
-    robot = rig.Robot(iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT, remember=remember)
-    if stops:
-        lines.watchers[DECIDED] = robot.react
-    board = rig.Board(fmt, robot, clock)
-    backend = usb.RigBackend(board, clock, acm=acm)
+    robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember)
+    backend = usb.RigBackend(rig.Board(fmt, robot, clock), clock, acm=acm)
     return SimDevices(clock=clock, gpio=lines, backend=backend, source=source, robot=robot, format=fmt)

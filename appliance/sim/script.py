@@ -23,6 +23,8 @@ SETS = "replay:"
 PAUSE_S = 0.1, 0.14
 """Time that the finger is off the tube before and after a sweep; drawn for each one, so that edges fall anywhere within
 packets."""
+PAUSE_FRAMES = 12
+"""Least frames for which it is off, so that a slow skin is seen unloaded, too."""
 SLIDE_S, REST_S = 3.0, 0.1
 """Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after it."""
 LEAD_S = 0.5
@@ -37,26 +39,41 @@ RESTS_FOR_S, LIFTED_S = 3.0, 1.0
 MARGIN = 8
 """Frames before the start edge and after the stop edge."""
 
+_NAME_SKIN = "name another skin with --skin, or use --sim replay:FILE"
+_NAME_BUNDLE = (
+    "name a bundle for this skin with --set classifier.bundle=DIR; palpate record --sim skin --skin NAME, palpate-train fit "
+    "and export make one"
+)
+
 
 def named(
-    name: str, fmt: SweepFormat | None, seed: int, *, spread: bool = False
+    name: str, fmt: SweepFormat | None, seed: int, *, spread: bool = False, seen: SeenTubes | None = None
 ) -> tuple[Iterator[Act], str, SweepFormat]:
     """The script with this name after `--sim`, the name of the source in sentences, and the format of its sweeps.
 
     fmt: what the bundle wants, None without one. spread: play the sweeps of a set in an order that is drawn, the
-    materials in turn. Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
+    materials in turn. seen: the skin on the finger, None for the simulator's own. Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
     """
-    if name in ("skin", "rest"):
-        worlds = {world.format: world for world in (skin.WORLD, skin.World(shear=True))}
-        fmt = fmt or skin.FORMAT
-        if fmt not in worlds:
-            sent = " or ".join(map(str, worlds))
-            raise FormatError(f"the simulated skin sends {sent}, {fmt} is wanted; use --sim replay:FILE")
-        return (tubes if name == "skin" else rests)(seed, world=worlds[fmt]), "sim", fmt
+    kind, _, only = name.partition(":")
+    if name == "rest" or kind == "skin":
+        able: list[tuple[SweepFormat, skin.World, SeenTubes]] = [
+            (world.format, world, skin) for world in (skin.WORLD, skin.World(shear=True))
+        ]
+        if seen:
+            able = [(seen.FORMAT, skin.WORLD, seen)]
+        fmt = fmt or able[0][0]
+        fits = [one for one in able if (one[0].skin, one[0].rate_hz) == (fmt.skin, fmt.rate_hz)]
+        if not fits:
+            sent = " or ".join(str(form) for form, _, _ in able)
+            hint = _NAME_BUNDLE if seen else _NAME_SKIN
+            raise FormatError(f"the simulated skin sends {sent}, {fmt} is wanted; {hint}")
+        _, world, by = fits[0]
+        acts = rests(seed, world, by) if name == "rest" else tubes(seed, world=world, seen=by, only=only)
+        return acts, "sim", fmt
     if name.startswith(SETS):
         sweeps = load(Path(name.removeprefix(SETS)), fmt)
         return play(sweeps, in_turn(sweeps.labels, seed) if spread else range(len(sweeps))), "replay", sweeps.format
-    raise ConfigError(f"--sim {name} is unknown; use skin, rest, or replay:FILE with a sweep set")
+    raise ConfigError(f"--sim {name} is unknown; use skin, skin:MATERIAL, rest, or replay:FILE with a sweep set")
 
 
 class SeenTubes(Protocol):
@@ -67,13 +84,13 @@ class SeenTubes(Protocol):
         """The form of its frames."""
         ...
 
-    def idle(self, n: int, rng: Generator, world: skin.World = ...) -> NDArray[Any]:
+    def idle(self, n: int, rng: Generator, world: skin.World) -> NDArray[Any]:
         """n frames without contact."""
         ...
 
     def sweep(
-        self, material: str, placement: skin.Placement, rng: Generator, world: skin.World = ..., *,
-        rest_s: float = ..., slide_s: float = ..., after_s: float = ...,
+        self, material: str, placement: skin.Placement, rng: Generator, world: skin.World, *,
+        rest_s: float, slide_s: float, after_s: float,
     ) -> NDArray[Any]:  # fmt: skip
         """A sweep over a tube."""
         ...
@@ -81,35 +98,43 @@ class SeenTubes(Protocol):
 
 def tubes(
     seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = (), world: skin.World = skin.WORLD,
-    seen: SeenTubes = skin,
+    seen: SeenTubes = skin, only: str = "",
 ) -> Iterator[Act]:  # fmt: skip
     """Sweeps over the six tubes in random order; each begins at another spot of its tube.
 
     sweeps: their number; None for no end. places: positions of the skin, the next one for each round of six tubes; by
-    default one that is drawn from `seed`. seen: through which skin.
+    default one that is drawn from `seed`. seen: through which skin. only: over this tube alone. Raises ConfigError for
+    an unknown one.
     """
-    rng = np.random.default_rng(seed)
+    materials = (world.tube(only).name,) if only else skin.MATERIALS
+    return _tubes(np.random.default_rng(seed), sweeps, places or skin.placements("T-LAB", seed), world, seen, materials)
+
+
+def _tubes(
+    rng: Generator, sweeps: int | None, places: Sequence[skin.Placement], world: skin.World, seen: SeenTubes,
+    materials: Sequence[str],
+) -> Iterator[Act]:  # fmt: skip
     rate = seen.FORMAT.rate_hz
-    rounds = itertools.cycle(places or skin.placements("T-LAB", seed))
+    rounds = itertools.cycle(places)
     tubes_left: list[str] = []
     for _ in itertools.count() if sweeps is None else range(sweeps):
         if not tubes_left:
-            tubes_left, place = [str(m) for m in rng.permutation(skin.MATERIALS)], next(rounds)
+            tubes_left, place = [str(m) for m in rng.permutation(materials)], next(rounds)
         label = tubes_left.pop()
-        off = seen.idle(round(rng.uniform(*PAUSE_S) * rate), rng, world)
+        off = seen.idle(max(PAUSE_FRAMES, round(rng.uniform(*PAUSE_S) * rate)), rng, world)
         on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=SLIDE_S, after_s=REST_S)
         start = len(off) + round(REST_S * rate)
         yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
 
 
-def rests(seed: int, world: skin.World = skin.WORLD) -> Iterator[Act]:
+def rests(seed: int, world: skin.World = skin.WORLD, seen: SeenTubes = skin) -> Iterator[Act]:
     """A finger that is lifted and put on the wooden tube again, without end; the skin is moved between the touches."""
     rng = np.random.default_rng(seed)
-    off = round(LIFTED_S * skin.FORMAT.rate_hz)
+    off = round(LIFTED_S * seen.FORMAT.rate_hz)
     for dx_mm, dy_mm in itertools.cycle(RESTS_MM):
         place = skin.Placement(dx_mm, dy_mm, seed=seed)
-        on = skin.sweep("wood", place, rng, world, rest_s=RESTS_FOR_S, slide_s=0, after_s=0)
-        frames = np.concatenate([skin.idle(off, rng, world), on])
+        on = seen.sweep("wood", place, rng, world, rest_s=RESTS_FOR_S, slide_s=0, after_s=0)
+        frames = np.concatenate([seen.idle(off, rng, world), on])
         yield Act(frames, off, len(frames) - 1, "wood")
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from appliance.io import packets as wire
 from appliance.io import robot_link
+from tests.fuzz.skins import GRIDS
 
 Plain = Callable[[bytes], bytes]
 Mutator = Callable[[bytes, Random, Plain], bytes]
@@ -103,6 +104,25 @@ def headed(data: bytes, random: Random, plain: Plain) -> bytes:
     return data[: start - len(length)] + length + head + rest
 
 
+def frames(data: bytes, random: Random, plain: Plain) -> bytes:
+    """A skin's frames left out, repeated or put elsewhere, or bytes changed; then most sums of PapillArray made right."""
+    pieces = [p for p in re.split(rb"(?=\xaa\x55|\x55\x66\x77\x88|\x9a\x00)|(?<=\n)|(?<=\r)", data) if p]
+    if len(pieces) > 1 and random.random() < 0.4:
+        piece = random.choice(pieces)
+        pieces.insert(random.randrange(len(pieces) + 1), piece)
+        if random.random() < 0.5:
+            pieces.remove(random.choice(pieces))
+        data = b"".join(pieces)
+    else:
+        data = plain(data)
+
+    def seal(match: re.Match[bytes]) -> bytes:
+        right = (sum(match[1]) & 0xFFFF).to_bytes(2, "little")
+        return match[0] if random.random() < 0.2 else match[0][:4] + match[1] + right + match[0][-4:]
+
+    return re.sub(rb"(?s)\x55\x66\x77\x88(.*?)..\xaa\xbb\xcc\xdd", seal, data)
+
+
 def _places(tree: Any) -> Any:
     """(branch, key) of every value, down to the tenth level."""
     stack = [(tree, 0)]
@@ -121,4 +141,6 @@ MUTATORS: dict[str, Mutator] = {
     "manifest": trees,
     "recording": headed,
     "capture": headed,
+    "profile": tables,
+    **{f"skin-{name}": frames for name in GRIDS},
 }

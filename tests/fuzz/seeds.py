@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,9 +18,11 @@ from appliance.bundle import bundle
 from appliance.core import config
 from appliance.core.types import DATA_TYPES, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat, save
 from appliance.io import packets, robot_link
+from appliance.io.skin_profile import SkinProfile
 from appliance.recording.capture import MAGIC, CaptureWriter
 from appliance.sim import script, skin
 from tests.factories.paths import ROOT
+from tests.fuzz import skins
 from tests.fuzz.files import NPY
 
 ENDLESS = packets.HEADER.pack(
@@ -125,7 +128,8 @@ def capture() -> list[bytes]:
 
 
 SEEDS: dict[str, Callable[[], list[bytes]]] = {
-    f.__name__: f for f in (unpack, command, settings, manifest, recording, capture)
+    **{f.__name__: f for f in (unpack, command, settings, manifest, recording, capture)}, "profile": skins.profile_seeds,
+    **{f"skin-{name}": partial(skins.seeds, name) for name in skins.GRIDS},
 }  # fmt: skip
 
 
@@ -143,6 +147,10 @@ def words(target: str) -> Sequence[bytes]:
         keys = [f.name for group in sections.values() for f in fields(group)]
         odd = ["board = ", " = ", '"', "[", "]", "true", "nan", "-0.0", "1e-9", "0x", '"\\u0000"', "1979-05-27", "'''"]
         return [text.encode() for text in (*(f"[{name}]" for name in sections), *keys, *odd)]
+    if target == "profile":
+        return [f"{field.name} = ".encode() for field in fields(SkinProfile)]
+    if target.startswith("skin-"):
+        return list(skins.MARKS[target.removeprefix("skin-")])
     kinds = {
         "manifest": (bundle.Manifest, bundle.Thresholds),
         "recording": (SweepFormat, Sweep),

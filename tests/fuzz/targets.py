@@ -20,7 +20,7 @@ from appliance.core.errors import FormatError, SensorMismatch
 from appliance.core.types import SweepFormat
 from appliance.io import packets as wire
 from appliance.io import robot_link, usb_sensor
-from tests.fuzz import files
+from tests.fuzz import files, skins
 from tests.fuzz.files import one_line
 
 Target = Callable[[bytes, Path], None]
@@ -192,5 +192,5 @@ def _answer(parsed: robot_link.Command) -> None:
 
 TARGETS: dict[str, Target] = {
     "unpack": unpack, "command": command, "settings": files.settings, "manifest": files.manifest,
-    "recording": files.recording, "capture": files.played,
+    "recording": files.recording, "capture": files.played, **skins.TARGETS,
 }  # fmt: skip

@@ -129,7 +129,12 @@ class Player:
 
     def _taken(self) -> int:
         """Number of the first frame that is not taken yet."""
-        return self._origin + int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
+        return self._first_after(self._clock.now_ns())
+
+    def _first_after(self, t_ns: int) -> int:
+        """Number of the first frame after the time `t_ns`."""
+        about = self._origin + int((t_ns - self._origin_ns) / self._period_ns)
+        return about + (self.frame_ns(about) <= t_ns)
 
     def _skip(self) -> None:
         """Frames that nobody is sent are gone."""
@@ -137,10 +142,8 @@ class Player:
             self._next = max(self._next, self._taken())
 
     def _send_due(self) -> None:
-        until = self._taken()
-        if self._collect_ns:
-            passed = self._clock.now_ns() // self._collect_ns * self._collect_ns
-            until = min(until, self._origin + int((passed - self._origin_ns) / self._period_ns))
+        now = self._clock.now_ns()
+        until = self._first_after(now // self._collect_ns * self._collect_ns if self._collect_ns else now)
         while self._next < until:
             self._send_one(self._next)
 
@@ -168,6 +171,8 @@ class Player:
 
 DELIVERY_S = 0.1
 """Longest wait for the kernel to pass on what one end of a terminal wrote; it does so in its own time."""
+SPIN_S = 5e-4
+"""Time for which that is awaited without sleeping."""
 PORT_BYTES = 4000
 """What the near end of a terminal can hold before it is read (4096 less the last line's end)."""
 
@@ -210,9 +215,10 @@ def _wait_for_bytes(fd: int, sent: int) -> bool:
     """Whether something can be read from `fd`, once the kernel has delivered `sent` bytes; at once if there are none."""
     if not sent:
         return wait_readable(fd, 0)
-    end = time.monotonic() + DELIVERY_S
-    while time.monotonic() < end and (ready := _held(fd)) < min(sent, PORT_BYTES):
-        time.sleep(20e-6) if ready else wait_readable(fd, DELIVERY_S)
+    begin = time.monotonic()
+    while (waited := time.monotonic() - begin) < DELIVERY_S and (held := _held(fd)) < min(sent, PORT_BYTES):
+        if waited > SPIN_S:  # it usually takes some 10 us; who sleeps on a busy machine is woken much later
+            time.sleep(1e-4) if held else wait_readable(fd, DELIVERY_S)
     return wait_readable(fd, 0)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -63,7 +64,7 @@ class SkinView:
     def sweep(
         self, material: str, placement: Placement, rng: Generator, world: World, *,
         rest_s: float, slide_s: float, after_s: float,
-    ) -> NDArray[np.generic]:  # fmt: skip
+    ) -> NDArray[Any]:  # fmt: skip
         """As `skin.sweep`: raw counts [n, R, C] or [n, R, C, A] at this skin's rate.
 
         A slow skin does not filter before it samples, so what is faster than half its rate is folded, as with real ones.
@@ -76,11 +77,11 @@ class SkinView:
         step = skin.FORMAT.rate_hz / self.FORMAT.rate_hz
         return self._digitize(_at(signal, step * np.arange(n, dtype=np.float64)), of_noise)
 
-    def idle(self, n: int, rng: Generator, world: World) -> NDArray[np.generic]:
+    def idle(self, n: int, rng: Generator, world: World) -> NDArray[Any]:
         """As `skin.idle`: n frames of a skin without contact."""
         return self._digitize(np.zeros((n, *self.FORMAT.shape)), rng)
 
-    def _digitize(self, counts: Array, rng: Generator) -> NDArray[np.generic]:
+    def _digitize(self, counts: Array, rng: Generator) -> NDArray[Any]:
         s = self.scale
         signal = s.rest + s.gain * counts + s.noise * rng.standard_normal(counts.shape)
         dtype = self.FORMAT.numpy_type

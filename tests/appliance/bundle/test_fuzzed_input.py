@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -14,9 +15,10 @@ import pytest
 from appliance.bundle import bundle, manifest
 from appliance.core import config, schema, types
 from appliance.core.errors import ApplianceError
-from appliance.io import packets, robot_link, usb_sensor
+from appliance.io import packets, robot_link, skin_codecs, skin_profile, usb_sensor
+from appliance.io.skin_codecs import fixed, papillarray, robotiq, text, xela
 from appliance.recording import capture
-from tests.fuzz import corpus, files, seeds, targets
+from tests.fuzz import corpus, files, seeds, skins, targets
 from tests.fuzz.mutators import MUTATORS
 
 TARGETS = sorted(targets.TARGETS)
@@ -112,6 +114,11 @@ def read_recording(data: bytes, folder: Path) -> Any:
     return types.load(written(folder, "s.npy", magic + table))
 
 
+def frames_of(name: str, data: bytes, folder: Path) -> int:
+    """How many frames of a skin there are."""
+    return len(skin_codecs.codec(skins.SUBJECTS[name].profile)(skin_codecs.Rest(), data))
+
+
 READ: dict[str, Callable[[bytes, Path], Any]] = {
     "unpack": lambda data, folder: packets.unpack(data).packets,
     "command": lambda data, folder: any(not c.error for c in robot_link.parse(data)[0]),
@@ -119,6 +126,8 @@ READ: dict[str, Callable[[bytes, Path], Any]] = {
     "manifest": read_manifest,
     "recording": read_recording,
     "capture": lambda data, folder: capture.Playback(written(folder, "c", data)).format,
+    "profile": lambda data, folder: skin_profile.load(written(folder, "s.toml", data).stem, [folder]),
+    **{f"skin-{name}": partial(frames_of, name) for name in skins.GRIDS},
 }
 """How each target reads an input: a value, nothing, or one of its own errors."""
 
@@ -188,6 +197,7 @@ def hasty(data: bytes, rest: bytes = b"") -> tuple[list[robot_link.Command], byt
     return found, b"" if len(rest) > robot_link.MAX_LINE else rest
 
 
+COLLECTED = text.collected
 UNPACK, ONE, PARSE, FIT, FRAMES = packets.unpack, packets._one, robot_link.parse, schema.Key.fit, types.Frames
 
 
@@ -206,6 +216,22 @@ def numb(load: Callable[..., Any]) -> Callable[..., Any]:
 def broken_json(text: bytes) -> Any:
     """Raises an error of two lines."""
     raise ValueError("line 1\nline 2")
+
+
+def eager(layout: Any, data: bytes, at: int) -> bool:
+    """Takes a beginning as certain once one period has followed it, however many bytes have come."""
+    return data.startswith(layout.mark, at + layout.period)
+
+
+def unsummed(data: bytes, begin: int) -> int:
+    """The next tail ends a packet, whatever its sum."""
+    tail = data.find(b"\xaa\xbb\xcc\xdd", begin)
+    return tail + 4 if tail > begin + 2 else 0
+
+
+def turned(profile: Any, numbers: Any, *more: Any, **named: Any) -> Any:
+    """Frames whose numbers come in the opposite order."""
+    return COLLECTED(profile, [frame[::-1] for frame in numbers], *more, **named)
 
 
 BREAKS: list[tuple[str, str, Any, str, Any]] = [
@@ -242,6 +268,14 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
     ("capture", "records are not looked at", capture, "_written", lambda kind, t_ns, body: True),
     ("capture", "the last record is never played", capture.Playback, "finished", False),
     ("manifest", "what is written is something else", bundle.Manifest, "json", lambda manifest: b"{}"),
+    ("skin-flexitac", "frames are told apart by what has come", fixed, "_begins", eager),
+    ("skin-anyskin", "the end of a frame is not looked at", fixed, "_run",
+     lambda layout, data, at: ((len(data) - len(layout.mark) - at) // layout.period, False)),
+    ("skin-papillarray", "a wrong sum is taken", papillarray, "_pts_end", unsummed),
+    ("skin-xela-can", "the last taxel comes first", xela, "collected", turned),
+    ("skin-robotiq-tsf", "the last taxel comes first", robotiq, "collected", turned),
+    ("skin-3d-vitac", "the last taxel comes first", text, "collected", turned),
+    ("profile", "the file is not named", skin_profile, "load", numb(skin_profile.load)),
 ]  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from appliance.bundle import bundle
 from appliance.bundle.bundle import Early
 from appliance.cli import main as main_module
 from appliance.cli.main import main
-from appliance.core import statistics
+from appliance.core import config, statistics
 from appliance.core.clock import SystemClock
 from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError, SensorError
@@ -258,7 +258,9 @@ def test_record_on_a_machine_without_gpio(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """A PC: no line is wired, gpiod cannot be imported, no bundle is there; sweeps by the clock are recorded."""
-    simulated = main_module._simulated("skin", None, argparse.Namespace(seed=1, sweeps=None, virtual=True))
+    simulated = main_module._simulated(
+        "skin", None, argparse.Namespace(seed=1, sweeps=None, virtual=True), config.load(None)
+    )
     plain = Devices(simulated.clock, None, simulated.backend, "sim")
     monkeypatch.setattr(main_module, "Devices", lambda clock: plain)
     monkeypatch.setitem(sys.modules, "gpiod", None)

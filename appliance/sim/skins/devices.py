@@ -1,0 +1,74 @@
+"""A simulated robot whose skin is one that people own, on a terminal. In: the name of its profile, acts. Out: devices."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from appliance.core.clock import Clock
+from appliance.core.config import Config
+from appliance.core.types import SweepFormat
+from appliance.io.skin_profile import SkinProfile
+from appliance.sim import rig
+from appliance.sim.devices import RobotDevices, robot_on_lines
+from appliance.sim.skins.player import Player, PlayerClock
+from appliance.sim.skins.wires import wire
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayedDevices(RobotDevices):
+    """Simulated lines, and a skin that is played on a terminal. name: of its profile. folder: where the terminal's link
+    is, removed with this object."""
+
+    name: str
+    player: Player
+    folder: tempfile.TemporaryDirectory[str]
+
+    def wire(self, settings: Config) -> Config:
+        """The settings with the simulated lines, and with the terminal as the skin's port."""
+        sensor = replace(settings.sensor, skin=self.name, port=str(self.player.path))
+        return replace(RobotDevices.wire(self, settings), sensor=sensor)
+
+
+def on_wire(taxels: NDArray[Any], profile: SkinProfile) -> NDArray[Any]:
+    """A frame [R, C] or [R, C, A] as the skin itself sees it, before the profile turns it."""
+    for turn in reversed(profile.orientation):  # each turn is its own inverse
+        taxels = {"transpose": taxels.swapaxes(0, 1), "flip-rows": taxels[::-1], "flip-columns": taxels[:, ::-1]}[turn]
+    return taxels
+
+
+class _Reel:
+    """A robot's acts as frames for a wire."""
+
+    def __init__(self, film: rig.Film, profile: SkinProfile) -> None:
+        self._film, self._profile = film, profile
+
+    def frame(self, i: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
+        """See FrameSource."""
+        return on_wire(self._film.frames(i, 1, frame_ns)[0], self._profile)
+
+
+def build(
+    name: str, profile: SkinProfile, fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *,
+    remember: bool = True,
+) -> PlayedDevices:  # fmt: skip
+    """Devices on which a robot plays `acts`, sweeps of `fmt`, with the skin of this profile. source, remember: see
+    `sim.devices.build`.
+
+    Raises ConfigError for a skin that has no emulator.
+    """
+    playing = PlayerClock(clock)
+    robot, lines = robot_on_lines(acts, playing, remember=remember)
+    folder = tempfile.TemporaryDirectory()
+    reel = _Reel(rig.Film(fmt, robot), profile)
+    player = Player(wire(name, fmt.rate_hz), reel, playing, Path(folder.name) / "ttySkin")
+    playing.player = player
+    return PlayedDevices(
+        clock=playing, gpio=lines, source=source, robot=robot, wait=playing.wait_readable, format=fmt,
+        name=name, player=player, folder=folder,
+    )  # fmt: skip

@@ -1,0 +1,69 @@
+"""`python -m tests.skins way|noise|load|page [SKIN ...]`: measures emulated skins; docs/skins.json, tables of docs/skins.md.
+
+way: record, describe, fit, export and run with each. noise: wrong frames on a bad cable. load: share of a core, lost frames
+and time to the answer, with the bundles of `way`. Without a word all of them, then the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from shutil import rmtree
+from typing import Any
+
+from appliance.core.provenance import commit
+from tests.factories.paths import ROOT
+from tests.skins import load, noise, page, way
+from tests.skins.subjects import NAMES, subject
+
+WORK = ROOT / "build" / "skins"
+RESULTS = ROOT / "docs" / "skins.json"
+FAULTS = 10_000
+
+
+def _way(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    rmtree(WORK / name, ignore_errors=True)
+    (WORK / name).mkdir(parents=True)
+    return way.go(name, WORK / name)
+
+
+def _noise(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    return {fault.__name__: asdict(noise.count(subject(name), fault, FAULTS)) for fault in noise.FAULTS}
+
+
+def _load(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    return load.measure(name, WORK / name / "bundle", args.seconds)
+
+
+PARTS: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {"way": _way, "noise": _noise, "load": _load}
+
+
+def main() -> int:
+    """Run the parts, and write what they gave beside what others gave before."""
+    parser = argparse.ArgumentParser(prog="python -m tests.skins", description=__doc__)
+    parser.add_argument("part", nargs="?", choices=[*PARTS, "page"], help="all by default")
+    parser.add_argument("skins", nargs="*", metavar="SKIN", help=f"from {', '.join(NAMES)}; all by default")
+    parser.add_argument("--seconds", type=float, default=600, help="of `load` for each skin (%(default)s)")
+    args = parser.parse_args()
+    if wrong := set(args.skins) - set(NAMES):
+        parser.error(f"no skin {', '.join(sorted(wrong))}; there are {', '.join(NAMES)}")
+    for part in [args.part] if args.part in PARTS else [] if args.part else PARTS:
+        for name in args.skins or NAMES:
+            found = PARTS[part](name, args)
+            print(part, name, json.dumps(found), flush=True)
+            _keep(part, name, found)
+    page.write(ROOT / "docs" / "skins.md", json.loads(RESULTS.read_text("utf-8")))
+    return 0
+
+
+def _keep(part: str, name: str, found: dict[str, Any]) -> None:
+    results: dict[str, Any] = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
+    results.setdefault(part, {})[name] = {"commit": commit(), **found}
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

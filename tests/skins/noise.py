@@ -1,0 +1,89 @@
+"""How often a bad cable makes a wrong frame. In: the bytes of each skin, faults. Out: counts.
+
+A frame is wrong if the box takes it and no such frame was sent. A skin with a checksum has none of them. One without
+cannot tell a changed number from a felt one; what can be asked of it is that lost and added bytes invent no frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from numpy.random import Generator, default_rng
+
+from appliance.io.skin_codecs import Rest, codec
+from tests.skins.subjects import Subject
+
+READ_BYTES = 701
+"""Bytes of one read: no multiple of any frame."""
+APART = 6
+"""One frame in so many is damaged, so that a skin is understood again in between."""
+
+Fault = Callable[[bytes, Generator], bytes]
+
+
+def lost(data: bytes, rng: Generator) -> bytes:
+    """One to eight bytes are missing."""
+    at = int(rng.integers(len(data)))
+    return data[:at] + data[at + int(rng.integers(1, 9)) :]
+
+
+def changed(data: bytes, rng: Generator) -> bytes:
+    """One byte arrives as another one."""
+    at = int(rng.integers(len(data)))
+    return data[:at] + bytes([data[at] ^ int(rng.integers(1, 256))]) + data[at + 1 :]
+
+
+def added(data: bytes, rng: Generator) -> bytes:
+    """One to 64 random bytes arrive as well."""
+    at = int(rng.integers(len(data)))
+    return data[:at] + rng.bytes(int(rng.integers(1, 65))) + data[at:]
+
+
+def twice(data: bytes, rng: Generator) -> bytes:
+    """A part of up to 64 bytes arrives twice."""
+    at = int(rng.integers(len(data)))
+    return data[:at] + data[at : at + int(rng.integers(1, 65))] + data[at:]
+
+
+FAULTS: tuple[Fault, ...] = (lost, changed, added, twice)
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseCount:
+    """faults: how many. taken: frames that the box took. wrong: those of them that were not sent. sent: frames sent."""
+
+    faults: int
+    sent: int
+    taken: int
+    wrong: int
+
+
+def count(subject: Subject, fault: Fault, faults: int, seed: int = 1) -> NoiseCount:
+    """Play a stream in which one frame of APART is damaged, and compare what comes out with what was sent."""
+    known = {frame.tobytes() for frame in subject.frames}
+    read, rest = codec(subject.profile), Rest()
+    taken = wrong = 0
+    for block in _reads(_damaged(subject, fault, faults, default_rng(seed))):
+        found = read(rest, block)
+        rest = found.rest
+        taken += len(found)
+        wrong += sum(taxels.tobytes() not in known for taxels in found.taxels)
+    return NoiseCount(faults, faults * APART, taken, wrong)
+
+
+def _damaged(subject: Subject, fault: Fault, faults: int, rng: Generator) -> Iterator[bytes]:
+    skin = subject.wire()
+    for i in range(faults * APART):
+        data = subject.sent(skin, i)
+        yield fault(data, rng) if i % APART == APART // 2 else data
+
+
+def _reads(parts: Iterator[bytes]) -> Iterator[bytes]:
+    waiting = b""
+    for part in parts:
+        waiting += part
+        while len(waiting) >= READ_BYTES:
+            yield waiting[:READ_BYTES]
+            waiting = waiting[READ_BYTES:]
+    yield waiting

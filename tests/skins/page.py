@@ -1,0 +1,76 @@
+"""The tables of docs/skins.md. In: docs/skins.json. Out: the page with each table between its markers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from appliance.core.storage import put
+
+Json = dict[str, Any]
+
+
+def write(path: Path, results: Json) -> None:
+    """Put each table into the page. Raises ValueError where a pair of markers is not there once."""
+    text = path.read_text("utf-8")
+    for part, table in TABLES.items():
+        begin, end = f"<!-- {part} -->", f"<!-- /{part} -->"
+        if text.count(begin) != 1 or text.count(end) != 1:
+            raise ValueError(f"{path} has not one pair of markers {begin} and {end}; put them where the table belongs")
+        before, _, rest = text.partition(begin)
+        rows = "\n".join(table(results.get(part, {})))
+        text = f"{before}{begin}\n{rows}\n{end}{rest.partition(end)[2]}"
+    put(path, text.encode())
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _way(found: dict[str, Json]) -> Iterator[str]:
+    yield "| skin | as recorded | chosen by `fit` | named rightly, at other positions | 95 % interval | frames lost | bundle |"
+    yield "|---|---|---|---|---|---|---|"
+    for name, row in found.items():
+        low, high = map(_percent, row["interval"])
+        right = f"{row['right']} of {row['total']}: {_percent(row['right'] / row['total'])}"
+        described = f"{row['sweeps']} sweeps, {row['format']}"
+        yield f"| {name} | {described} | {row['chosen']} | {right} | {low} to {high} | {row['lost']} | {row['bundle_kb']} kB |"
+
+
+def _noise(found: dict[str, Json]) -> Iterator[str]:
+    kinds = {
+        "lost": "1 to 8 bytes lost",
+        "added": "1 to 64 added",
+        "twice": "a part twice",
+        "changed": "a byte changed",
+    }
+    yield f"| skin | {' | '.join(kinds.values())} | frames taken of those not damaged |"
+    yield "|---|---|---|---|---|---|"
+    for name, row in found.items():
+        wrong = [_rate(row[kind]["wrong"], row[kind]["faults"]) for kind in kinds]
+        sound = sum(row[kind]["sent"] - row[kind]["faults"] for kind in kinds)
+        taken = sum(row[kind]["taken"] - row[kind]["wrong"] for kind in kinds)
+        yield f"| {name} | {' | '.join(wrong)} | {min(1.0, taken / sound):.1%} |"
+
+
+def _rate(wrong: int, faults: int) -> str:
+    """Wrong frames in so many faults; without any, the rule of three gives what they can be at most."""
+    if not wrong:
+        return f"0 of {faults:,} (below {3 / faults:.2%})"
+    return f"{wrong:,} of {faults:,} ({wrong / faults:.2%})"
+
+
+def _load(found: dict[str, Json]) -> Iterator[str]:
+    yield "| skin | frames | share of a core | edge to sentence | time | frames sent | lost |"
+    yield "|---|---|---|---|---|---|---|"
+    for name, row in found.items():
+        times = f"{row['answer_ms']['p50']:.1f} ms, 99 % within {row['answer_ms']['p99']:.1f} ms (n = {row['answers']})"
+        lost = row["sent"] - row["came"]
+        yield (
+            f"| {name} | {row['format']} | {_percent(row['share'])} | {times} | {row['seconds']:.0f} s | {row['sent']:,} "
+            f"| {lost} |"
+        )
+
+
+TABLES: dict[str, Callable[[dict[str, Json]], Iterator[str]]] = {"way": _way, "noise": _noise, "load": _load}

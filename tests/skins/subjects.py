@@ -1,0 +1,54 @@
+"""The skins that are measured. In: the name of a delivered profile. Out: its profile, its emulator, and numbered frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.io import skin_profile
+from appliance.io.skin_profile import SkinProfile
+from appliance.sim.skins.devices import on_wire
+from appliance.sim.skins.wires import WIRES, Wire, wire
+from tests.factories.paths import ROOT
+
+PROFILES = ROOT / "firmware_config" / "skins"
+NAMES = tuple(WIRES)
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A skin that sends frames of random content. frames: [n, *shape], sent again and again."""
+
+    name: str
+    profile: SkinProfile
+    frames: NDArray[np.generic]
+
+    def wire(self) -> Wire:
+        """A new emulator of it."""
+        return wire(self.name, self.profile.rate_hz)
+
+    def sent(self, skin: Wire, i: int) -> bytes:
+        """The bytes of frame `i`."""
+        return skin.frame(
+            on_wire(self.frames[i % len(self.frames)], self.profile), round(1e6 * i / self.profile.rate_hz)
+        )
+
+
+@lru_cache
+def subject(name: str, rows: int = 0, cols: int = 0, n: int = 251) -> Subject:
+    """The skin with this name. Its numbers fill the range of the type, so that every marker occurs among them.
+
+    rows, cols: the grid on the wire, by default the profile's.
+    """
+    profile = skin_profile.load(name, [PROFILES])
+    profile = replace(profile, rows=rows or profile.rows, cols=cols or profile.cols)
+    fmt, rng = profile.format, np.random.default_rng(sum(name.encode()))
+    if fmt.dtype == "float32":
+        values = rng.integers(-4000, 4000, (n, *fmt.shape)) / 4  # what two digits after the point can hold
+    else:
+        most = 0xF9FF if name == "xela-can" else np.iinfo(fmt.dtype).max
+        values = rng.integers(0, most + 1, (n, *fmt.shape))
+    return Subject(name, profile, values.astype(fmt.numpy_type))
