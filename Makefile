@@ -9,7 +9,7 @@ DESKTOP := $(VENV)/desktop.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast check machines lint types bench bundle chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
+.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
   deploy install wheel lock clean
 
 help: ## this list
@@ -93,6 +93,9 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
 	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --seed 1 --out build/default.npz
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 3
+
+skins: $(DESKTOP) ## measure emulated skins: docs/skins.md; PART=way, noise or load alone, SKINS= some of them
+	nice $(BIN)/python -m tests.skins $(PART) $(SKINS)
 
 chart: $(DESKTOP) ## speed against accuracy: docs/chart/ (goes on where it was interrupted)
 	$(BIN)/palpate-train chart $(CHART)

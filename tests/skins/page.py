@@ -66,7 +66,7 @@ def _load(found: dict[str, Json]) -> Iterator[str]:
     yield "|---|---|---|---|---|---|---|"
     for name, row in found.items():
         times = f"{row['answer_ms']['p50']:.1f} ms, 99 % within {row['answer_ms']['p99']:.1f} ms (n = {row['answers']})"
-        lost = row["sent"] - row["came"]
+        lost = max(0, row["sent"] - row["came"])  # a read may end with frames that were sent before the first one
         yield (
             f"| {name} | {row['format']} | {_percent(row['share'])} | {times} | {row['seconds']:.0f} s | {row['sent']:,} "
             f"| {lost} |"

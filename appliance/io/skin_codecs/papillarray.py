@@ -78,8 +78,11 @@ def _pts_content(body: bytes) -> tuple[NDArray[Any], tuple[int, int]] | None:
         ends = dict(pairwise([*sorted(blocks.values()), len(body)]))
         if ends[blocks[1]] - blocks[1] != _CLOCK.size:
             return None
+        # the sum does not see bytes of 0 that are missing; then block 4 no longer begins with the number of sensors
+        if 4 in blocks and _U16.unpack_from(body, blocks[4]) != _U16.unpack_from(body, blocks[3]):
+            return None
         clock = _CLOCK.unpack_from(body, blocks[1])
-        # the sum does not see bytes of 0 that were added, the lengths of the blocks do
+        # nor those that were added; the lengths of the blocks do
         return _pts_pillars(body[: ends[blocks[3]]], blocks[3]), clock
     except (struct.error, KeyError, ValueError, IndexError):
         return None

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from appliance.core.errors import ConfigError
+from appliance.io import skin_profile
+from appliance.io.skin_codecs import Rest, codec
 from appliance.sim.skins import wires
+from tests.factories.paths import ROOT
 
 PREVIEW = bytes.fromhex(
     "556677880201001b0003002700040029020500630206000f0307002b0300004efa320031aa768f0000000002002d002b01"
@@ -139,3 +142,16 @@ def test_unknown_name() -> None:
     """The error names what there is."""
     with pytest.raises(ConfigError, match=r"'biotac'; there are flexitac, .*robotiq-tsf"):
         wires.wire("biotac", 100)
+
+
+def test_a_zero_that_is_missing_makes_no_frame() -> None:
+    """The controller's sum does not see it. Wherever one is missing, the box takes the frame as it was sent, or none."""
+    profile = skin_profile.load("papillarray", [ROOT / "firmware_config" / "skins"])
+    force = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
+    sent = wires.PapillArray().frame(force, 1000)
+    taken = 0
+    for at in (i for i, byte in enumerate(sent) if not byte):
+        for taxels in codec(profile)(Rest(), sent[:at] + sent[at + 1 :]).taxels:
+            assert (taxels == force).all()
+            taken += 1
+    assert taken > 0  # what follows the forces is of no interest
