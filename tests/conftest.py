@@ -58,7 +58,7 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
                 box = assembly.box(settings, model, simulated, port, stack, observers=watching, capture=capture)
             else:  # a box that records
                 box = assembly.recorder(
-                    settings, skin.FORMAT, simulated, port, stack, observers=watching, commands=commands
+                    settings, simulated.format, simulated, port, stack, observers=watching, commands=commands
                 )
             return Rigged(box, simulated, far_end, port, kept=kept)
 

@@ -24,6 +24,7 @@ VIEW_NS = 200_000_000
 """From one View to the next."""
 SPAN_S = 0.3
 """How much of the latest signal is averaged: long compared with the vibrations of a pulse or a robot's controller."""
+NO_BUNDLE = "none for this skin"
 SHOWN = 10
 """The strongest load shown is at first so many times the contact threshold."""
 
@@ -31,18 +32,20 @@ SHOWN = 10
 @dataclass(frozen=True, slots=True)
 class Expected:
     """What is known of the skin beforehand. bundle: the one that fits it, in words. contact: its threshold, in counts, and
-    place: its positions in training, both None without such a bundle."""
+    place: its positions in training, both None without such a bundle, or where it does not know them. unloaded: counts
+    [R, C] along the normal that an unloaded skin gives by the bundle; 0 without."""
 
     format: SweepFormat
-    bundle: str = "none for this skin"
+    bundle: str = NO_BUNDLE
     contact: float | None = None
     place: ContactPositions | None = None
+    unloaded: NDArray[np.float64] | float = 0.0
 
     @classmethod
     def by(cls, model: Bundle) -> Expected:
         """What a bundle says."""
         m = model.manifest
-        return cls(m.format, f"{m.name} {m.version}, {model.id}", m.thresholds.contact, m.place)
+        return cls(m.format, f"{m.name} {m.version}, {model.id}", m.thresholds.contact, m.place, normal(m.tare, 0))
 
 
 class Alignment:
@@ -103,15 +106,17 @@ class Alignment:
         """The View of a streaming skin with this load [R, C], raw counts, and centre of contact (None: no contact)."""
         place = self._expected.place
         shown: dict[str, Any] = {"load": tuple(map(tuple, load.round(1).tolist())), "full": self._full}
-        least = self._lowest[np.isfinite(self._lowest)].max(initial=-np.inf)
+        lowest = self._lowest - self._expected.unloaded
+        least = lowest[np.isfinite(lowest)].max(initial=-np.inf)
         if self._expected.contact is not None and least >= self._expected.contact:
-            hint = f"a taxel has not read less than {least:.0f} raw counts yet: something lies on the skin"
+            above = " above the unloaded skin" if np.any(self._expected.unloaded) else ""
+            hint = f"a taxel has not read less than {least:.0f} raw counts{above} yet: something lies on the skin"
             return self._view("lift", "lift the finger off the skin once", hint, **shown)
         if found is None:
             return self._view("no-contact", "nothing touches the skin", "rest the finger on the tube", **shown)
         if place is None:
             hint = "this bundle does not say where the skin sat in training; export it again"
-            if self._expected.contact is None:
+            if self._expected.bundle == NO_BUNDLE:
                 hint = "no bundle fits this skin, so there is no trained position; palpate record needs none"
             return self._view("no-positions", "the contact's centre alone", hint, **shown, centre=found)
         offset = place.offset(found)

@@ -12,6 +12,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.schema import typed
 from appliance.core.types import SweepFormat
@@ -110,6 +113,8 @@ class Manifest:
     input: "raw" or a feature set. files: name -> sha256 and size. figures: results by evaluation protocol. made:
     commit, seed and machine of the export. early, known, place, moved: rules for early answers and unknown materials,
     contact positions of training, and the rule for contacts elsewhere; None if the bundle does not support them.
+    unloaded: raw counts of the skin without contact, the values of a frame in their order; () where they are not known,
+    which `json` omits.
     runtime: least version of the box that can run it. counter: increases with each signed bundle, so that an older one
     cannot be installed unnoticed; 0 was never signed.
     """
@@ -129,6 +134,7 @@ class Manifest:
     moved: Moved | None = None
     runtime: str = "0.0.0"
     counter: int = 0
+    unloaded: tuple[float, ...] = ()
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -144,6 +150,13 @@ class Manifest:
             raise BundleError(f"manifest must have both `known` and {MEANS}, or neither; export the bundle again")
         if self.moved and not (self.known and self.place):
             raise BundleError("manifest has `moved` without `known` and `place`; export the bundle again")
+        if self.place and self.thresholds.contact is None:
+            raise BundleError("manifest has `place` without `thresholds.contact`; export the bundle again")
+        if self.unloaded and len(self.unloaded) != self.format.channels:
+            raise BundleError(
+                f"manifest gives {len(self.unloaded)} counts of the unloaded skin, its frames have {self.format.channels}; "
+                "export the bundle again"
+            )
         if self.early and self.input != "raw":
             raise BundleError(
                 f"manifest has `early`, but input {self.input!r} needs the whole window; export it without"
@@ -158,7 +171,14 @@ class Manifest:
     def json(self) -> bytes:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = asdict(self) | {"format": self.format.json()}
+        if not self.unloaded:
+            del values["unloaded"]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
+
+    @property
+    def tare(self) -> NDArray[np.float64]:
+        """Raw counts of the unloaded skin, of the shape of a frame, from which the box starts; 0 where they are not known."""
+        return np.array(self.unloaded or (0.0,) * self.format.channels).reshape(self.format.shape)
 
     @classmethod
     def parse(cls, text: bytes) -> Manifest:

@@ -27,7 +27,8 @@ class SweepSet:
 
     samples: raw counts [N, T, R, C] or [N, T, R, C, A] of one of DATA_TYPES. labels: int [N], indices into `materials`.
     rate_hz: frames per second. groups: int [N] each; sweeps with the same number in `recording` are parts of one recording. source: the
-    name used in messages. Raises FormatError naming `source` and what is wrong.
+    name used in messages. unloaded: float [N, 2, R, C] or [N, 2, R, C, A], mean and standard deviation of the skin without
+    contact as it was when each sweep was recorded, NaN for a sweep where it is not known; None where it never is. Raises FormatError naming `source` and what is wrong.
     """
 
     samples: Array
@@ -36,6 +37,7 @@ class SweepSet:
     rate_hz: float
     groups: dict[str, Array] = field(default_factory=dict)
     source: str = "sweep set"
+    unloaded: Array | None = None
 
     def __post_init__(self) -> None:
         x, n = self.samples, len(self.materials)
@@ -53,6 +55,12 @@ class SweepSet:
             if values.shape != (len(x),) or values.dtype.kind not in "iu":
                 what = f"{values.dtype} {list(values.shape)}"
                 raise self._error(f"{name} holds {what}; give one whole number for each of {len(x)} sweeps")
+        level, wanted = self.unloaded, (len(x), 2, *x.shape[2:])
+        if level is not None and (level.shape != wanted or level.dtype.kind != "f"):
+            raise self._error(
+                f"unloaded holds {level.dtype} {list(level.shape)}; give floats {list(wanted)}: mean and standard deviation "
+                "of the unloaded skin for each sweep, or leave it out"
+            )
         outside = np.flatnonzero((self.labels < 0) | (self.labels >= n))
         if len(outside):
             i = outside[0]
@@ -131,7 +139,9 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
     native = {k: v.astype(v.dtype.newbyteorder("="), copy=False) for k, v in arrays.items()}
     groups = {k.removeprefix("group_"): v for k, v in native.items() if k.startswith("group_")}
     materials = tuple(str(m) for m in arrays["materials"])
-    return kind(native["samples"], native["labels"], materials, arrays["rate_hz"].item(), groups, source)
+    return kind(
+        native["samples"], native["labels"], materials, arrays["rate_hz"].item(), groups, source, native.get("unloaded")
+    )
 
 
 def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:

@@ -132,7 +132,7 @@ class Shadow(Observer):
                 f"candidate {candidate.id} wants {candidate.format}, the bundle in service {current.format}: one skin "
                 "cannot serve both; commit to it without a shadow"
             )
-        self._clock, self._failures_in_row = clock, 0
+        self._clock, self._failures_in_row, self._tare = clock, 0, current.manifest.tare
         self._log = TroubleLog(f"shadow: {folder} cannot be written", "make room there; classifying goes on")
         self._waiting: list[tuple[Sweep, Verdict, Mapping[str, Any]]] = []
         self._settled_ns = self._due_ns = clock.now_ns() + PERIOD_NS
@@ -153,7 +153,9 @@ class Shadow(Observer):
         """Let the candidate judge a sweep that has a window; one on which they differ is kept in a later turn."""
         if self._failures_in_row == FAILURES or not len(sweep.frames):
             return
-        self._classifier.tare = np.asarray(circumstances["tare"], np.float64)
+        tare = np.asarray(circumstances["tare"], np.float64)
+        sent = not np.array_equal(tare, self._tare)  # by TARE; without one each bundle has its own
+        self._classifier.tare = tare if sent else self._classifier.bundle.manifest.tare
         begin_ns = self._clock.now_ns()
         self._due_ns = min(self._due_ns, begin_ns + PERIOD_NS)
         try:

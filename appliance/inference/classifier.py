@@ -79,7 +79,7 @@ class Classifier:
         self._clock, self._fusion, self._max_sweeps = clock, fusion, max_sweeps
         self._object = 0
         self._scores: list[NDArray[np.float64]] = []  # of the object's sweeps so far
-        self.tare: NDArray[np.float64] = np.zeros(bundle.format.shape)
+        self.tare = bundle.manifest.tare
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
         rule = bundle.manifest.moved
@@ -228,7 +228,9 @@ class Classifier:
     def _moved(self, sweep: Sweep) -> str:
         """Distance of the contact from its positions in training, "" if it is at one of them."""
         m = self.bundle.manifest
-        return moved(sweep.frames.taxels, self.tare, m.thresholds.contact, m.place) if m.place else ""
+        if m.place is None or m.thresholds.contact is None:
+            return ""
+        return moved(sweep.frames.taxels, self.tare, m.thresholds.contact, m.place)
 
     def _verdict(
         self, sweep: Sweep, finding: Finding, scores: NDArray[np.float64] = _NONE, fused: int = 0,

@@ -72,14 +72,14 @@ class KeptSweep:
     """A kept sweep with the content of its sidecar; older sidecars hold less.
 
     object: the folder, run and object number that fused sweeps share. rule: None where the sidecar has none. tare:
-    [R, C] or [R, C, A] raw counts. bundle: its id, or "". verdict: as `Verdict.as_dict` gives it, or empty.
+    [R, C] or [R, C, A] raw counts, None where the sidecar has none. bundle: its id, or "". verdict: as `Verdict.as_dict` gives it, or empty.
     """
 
     sweep: Sweep
     format: SweepFormat
     object: tuple[Path, int, int]
     rule: ReplayRule | None
-    tare: NDArray[np.float64]
+    tare: NDArray[np.float64] | None
     bundle: str
     verdict: dict[str, Any]
 
@@ -89,7 +89,7 @@ class KeptSweep:
         sweep, fmt = load(path)
         about = sidecar(path)
         try:
-            tare = np.broadcast_to(np.asarray(about.get("tare", 0.0), np.float64), fmt.shape)
+            tare = np.broadcast_to(np.asarray(about["tare"], np.float64), fmt.shape) if "tare" in about else None
             rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
             touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))
@@ -171,7 +171,7 @@ class Judge:
                 self._classifier = Classifier(self._bundle, self._clock, *astuple(kept.rule))
             else:
                 self._classifier = assembly.classifier(self._settings, self._bundle, self._clock)
-        self._classifier.tare = kept.tare
+        self._classifier.tare = self._bundle.manifest.tare if kept.tare is None else kept.tare
         self._clock.t_ns = kept.verdict.get("time_ns", kept.sweep.complete_ns)
         return self._classifier
 

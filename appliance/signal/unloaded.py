@@ -40,11 +40,13 @@ class UnloadedSkin:
     @classmethod
     def measured(cls, taxels: NDArray[Any]) -> UnloadedSkin:
         """From frames of a skin that nothing touches, raw counts [n, R, C] or [n, R, C, A]."""
-        noise = taxels.std(axis=0, dtype=np.float64)
+        return cls.of(taxels.mean(axis=0, dtype=np.float64), taxels.std(axis=0, dtype=np.float64), taxels.dtype)
+
+    @classmethod
+    def of(cls, level: NDArray[np.float64], noise: NDArray[np.float64], counts: np.dtype[Any]) -> UnloadedSkin:
+        """From mean and standard deviation of each taxel. counts: the type of the raw counts."""
         contact = NOISE * _median(noise)
-        if taxels.dtype.kind != "f":
-            contact = max(contact, LEAST_COUNTS)
-        return cls(taxels.mean(axis=0, dtype=np.float64), noise, contact)
+        return cls(level, noise, contact if counts.kind == "f" else max(contact, LEAST_COUNTS))
 
 
 class UnloadedTracker:

@@ -24,11 +24,12 @@ SHARE = 0.1
 class WindowLimits:
     """Limits for a window.
 
-    contact: least mean over time of a loaded taxel, in counts above the tare. full_scale: the sensor's highest count.
+    contact: least mean over time of a loaded taxel, in counts above the tare; None where nothing tells a load from the
+    unloaded skin, so that every taxel counts as loaded. full_scale: the sensor's highest count.
     saturated: largest accepted share of full-scale counts. dead_taxels: largest accepted number of these.
     """
 
-    contact: float
+    contact: float | None
     full_scale: float
     saturated: float = 0.01
     dead_taxels: int = 0
@@ -70,7 +71,7 @@ def inspect(
     load = np.abs(load) if either_way else load
     if not np.isfinite(load).all():  # possible with float32 counts; no output of the network is an answer then
         return Finding(Status.DEAD_TAXEL, _taxels(~np.isfinite(load)))
-    loaded = load[..., -1:] >= limits.contact  # [R, C, 1]
+    loaded = load[..., -1:] >= (-np.inf if limits.contact is None else limits.contact)  # [R, C, 1]
     if not loaded.any():
         return Finding(Status.NO_CONTACT, f"strongest taxel {load[..., -1].max():.1f} digits")
     full = _at_full_scale(series, highest, lowest, limits.full_scale, form)

@@ -107,6 +107,8 @@ def _usable(read: bundle.Manifest) -> None:
         assert type(value) is int, f"{value!r} is no whole number"
         assert abs(value) < 1 << 63
     limits = [getattr(read.thresholds, field.name) for field in fields(read.thresholds)]
+    limits = [value for value in limits if value is not None]
+    assert read.tare.shape == f.shape
     for value in (f.rate_hz, *limits):
         assert type(value) in (int, float), f"{value!r} is no number"
         assert isfinite(value)
@@ -119,7 +121,7 @@ def _usable(read: bundle.Manifest) -> None:
         assert isinstance(entry, dict)
     assert isinstance(read.figures, dict)
     again = read.json()
-    assert json.loads(again).keys() == {field.name for field in fields(read)}
+    assert json.loads(again).keys() | {"unloaded"} == {field.name for field in fields(read)}
     assert bundle.Manifest.parse(again).json() == again, "what a manifest writes reads as something else"
 
 

@@ -249,9 +249,11 @@ def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | Non
 
 
 def _print(manifest: Manifest, out: Path) -> None:
-    """The figures of a bundle, and its size; why it is not in int8, where it might be."""
+    """The figures of a bundle, and its size; why it is not in int8 or cannot tell contact, where it might."""
     if why := manifest.made.get("float_because"):
         print(f"in float, not int8, which takes more time: {why}")
+    if why := manifest.made.get("contact_unknown_because"):
+        print(f"no-contact cannot be told: {why}")
     _print_figures(manifest.figures)
     size = measure.sizes(out)[1]
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")

@@ -26,6 +26,7 @@ HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
 """Rate of the TactMat data, which neither the file nor its page states: that of the same laboratory's skin in the paper
 (sec. II.A). A `rate_hz` in the file takes precedence."""
+SET_ARRAYS = ("samples", "labels", "materials", "rate_hz", "unloaded")
 NAMED = ("position", "session")
 """What a recording may name, beside its material."""
 REFUSED = tuple(status for status in Status if status.faulty)
@@ -63,6 +64,25 @@ class RecordedSweep:
             return str(self.sweep.status)
         return str(answer) if answer in REFUSED else "early" if self.sweep.share < 1 else ""
 
+    @property
+    def unloaded(self) -> Array:
+        """Mean and standard deviation of the unloaded skin, float [2, R, C] or [2, R, C, A]; NaN where the sidecar does not
+        know them. Raises FormatError where it has something else."""
+        found = self.about.get("unloaded")
+        shape = self.format.shape
+        if found is None:
+            return np.full((2, *shape), np.nan)
+        try:
+            level = np.stack([np.asarray(found[name], np.float64) for name in ("level", "noise")])
+        except (TypeError, KeyError, ValueError):
+            level = np.empty(0)
+        if level.shape != (2, *shape):
+            raise FormatError(
+                f"{self.path}: `unloaded` of its sidecar has no level and noise of the shape {list(shape)}; "
+                "take one that was not changed, or remove the entry"
+            )
+        return level if np.isfinite(level).all() else np.full(level.shape, np.nan)
+
 
 def read(path: Path, kind: type[Set]) -> Set:
     """The set at `path`, in whatever format. Raises FormatError naming what is missing or of the wrong form, and where."""
@@ -83,7 +103,7 @@ def hdf5(path: Path, kind: type[Set]) -> Set:
     """The set in an HDF5 file with the keys of an .npz, or in the TactMat layout. Raises FormatError."""
     try:
         with h5py.File(path, "r") as file:
-            names = [k for k in file if k in ("samples", "labels", "materials", "rate_hz") or k.startswith("group_")]
+            names = [k for k in file if k in SET_ARRAYS or k.startswith("group_")]
             arrays = {name: array_in(file, name) for name in names}
             if "rate_hz" in file.attrs:
                 arrays.setdefault("rate_hz", np.asarray(file.attrs["rate_hz"]))
@@ -215,8 +235,11 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
         )
     materials = [one.sweep.material for one in kept]
     samples = np.stack([one.sweep.frames.taxels for one in kept])
+    unloaded = np.stack([one.unloaded for one in kept])
     rate = np.array(kept[0].format.rate_hz)
     about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
+    if np.isfinite(unloaded).any():
+        about["unloaded"] = unloaded
     return build({"samples": samples} | about | groups, source, kind)
 
 

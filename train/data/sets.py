@@ -51,7 +51,8 @@ class Dataset(sweep_set.SweepSet):
     def take(self, index: Array) -> Dataset:
         """The sweeps `index` (mask or numbers) with all materials, so that labels keep their meaning."""
         groups = {k: v[index] for k, v in self.groups.items()}
-        return replace(self, samples=self.samples[index], labels=self.labels[index], groups=groups)
+        unloaded = None if self.unloaded is None else self.unloaded[index]
+        return replace(self, samples=self.samples[index], labels=self.labels[index], groups=groups, unloaded=unloaded)
 
     def select(self, conditions: Sequence[str]) -> Dataset:
         """The sweeps for which all conditions hold, without materials that do not occur.
@@ -104,7 +105,7 @@ class Dataset(sweep_set.SweepSet):
         """
         means = self.samples.mean(axis=1, keepdims=True, dtype=np.float64)  # exact where a taxel is constant
         samples = np.subtract(self.samples, means, out=np.empty(self.samples.shape, np.float32), casting="same_kind")
-        return replace(self, samples=samples)
+        return replace(self, samples=samples, unloaded=None)
 
     def counts_by(self, by: str) -> tuple[Array, Array, Array]:
         """The values [V] of group `by`, the index of each sweep's value [N], and the sweeps of each material [V, K]."""
@@ -141,6 +142,8 @@ class Dataset(sweep_set.SweepSet):
         groups = {f"group_{k}": v for k, v in self.groups.items()}
         rate = np.array(self.rate_hz)
         arrays: dict[str, Array] = {"samples": self.samples, "labels": self.labels, "rate_hz": rate} | groups
+        if self.unloaded is not None:
+            arrays["unloaded"] = self.unloaded
         if path.suffix in readers.HDF5:
             readers.write_hdf5(path, arrays | {"materials": list(self.materials)})
         else:
@@ -193,7 +196,18 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
             parts = [part - part.min() + start for part, start in zip(parts, starts, strict=False)]
         groups[name] = np.concatenate(parts)
     samples, labels = (np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels"))
-    return Dataset(samples, labels, head.materials, head.rate_hz, groups, " + ".join(s.source for s in sets))
+    source = " + ".join(s.source for s in sets)
+    return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, _unloaded(sets))
+
+
+def _unloaded(sets: Sequence[Dataset]) -> Array | None:
+    """What all sets know of the unloaded skin, one after the other."""
+    if all(s.unloaded is None for s in sets):
+        return None
+    known: Array = np.concatenate(
+        [np.full((len(s), 2, *s.format.shape), np.nan) if s.unloaded is None else s.unloaded for s in sets]
+    )
+    return known
 
 
 def _simulated(spec: str, seed: int) -> Dataset:
@@ -221,6 +235,8 @@ def digest(sweeps: Dataset) -> str:
     total = hashlib.sha256(repr((sweeps.materials, float(sweeps.rate_hz), x.dtype.name, x.shape, names)).encode())
     for numbers in (sweeps.labels, *(sweeps.groups[name] for name in names)):
         total.update(numbers.astype("<i8").tobytes())
+    if sweeps.unloaded is not None:
+        total.update(np.ascontiguousarray(sweeps.unloaded, "<f8").data)
     total.update(np.ascontiguousarray(x, x.dtype.newbyteorder("<")).data)
     return total.hexdigest()[:16]
 

@@ -52,7 +52,12 @@ class Change:
             frames = max(round(self.window * x.shape[1]), 1)
             first = (x.shape[1] - frames) // 2
             x = x[:, first : first + frames]
-        return sweeps if x is sweeps.samples else replace(sweeps, samples=x, rate_hz=sweeps.rate_hz / self.rate)
+        if x is sweeps.samples:
+            return sweeps
+        unloaded = sweeps.unloaded  # of fewer taxels nothing is known
+        if x.shape[2:] != sweeps.samples.shape[2:]:
+            unloaded = None
+        return replace(sweeps, samples=x, rate_hz=sweeps.rate_hz / self.rate, unloaded=unloaded)
 
     def __str__(self) -> str:
         left = [f"{k} {len(v) if k == 'taxels' else v}" for k, v in vars(self).items() if v != getattr(WHOLE, k)]

@@ -23,6 +23,7 @@ from appliance.sim import skin
 from train.calibration import novelty
 from train.data.sets import Dataset
 from train.evaluation.corruptions import EvaluationSweeps
+from train.export.contact_limit import ContactLimit
 from train.metrics.score import interval, provenance
 
 Array = NDArray[Any]
@@ -37,21 +38,19 @@ LOSS = 0.05
 """Accuracy counts as lost where it is so far below that of a skin that has not moved."""
 
 
-def place_of(sweeps: Dataset, contact: float, pitch_mm: float | None = None) -> ContactPositions | None:
+def place_of(sweeps: Dataset, loads: ContactLimit, pitch_mm: float | None = None) -> ContactPositions | None:
     """The centre of contact at each position of a training set (else of each recording); None where the distance of the
-    taxels is not known, or nothing touched them.
+    taxels or the threshold is not known, or nothing touched them.
 
-    contact: the bundle's threshold. pitch_mm: of the skin; a simulated skin's is known. The raw counts are those of a box
-    without a TARE: they are relative to the unloaded skin.
+    pitch_mm: of the skin; a simulated skin's is known. Loads are those of a box without a TARE.
     The limit keeps 97 % of positions whose own sweeps were left out (their farthest one counts), as novelty.limit
     computes it; of 33 positions and fewer it keeps all.
     """
     if pitch_mm is None and all(part.startswith("sim:") for part in sweeps.source.split(" + ")):
         pitch_mm = skin.PITCH_MM
-    if pitch_mm is None:
+    if pitch_mm is None or loads.contact is None:
         return None
-    tare = np.zeros(sweeps.samples.shape[2:])
-    found = [centre(window, tare, contact) for window in sweeps.samples]
+    found = [centre(window, loads.tare, loads.contact) for window in sweeps.samples]
     touched = np.array([point is not None for point in found])
     if not touched.any():
         return None
@@ -114,6 +113,7 @@ def _point(
     assert test.scene
     sweeps, place, limits = test.sweeps, box.bundle.manifest.place, box.bundle.manifest.thresholds
     assert place
+    assert limits.contact is not None
     right, moved, wrong, unsure, unknown, network, distance_mm = (np.zeros(len(sweeps)) for _ in range(7))
     for i, window in enumerate(test.scene.draw(where)):
         n = np.arange(len(window))

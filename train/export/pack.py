@@ -27,11 +27,11 @@ from appliance.bundle.manifest import UNSURE as LEAST_SURE
 from appliance.core import provenance, storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
-from appliance.core.types import Status, normal
+from appliance.core.types import Status
 from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, softmax
 from train.calibration.posthoc import HeldOut, calibrate
 from train.data.sets import Dataset
-from train.export import bundle_score
+from train.export import bundle_score, contact_limit
 from train.export.contact_positions import place_of
 from train.metrics.score import accuracy_figure, fuse
 from train.models.compact.fitted import Fit
@@ -94,8 +94,9 @@ def pack(
     Raises ExportRefused where a check fails, and BundleError where a label or the target cannot be used.
     """
     train, held_out = content.train, content.held_out
-    limits = thresholds(train, full_scale)
-    place = place_of(train, limits.contact, pitch_mm)
+    loads = contact_limit.find(train)
+    limits = thresholds(train, loads.contact, full_scale)
+    place = place_of(train, loads, pitch_mm)
     content = with_posthoc(content, place is not None)
     logits = run(content.model, model_inputs(content.input, train))
     golden = golden_sweeps(train, logits, logits_of_means(content, train) if content.known else logits)
@@ -103,10 +104,11 @@ def pack(
     files |= {bundle.MEANS: content.means} if content.known else {}
     manifest = bundle.Manifest(
         name=name, version=version, format=train.format, input=content.input, labels=train.materials,
-        thresholds=limits, place=place, runtime=RUNTIME, early=content.early, known=content.known, moved=content.moved,
+        thresholds=limits, place=place, unloaded=tuple(loads.tare.ravel().tolist()) if loads.tare.any() else (), runtime=RUNTIME, early=content.early, known=content.known, moved=content.moved,
         files={k: bundle.file_entry(v) for k, v in files.items()},
         made={"commit": commit, "set": train.source, "machine": platform.machine(), "cpus": os.cpu_count(),
-              "torch": metadata.version("torch") if find_spec("torch") else None, "onnxruntime": onnxruntime.__version__} | content.about,
+              "torch": metadata.version("torch") if find_spec("torch") else None, "onnxruntime": onnxruntime.__version__}
+             | ({"contact_unknown_because": loads.why} if loads.why else {}) | content.about,
     )  # fmt: skip
     with _replacing(target) as folder:
         for file, data in files.items():
@@ -239,14 +241,10 @@ def _why(sweeps: Dataset, label: int) -> str:
     return "they look like others; record it at more positions, or leave it out with --only"
 
 
-def thresholds(sweeps: Dataset, full_scale: float | None) -> bundle.Thresholds:
-    """The thresholds for a window. contact: a tenth of the weakest contact in training, by the strongest taxel's mean on
-    the normal axis."""
-    weakest = float(normal(sweeps.samples, 2).mean(axis=1, dtype=np.float64).max(axis=(1, 2)).min())
+def thresholds(sweeps: Dataset, contact: float | None, full_scale: float | None) -> bundle.Thresholds:
+    """The thresholds for a window; without `full_scale` the highest count of the type is taken for it."""
     kind = sweeps.samples.dtype
     top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
-    # below the weakest also where a tared skin was pulled, so that its counts are negative
-    contact = weakest - 0.9 * abs(weakest)
     return bundle.Thresholds(contact=contact, full_scale=float(top if full_scale is None else full_scale))
 
 

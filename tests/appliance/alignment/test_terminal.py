@@ -103,6 +103,25 @@ def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
     assert seen[-1].load[3][3] == 0
 
 
+def test_a_skin_that_is_never_near_zero(model: Bundle):
+    """What the bundle knows of the unloaded skin is no load: the finger is told from it, and the hint counts above it."""
+    rest = replace(model, manifest=replace(model.manifest, unloaded=(50.0,) * 16))
+    seen = views_of(pressed(130, 145, 52, 130), rest)(4)
+    assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
+    assert "80 raw counts above the unloaded skin" in next(v for v in seen if v.state == "lift").hint
+    assert states(views_of(pressed(130, 145, 52, 130), model)(4)) == ["wait", "lift"]
+
+
+def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
+    """What is a contact comes from the unloaded skin of this moment, as without a bundle; no position is compared."""
+    m = model.manifest
+    limits = replace(m.thresholds, contact=None)
+    without = replace(model, manifest=replace(m, place=None, moved=None, thresholds=limits))
+    last = [v for v in views_of(resting(), without)(14.5) if v.centre][-1]
+    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
+    assert "export it again" in last.hint
+
+
 def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
     """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is measured anew."""
     simulated = resting()

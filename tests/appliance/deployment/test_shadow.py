@@ -168,6 +168,16 @@ def test_it_judges_with_the_box_s_tare(side):
     assert pair.shadow.agreement.pairs == {"(no-contact)": {"(no-contact)": 1}}
 
 
+def test_without_a_tare_each_bundle_has_its_own(side):
+    """The candidate knows another unloaded skin: it is judged from that, until the robot sends a TARE."""
+    pair = side(lambda b: replace(b, id="bbbbbbbb", manifest=replace(b.manifest, unloaded=(1e4,) * 4)))
+    pair.judge(A)
+    assert pair.shadow.agreement.pairs == {"a": {"(no-contact)": 1}}
+    pair.tare = pair.current.tare = np.ones((2, 2))
+    pair.judge(A)
+    assert pair.shadow.agreement.pairs == {"a": {"(no-contact)": 1, "a": 1}}
+
+
 def test_what_has_no_window_is_not_compared(side):
     """A sweep without a window tells nothing about a bundle, so it is not counted."""
     pair = side()

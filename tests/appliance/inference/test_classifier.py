@@ -174,6 +174,16 @@ def test_altered_and_missing_files_are_named(tmp_path: Path, name: str):
         ({"files": {}, "early": None, "known": None, "moved": None}, "does not name model.onnx"),
         ({"format": {"rows": 4}}, "manifest cannot be read"),
         ({"extra": 1}, "extra"),
+        ({"unloaded": [1.0, 2.0]}, "gives 2 counts of the unloaded skin, its frames have 16; export"),
+        ({"unloaded": 16}, "manifest cannot be read"),
+        ({"unloaded": ["1"] * 16}, "manifest cannot be read"),
+        (
+            {
+                "thresholds": {"contact": None, "full_scale": 255.0},
+                "place": {"pitch_mm": 4.0, "rows_mm": [1.0], "cols_mm": [1.0], "limit_mm": 1.0},
+            },
+            "`place` without `thresholds.contact`",
+        ),
         ({"labels": ["a", "b"]}, "logits"),
     ],
 )
@@ -183,6 +193,20 @@ def test_broken_manifests_are_named(tmp_path: Path, changes: dict, hint: str):
     edit(folder, **changes)
     with pytest.raises(BundleError, match=hint):
         bundle.load(folder)
+
+
+def test_a_bundle_may_know_the_unloaded_skin(tmp_path: Path):
+    """The box starts from it as its tare; the manifest of a bundle that does not know it is what it always was."""
+    folder = copy(tmp_path)
+    before = bundle.load(folder)
+    assert Classifier(before, VirtualClock()).tare.tolist() == np.zeros((4, 4)).tolist()
+    assert before.manifest.json() == (folder / bundle.MANIFEST).read_bytes()
+    assert b"unloaded" not in before.manifest.json()
+    level = [float(i) for i in range(16)]
+    edit(folder, unloaded=level)
+    after = bundle.load(folder)
+    assert Classifier(after, VirtualClock()).tare.tolist() == np.reshape(level, (4, 4)).tolist()
+    assert bundle.Manifest.parse(after.manifest.json()) == after.manifest
 
 
 def test_no_bundle(tmp_path: Path):

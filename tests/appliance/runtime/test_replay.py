@@ -212,6 +212,17 @@ def test_a_sweep_that_is_not_answered_early_any_more(tmp_path: Path):
     assert outcomes == ["s.npy: DIFFERENT (it was answered early, which this bundle does not do)"]
 
 
+def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path: Path):
+    """As the box would; one that was tared is judged with its own."""
+    model = toy_bundle.load(tmp_path / "bundle")
+    high = replace(model, manifest=replace(model.manifest, unloaded=(1e4,) * 4))
+    save(tmp_path / "s.npy", toy_bundle.sweep(0, 0), toy_bundle.FORMAT)
+    assert ",ok,a," in played(tmp_path / "s.npy", model)[1][0]
+    assert ",no-contact," in played(tmp_path / "s.npy", high)[1][0]
+    save(tmp_path / "s.npy", toy_bundle.sweep(0, 0), toy_bundle.FORMAT, {"tare": [[0.0] * 2] * 2})
+    assert ",ok,a," in played(tmp_path / "s.npy", high)[1][0]
+
+
 @pytest.mark.parametrize(
     ("about", "hint"),
     [

@@ -51,6 +51,15 @@ def test_a_spoiled_window_is_named(place, value: int, status: Status, detail: st
     assert detail in found.detail
 
 
+def test_without_a_threshold_every_taxel_counts_as_loaded():
+    """No window is without contact; a taxel that is still is stuck, as everywhere in a contact."""
+    unknown = replace(LIMITS, contact=None)
+    assert inspect(moving(6), BARE, unknown).status is Status.OK
+    taxels = moving()
+    taxels[:, 1, 2] = 0
+    assert inspect(taxels, BARE, unknown).status is Status.STUCK_TAXEL
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_taxel_that_gives_no_number_is_dead(value: float):
     """One frame of it is enough, also at the edge, and for any number of dead taxels that the bundle tolerates."""

@@ -272,6 +272,33 @@ def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):
     assert sets.digest(sets.load(str(tmp_path))) == before
 
 
+def test_the_unloaded_skin_is_kept(tmp_path: Path):
+    """Of each sweep whose sidecar knows it in numbers, NaN for the others; a set of which none does has no such array."""
+    level = [[1.0, 2, 3], [4, 5, 6]]
+    for i in range(4):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
+    assert sets.load(str(tmp_path)).unloaded is None
+    for i, known in enumerate([{"level": level, "noise": level}, None, {"level": level, "noise": [[np.nan] * 3] * 2}]):
+        save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), {"unloaded": known})
+    unloaded = sets.load(str(tmp_path)).unloaded
+    assert unloaded.shape == (4, 2, 2, 3)
+    assert unloaded[0].tolist() == [level, level]
+    assert np.isnan(unloaded[1:]).all()
+
+
+@pytest.mark.parametrize("known", [7, [], {"level": [[1.0] * 3] * 2}, {"level": [1.0], "noise": [1.0]},
+                                   {"level": [["a"] * 3] * 2, "noise": [[1.0] * 3] * 2}])  # fmt: skip
+def test_an_unloaded_skin_of_another_form_is_named(tmp_path: Path, known: object):
+    """The file, the shape that is wanted and what to do."""
+    for i in range(2):
+        record(tmp_path / f"{i}.npy", "ab"[i], id=i)
+    save(tmp_path / "1.npy", *load(tmp_path / "1.npy"), {"unloaded": known})
+    with pytest.raises(
+        FormatError, match=r"1\.npy: `unloaded` of its sidecar has no level and noise of the shape \[2, 3\]"
+    ):
+        sets.load(str(tmp_path))
+
+
 def test_what_the_box_refused_is_left_out(tmp_path: Path):
     """A skin that did not touch, or was broken, whatever its label; an early answer's part of a window."""
     for i in range(8):

@@ -77,6 +77,8 @@ NAN[4, 7, 1, 2] = np.nan
         ({"rate_hz": np.array(-1.0)}, "rate_hz is -1.0"),
         ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
         ({"materials": np.array(["a", {}, "c"], object)}, "not a sweep set"),
+        ({"unloaded": np.zeros((6, 2, 3))}, "unloaded holds float64 \\[6, 2, 3\\]; give floats \\[6, 2, 2, 3\\]"),
+        ({"unloaded": np.zeros((6, 2, 2, 3), int)}, "unloaded holds int64"),
     ],
 )
 def test_a_broken_file_is_refused_by_name(tmp_path: Path, changes: dict, message: str):
@@ -252,6 +254,24 @@ def test_without_means_leaves_the_texture(dtype: str):
     assert not bare.samples[2, :, 1, 0].any()
     np.testing.assert_allclose(np.diff(bare.samples, axis=1), np.diff(s.samples.astype(float), axis=1), atol=1e-4)
     assert (bare.labels is s.labels, bare.groups, bare.materials) == (True, s.groups, s.materials)
+
+
+@pytest.mark.parametrize("name", ["s.npz", "s.h5"])
+def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
+    """Into files of either kind, parts and joined sets, where it is unknown for the sweeps of a set that lacks it; it
+    changes the digest. Counts without their means have none."""
+    known = np.random.default_rng(1).normal(size=(12, 2, 2, 2))
+    s = replace(easy(4), unloaded=known)
+    s.save(tmp_path / name)
+    again = sets.load(str(tmp_path / name))
+    np.testing.assert_array_equal(again.unloaded, known)
+    assert sets.digest(again) == sets.digest(s) != sets.digest(easy(4))
+    np.testing.assert_array_equal(s.select(["material=low,high"]).unloaded, np.delete(known, np.s_[4:8], 0))
+    both = sets.join([easy(4, seed=1), s])
+    assert np.isnan(both.unloaded[:12]).all()
+    np.testing.assert_array_equal(both.unloaded[12:], known)
+    assert sets.join([easy(4), easy(4)]).unloaded is None
+    assert s.without_means().unloaded is None
 
 
 def test_digest_names_the_data_and_nothing_else(tmp_path: Path):

@@ -69,6 +69,13 @@ def test_rows_and_columns_stay_a_grid():
     assert line[0, 0, :, 0].tolist() == [0, 2, 4]
 
 
+def test_the_unloaded_skin_is_known_of_all_taxels_or_none():
+    """Fewer frames do not change it."""
+    known = replace(counting(), unloaded=np.zeros((2, 2, *counting().format.shape)))
+    assert Change(window=0.5, rate=2).of(known).unloaded is known.unloaded
+    assert Change(taxels=(5, 3, 0, 2)).of(known).unloaded is None
+
+
 def test_a_taxel_goes_with_all_its_axes():
     """The grid that is left has the axes that it had; a taxel whose shear alone tells materials apart comes first."""
     flat = counting()

@@ -97,9 +97,8 @@ class Fit:
 
     def save(self, path: Path) -> None:
         """Write the fit as one .npz without pickle; training and held-out sweeps are one set, the first of them trained on."""
-        sets = {
-            f"set_{k}": np.concatenate([getattr(self.train, k), getattr(self.held, k)]) for k in ("samples", "labels")
-        }
+        names = ("samples", "labels", *("unloaded",) * (self.train.unloaded is not None))
+        sets = {f"set_{k}": np.concatenate([getattr(self.train, k), getattr(self.held, k)]) for k in names}
         arrays = {f"weight_{k}": v for k, v in self.weights.items()} | sets
         for name in self.train.groups:
             arrays[f"group_{name}"] = np.concatenate([self.train.groups[name], self.held.groups[name]])
@@ -121,7 +120,8 @@ class Fit:
                 {k.removeprefix(p): v for k, v in arrays.items() if k.startswith(p)} for p in ("weight_", "group_")
             )
             samples, labels, materials = arrays["set_samples"], arrays["set_labels"], tuple(meta["materials"])
-            sweeps = Dataset(samples, labels, materials, meta["rate_hz"], groups, meta["source"])
+            unloaded = arrays.get("set_unloaded")
+            sweeps = Dataset(samples, labels, materials, meta["rate_hz"], groups, meta["source"], unloaded)
             first = np.arange(len(sweeps)) < meta["trained_on"]
             architecture = Architecture(**meta["shape"] | {"channels": tuple(meta["shape"]["channels"])})
             reach = meta["reach"]
