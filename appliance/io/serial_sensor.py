@@ -6,6 +6,7 @@ It only listens, but for the commands of the profile: a skin that is not the exp
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
@@ -88,7 +89,8 @@ class SerialSensor(LinkSensor):
         self._check_format()
         there = self._ports()
         path = self._config.port or find(self._profile.ids, self._config.serial, there)
-        info = next((port for port in there if port.path == path), PortInfo(path))
+        node = os.path.realpath(path)  # a name by id is a link
+        info = next((port for port in there if port.path in (path, node)), PortInfo(path))
         port = self._open_port(path, self._profile.baud)
         try:
             for command in self._profile.commands(self._profile.start, self._format.rate_hz):

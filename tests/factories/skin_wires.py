@@ -205,7 +205,7 @@ class WiredSkin:
         self.format = fmt or self.profile.format
         period_ns = self.profile.format.period_ns / rate
         self.port = WirePort(self.clock, lambda i: wire(name, i, period_ns), period_ns)
-        config = SensorConfig(skin=name, port=PATH, **{"retry_ms": 50} | settings)  # type: ignore[arg-type]
+        config = SensorConfig(skin=name, **{"port": PATH, "retry_ms": 50} | settings)  # type: ignore[arg-type]
         adapted = skin_profile.adapted(self.profile, config)
         self.sensor = SerialSensor(
             config, adapted, self.format, self.clock, tap, open_port=self.port.open, ports=self.port.ports

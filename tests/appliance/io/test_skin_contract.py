@@ -4,6 +4,7 @@ at which they were taken, or it is said why not. In virtual time."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -348,6 +349,17 @@ def test_once_in_step_a_mark_in_the_payload_does_no_harm(name: str):
     grid = grid.reshape(skin.profile.rows, skin.profile.cols, -1)[..., list(skin.profile.take)].reshape(-1)
     known = {taxels(skin.profile, i).tobytes() for i in range(199)} | {grid.tobytes()}
     assert all(one.tobytes() in known for one in skin.seconds(3).taxels)
+
+
+def test_a_port_named_by_id_tells_its_serial_number(tmp_path: Path):
+    """A name by id is a link; who the skin is does not depend on how its port was named."""
+    link = tmp_path / "usb-skin-S1"
+    link.symlink_to(PATH)
+    for port in (PATH, str(link)):
+        skin = WiredSkin("matrix", port=port)
+        skin.seconds(0.1)
+        assert skin.sensor.identity
+        assert skin.sensor.identity.serial == "S1"
 
 
 def test_a_sequence_number_shows_each_loss():
