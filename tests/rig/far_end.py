@@ -7,6 +7,9 @@ import threading
 import time
 from pathlib import Path
 
+ADAPTER = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_R1-if00-port0"
+"""What the guest calls an emulated USB serial adapter with the serial number R1."""
+
 
 class FarEnd:
     """heard: (host ns, line) of all lines, in order. While `deaf` nothing is read, and the guest's port fills up."""

@@ -23,7 +23,7 @@ FIELDS = (
     "time", "state", "sweeping", "answered", "received", "lost", "garbage", "enumerations", "dropped", "bundle",
     "source",
 )  # fmt: skip
-"""Of a state sentence (PROTOCOL.md, part 2)."""
+"""The first of a state sentence (PROTOCOL.md, part 2)."""
 LATE = {
     "gap", "short", "long", "no-start", "no-stop", "edges-lost", "sensor-lost", "not-ready", "unsure", "unknown",
 }  # fmt: skip
@@ -71,9 +71,9 @@ def check_recovers(cell: Cell) -> None:
 
 
 def state(cell: Cell) -> dict[str, str]:
-    """The fields of a state sentence, as of now."""
+    """The first fields of a state sentence, as of now."""
     received = cell.serial.ask("$PPLP,STATE", 30).split("*")[0].split(",")[4:]
-    return dict(zip(FIELDS, received, strict=True))
+    return dict(zip(FIELDS, received[: len(FIELDS)], strict=True))
 
 
 def until_state(cell: Cell, wanted: str, timeout_s: float = 30) -> None:

@@ -16,14 +16,13 @@ from appliance.io.robot_link import MAX_LINE, checksum
 from appliance.sim import script
 from appliance.tools.score import Answer
 from tests.rig.cell import Cell, Touch
-from tests.rig.far_end import FarEnd
+from tests.rig.far_end import ADAPTER, FarEnd
 from tests.rig.sound import known, not_wrong
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]
 
 PORT = "/dev/palpate-robot"
-ADAPTER = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_R1-if00-port0"
 DROPPED, LOST_FRAMES = 8, 5
 """Fields of STA, counted from 0."""
 AS_NOBODY = "setpriv --reuid nobody --regid dialout --clear-groups"

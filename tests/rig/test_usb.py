@@ -17,13 +17,13 @@ import pytest
 from appliance.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
+from tests.rig.pulled import SECOND, after, before, during
 from tests.rig.sound import begin, check_recovers, known, let_go, not_wrong, only_answer, state, until, until_state
 from tests.rig.usbredir import UsbRedirPeer
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]
 
-SECOND = 1_000_000_000
 HUB = "0409:55aa"
 RESETS = {
     "reset of the device": "usbreset 1209:7ac7",
@@ -36,37 +36,6 @@ RESETS = {
 def robot(shared: Cell) -> None:
     """Sweeps whose answer is known, and large packets: speed does not matter here."""
     shared.acts, shared.packet_frames = known(script.tubes(2)), 18
-
-
-def before(cell: Cell, i: int) -> str:
-    """Pulled before a sweep: READY falls, FAULT rises; a start edge is answered at once, its stop edge is not."""
-    cell.unplug()
-    assert cell.lines.wait("FAULT", True, 20)
-    assert cell.lines.wait("READY", False, 20)
-    since = len(cell.serial.heard)
-    cell.lines.set("START", True)
-    cell.answer(since)
-    for name, level in (("START", False), ("STOP", True), ("STOP", False)):
-        cell.lines.set(name, level)
-        cell.wait(0.2)
-    return only_answer(cell, since).status
-
-
-def during(cell: Cell, i: int) -> str:
-    """Pulled while the finger slides: answered at once."""
-    touch, since = begin(cell)
-    until(touch.start_ns + (i * 37 % 25) * SECOND // 10)
-    cell.unplug()
-    let_go(cell)  # no stop edge comes to bring the answer about
-    return not_wrong(touch, only_answer(cell, since))
-
-
-def after(cell: Cell, i: int) -> str:
-    """Pulled within 30 ms of the stop edge: the answer is out, or it is that the skin was lost."""
-    touch, since = begin(cell)
-    until(touch.stop_ns + i % 4 * SECOND // 100)
-    cell.unplug()
-    return not_wrong(touch, only_answer(cell, since))
 
 
 @pytest.mark.parametrize("when", [before, during, after])

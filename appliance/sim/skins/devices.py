@@ -42,7 +42,7 @@ def on_wire(taxels: NDArray[Any], profile: SkinProfile) -> NDArray[Any]:
     return taxels
 
 
-class _Reel:
+class Reel:
     """A robot's acts as frames for a wire."""
 
     def __init__(self, film: rig.Film, profile: SkinProfile) -> None:
@@ -65,7 +65,7 @@ def build(
     playing = PlayerClock(clock)
     robot, lines = robot_on_lines(acts, playing, remember=remember)
     folder = tempfile.TemporaryDirectory()
-    reel = _Reel(rig.Film(fmt, robot), profile)
+    reel = Reel(rig.Film(fmt, robot), profile)
     player = Player(wire(name, fmt.rate_hz), reel, playing, Path(folder.name) / "ttySkin")
     playing.player = player
     return PlayedDevices(

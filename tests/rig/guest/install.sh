@@ -4,6 +4,7 @@ set -eux
 cd "$1"
 /opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --no-deps --force-reinstall palpate-*.whl
 install -D -m 644 palpate.toml /etc/palpate/palpate.toml
+install -D -m 644 -t /etc/palpate/skins firmware_config/skins/*.toml
 install -m 644 systemd/palpate.service /etc/systemd/system/palpate.service
 install -m 644 systemd/palpate.sysusers /usr/lib/sysusers.d/palpate.conf
 install -m 644 systemd/palpate.tmpfiles /usr/lib/tmpfiles.d/palpate.conf
