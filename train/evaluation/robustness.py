@@ -34,6 +34,18 @@ from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_input
 
 Array = NDArray[Any]
 Json = dict[str, Any]
+TARGETS = {
+    "none": (("noise", 0.0),),
+    "noise": (("noise", 0.3),),
+    "dead": (("dead", 1.0),),
+    "noisy": (("noisy", 1.0),),
+    "gain": (("gain-down", 0.2), ("gain-up", 0.2)),
+    "lost": (("lost", 0.05),),
+    "drift": (("drift", 0.1),),
+    "hum": (("hum", 1.0),),
+    "shift": (("shift-rows", 1.0), ("shift-grid", 1.0)),
+}
+"""Corruptions and severities with a limit that the project has set; of several the worst counts."""
 POINTS = 0.05
 """A method fails where it has lost so much of its own accuracy."""
 
@@ -139,6 +151,20 @@ def falls(curve: Json, points: float = POINTS) -> float | None:
     return None
 
 
+def at_targets(curves: Json) -> dict[str, tuple[float, ...]]:
+    """Accuracy, lower and upper end of its interval at each of TARGETS that `curves` has, between two severities on a line."""
+    found = {}
+    for key, those in TARGETS.items():
+        there = [_at(curves[name], severity) for name, severity in those if name in curves]
+        if there:
+            found[key] = min(there)
+    return found
+
+
+def _at(curve: Json, severity: float) -> tuple[float, ...]:
+    return tuple(float(np.interp(severity, curve["severities"], curve[k])) for k in ("accuracy", "low", "high"))
+
+
 def worst(result: Json, method: str, n: int = 5) -> list[Json]:
     """The `n` corruptions under which `method` loses most: accuracy lost, the mean over the severities above 0."""
     found = result["methods"][method]["curves"]
@@ -147,16 +173,17 @@ def worst(result: Json, method: str, n: int = 5) -> list[Json]:
 
 
 def table(result: Json) -> str:
-    """Markdown: corruptions x methods, at which severity each has lost five points; then each method's five worst, and what
-    becomes of uninformative sweeps: on the desktop, and on the box where `result` holds `box_answers` as "box"."""
+    """Markdown: accuracy at TARGETS; corruptions x methods, at which severity each has lost five points; each method's five
+    worst; and what becomes of uninformative sweeps: on the desktop, and on the box where `result` has its answers as "box"."""
     entries = {name: entry for name, entry in result["methods"].items() if entry["curves"]}
+    lines = [*_target_lines(entries), ""]
     rows = [["accuracy lost by .05 at", *entries], ["---"] + ["---:"] * len(entries)]
     rows.append(["*no stress: accuracy*", *(f"{entry['clean']:.3f}" for entry in entries.values())])
     every = {k: curve for entry in entries.values() for k, curve in entry["curves"].items()}
     for name, curve in every.items():
         cells = [_cell(entry["curves"].get(name)) for entry in entries.values()]
         rows.append([f"{name} ({curve['unit']})", *cells])
-    lines = [f"| {' | '.join(row)} |" for row in rows] + [""]
+    lines += [f"| {' | '.join(row)} |" for row in rows] + [""]
     for name in entries:
         hardest = ", ".join(f"{w['stress']} −{w['lost']:.2f}" for w in worst(result, name))
         lines.append(f"- {name}: worst, by the mean loss over all severities: {hardest}")
@@ -167,6 +194,19 @@ def table(result: Json) -> str:
         desktop = ", ".join(f"{n} methods {answer}" for answer, n in answers.items())
         lines.append(f"- {name}: {desktop}" + (f"; the box: {result['box'][name]}" if "box" in result else ""))
     return "\n".join(lines) + "\n"
+
+
+def _target_lines(entries: Json) -> list[str]:
+    """A line for each of TARGETS with the accuracy of each method, in Markdown."""
+    found = {name: at_targets(entry["curves"]) for name, entry in entries.items()}
+    rows = [["accuracy, per cent [95 %]", *entries], ["---"] + ["---:"] * len(entries)]
+    for key, those in TARGETS.items():
+        cells = [f"{100 * at[key][0]:.1f} [{100 * at[key][1]:.1f}, {100 * at[key][2]:.1f}]" if key in at else ""
+                 for at in found.values()]  # fmt: skip
+        if any(cells):
+            what = " or ".join(f"{name} {severity:g}" for name, severity in those)
+            rows.append([what if key != "none" else "no stress", *cells])
+    return [f"| {' | '.join(row)} |" for row in rows]
 
 
 def uninformative_answers(method: Method, model: Model, test: EvaluationSweeps) -> dict[str, str]:

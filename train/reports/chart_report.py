@@ -52,15 +52,6 @@ FAMILIES = {
     "train.models.edge_spectral": "edge tools",
 }
 OTHERS = "related work"
-TARGETS = {
-    "none": (("noise", 0.0),),
-    "noise": (("noise", 0.3),),
-    "dead": (("dead", 1.0),),
-    "gain": (("gain-down", 0.2), ("gain-up", 0.2)),
-    "lost": (("lost", 0.05),),
-    "shift": (("shift-rows", 1.0), ("shift-grid", 1.0)),
-}
-"""Stresses and severities with a limit that the project has set; of several the worst counts."""
 
 
 @dataclass(frozen=True)
@@ -241,22 +232,15 @@ def joined(results: Sequence[Json]) -> Json:
 
 
 def under_stress(entry: Json) -> dict[str, Json]:
-    """Accuracies under stress from an entry of robustness.merge: "stress", the worst one's mean over severities, and TARGETS."""
+    """Accuracies under stress from an entry of robustness.merge: "stress", the worst one's mean over severities, and robustness.TARGETS."""
     curves, seeds = entry["curves"], entry["seeds"]
     n = next(iter(curves.values()))["total"] // len(seeds)
     mean = {name: [float(np.mean(c[k][1:])) for k in ("accuracy", "low", "high")] for name, c in curves.items()}
     worst = min(mean, key=lambda name: (mean[name][0], name))
     entries = {"stress": _entry(mean[worst], n, seeds) | {"name": worst}}
-    for key, those in TARGETS.items():
-        there = [_at(curves[name], severity) for name, severity in those if name in curves]
-        if there:
-            entries[f"stress:{key}"] = _entry(min(there), n, seeds)
-    return entries
-
-
-def _at(curve: Json, severity: float) -> tuple[float, ...]:
-    """Accuracy and its interval at a severity, interpolated between two that were measured."""
-    return tuple(float(np.interp(severity, curve["severities"], curve[k])) for k in ("accuracy", "low", "high"))
+    return entries | {
+        f"stress:{key}": _entry(shares, n, seeds) for key, shares in robustness.at_targets(curves).items()
+    }
 
 
 def _entry(shares: Iterable[float], n: int, seeds: Sequence[int]) -> Json:

@@ -45,8 +45,11 @@ ACCURACIES = {
     "stress:none": Axis("no stress", "the same sweeps without stress"),
     "stress:noise": Axis("noise", "white noise of 0.3 of each taxel's standard deviation"),
     "stress:dead": Axis("a dead taxel", "one taxel reads 0"),
+    "stress:noisy": Axis("a noisy taxel", "white noise on one taxel, of four of the set's standard deviations"),
     "stress:gain": Axis("gain ± 20 %", "all gains 20 % lower or higher, the worse of both"),
     "stress:lost": Axis("lost frames", "5 % of the frames lost"),
+    "stress:drift": Axis("drift", "the offset drifts by a tenth of full load within a sweep"),
+    "stress:hum": Axis("hum", "50 Hz on all taxels, of one standard deviation of the signal"),
     "stress:shift": Axis("shift", "the skin one row of taxels further along"),
 }
 """More is better; real ones first."""

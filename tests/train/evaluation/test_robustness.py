@@ -381,6 +381,7 @@ def test_the_table_says_where_each_falls():
     refused = {"method": "c", "seed": 0, "set": "x", "refused": "too short"}
     text = robustness.table(robustness.merge([task("a", 0, [18, 16, 10]), task("b", 0, [10, 10, 10]), refused]))
     assert "| accuracy lost by .05 at | a | b |" in text
+    assert "| dead 1 | 80.0 [58.4, 91.9] | 50.0 [29.9, 70.1] |" in text
     assert "| *no stress: accuracy* | 0.900 | 0.500 |" in text
     assert "| dead (taxels) | 0.5 | > 2 |" in text
     assert "- a: worst, by the mean loss over all severities: dead −0.25" in text
