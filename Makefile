@@ -13,7 +13,7 @@ WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box wi
   deploy install wheel lock clean
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(RUNTIME) ## watch simulated sweeps being classified, live
 	$(BIN)/palpate demo
@@ -99,6 +99,9 @@ skins: $(DESKTOP) ## measure emulated skins: docs/skins.md; PART=way, noise or l
 
 chart: $(DESKTOP) ## speed against accuracy: docs/chart/ (goes on where it was interrupted)
 	$(BIN)/palpate-train chart $(CHART)
+
+development: $(DESKTOP) ## ours and its peers on all development sets: docs/development/, README's picture (goes on where it was interrupted)
+	$(BIN)/palpate-train development $(DEVELOPMENT)
 
 paper: $(DESKTOP) ## the paper's experiment, run again: docs/paper/ (goes on where it was interrupted)
 	$(BIN)/palpate-train paper $(PAPER)

@@ -83,7 +83,7 @@ def render(figures: Json, quick: bool = False) -> tuple[str, dict[str, str]]:
         curves=_curve_rows(curves, names), relative=relative_times(times["entries"], names), each=EACH,
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         about=[[one["case"], f"{one['set']}{', '.join(['', *one['only']])}", one["protocol"], one["sweeps"],
-                one["materials"], one["digest"]] for one in figures["cases"]],
+                one["materials"], one["digest"]] for one in figures["cases"] if one["case"] in table],
         costs=[[one[key] for key in ("method", "precision", "runtime", "ms_p50", "ms_p99")] for one in times["entries"]],
         fits=[[name, _fit_s(table, name)] for name in names], missing=_missing(table, cases, names),
     )  # fmt: skip
