@@ -123,11 +123,13 @@ def _row(case: str, row: Accuracies, ours: str, names: Sequence[str], peers: Seq
 def mean_row(
     table: Mapping[str, Accuracies], cases: Sequence[str], ours: str, names: Sequence[str], peers: Sequence[str]
 ) -> Json:
-    """Means over those of the `cases` that ours and all peers have (`shared`); None of a method that lacks one of them.
+    """Means over the `cases` that ours and those peers have which lack the fewest (`shared`); None of a method that lacks one.
 
     best: the peer with the highest of these means.
     """
-    shared = [case for case in cases if all(name in table[case] for name in (ours, *peers))]
+    count = {name: sum(name in table[case] for case in cases) for name in peers}
+    whole = [name for name in peers if count[name] == max(count.values())]
+    shared = [case for case in cases if all(name in table[case] for name in (ours, *whole))]
     means = {name: float(np.mean([table[case][name]["mean"] for case in shared])) for name in names
              if shared and all(name in table[case] for case in shared)}  # fmt: skip
     leader = max((name for name in peers if name in means), key=lambda name: means[name], default="")

@@ -29,7 +29,7 @@ def test_the_page_shows_every_figure():
     read = PageReader(page)
     facts = ("one 85.0 % quant 90.0 % +5.0",
              "one +5.0 90.0 % 85.0 – 95.0 % 80.0 % 75.0 – 85.0 % 85.0 % 80.0 – 90.0 %", "two −5.5 70.0 % 65.0 – 75.0 % –",
-             "mean of 1: real and published 85.0 % quant 90.0 % +5.0", "mean of 1: all, the simulated ones too +5.0 90.0 % 80.0 % 85.0 %",
+             "mean of 1: real and published 85.0 % quant 90.0 % +5.0", "mean of 2: all, the simulated ones too −0.2 80.0 % – 80.2 %",
              "below the best peer in 1 of 2 lines, and +5.0 points from quant", "quick <b>, two: a window of 8 frames",
              "time of a sweep of 1500x4x4, MiniRocket’s = 1 2.2 quant 1/100", "quick <b>: two",
              "one default 50.0 % 45.0 – 55.0 % – – 90.0 %", "one.npz, force<=180 leave:force 100 4 digest of one",
@@ -47,7 +47,7 @@ def test_the_best_peer_of_each_line_is_bold():
     """Never ours, and another one in another line."""
     page, _ = development_report.render(figures())
     bold = re.findall(r'<td class="best">([\d.]+)', page)
-    assert bold == ["85.0", "75.5", "85.0", "85.0"]  # two lines, two means
+    assert bold == ["85.0", "75.5", "85.0", "80.2"]  # two lines, two means
 
 
 def test_a_part_of_the_results_makes_a_page():
@@ -179,6 +179,19 @@ def test_the_shipped_method_is_named_even_behind_the_front():
     assert all(name in svg for name in ("Palpate, as shipped", "MiniRocket", "DS-CNN"))
     shipped = next(part for part in svg.split("<text") if "Palpate, as shipped" in part)
     assert "--accent" in shipped
+
+
+def test_a_peer_that_lacks_a_line_has_no_mean_and_costs_none_a_line():
+    """The mean is over the lines of the peers that lack the fewest."""
+    table = development_report.by_case(
+        [entry(c, m, a) for c in ("one", "two") for m, a in (("default", 0.8), ("quant", 0.9))]
+    )
+    table["one"]["ds-cnn"] = entry("one", "ds-cnn", 0.99)
+    found = development_report.mean_row(
+        table, ["one", "two"], "default", ["default", "quant", "ds-cnn"], ["quant", "ds-cnn"]
+    )
+    assert (found["shared"], found["best"], found["difference"]) == (["one", "two"], "quant", "−10.0")
+    assert found["cells"] == [pytest.approx(0.8), pytest.approx(0.9), None]
 
 
 def test_times_are_told_in_those_of_minirocket():
