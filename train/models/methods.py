@@ -26,6 +26,8 @@ Log = Callable[[str], None]
 """Shows a line of progress."""
 Cost = list[tuple[int, float]]
 """(iteration, cross entropy of its batch), eq. 11: what the paper's Fig. 9 shows."""
+SHIPPED = "default"
+"""The method of the packaged bundle, and of `fit`."""
 MODULES = (
     "train.models.baselines",
     "train.models.prior_work",

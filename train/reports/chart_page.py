@@ -12,10 +12,11 @@ from typing import Any
 
 from markupsafe import Markup
 
+from train.models.methods import SHIPPED
 from train.reports import html as pages
 from train.reports.formatting import estimate
 from train.reports.pareto import ACCURACIES, COSTS, Axis, Dot, name
-from train.reports.scatter import SHIPPED, label
+from train.reports.scatter import label
 
 SCRIPT = pages.TEMPLATES / "chart.js"
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from train.models.methods import SHIPPED
 from train.reports import html, plots
 from train.reports.formatting import estimate, exact_percent, seconds
 from train.reports.paper_values import CNNS, CONFUSION, COST, FIGURES, SEVERAL, display_name, short_name
-from train.reports.scatter import SHIPPED
 
 TITLES = {
     "lopo": "T-REAL, leave one position out",

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from train.models.methods import SHIPPED
 from train.reports.pareto import ACCURACIES, COSTS, Dot, placed
 from train.reports.plot_style import (
     ACCENT,
@@ -41,8 +42,6 @@ PLACES = [(0, 10, "center"), (6, 0, "left"), (-6, 0, "right"), (0, -10, "center"
           (5, 8, "left"), (-5, -8, "right"), (0, 20, "center"), (0, -20, "center"), (8, 16, "left"), (8, -16, "left"),
           (-8, 16, "right"), (-8, -16, "right")]  # fmt: skip
 """Where a name may stand, points from its dot, and its alignment; the best first."""
-SHIPPED = "default"
-"""The method that the box ships: marked wherever it stands."""
 SHORT = {SHIPPED: "Palpate, as shipped", "minirocket-augmented": "MiniRocket, augmented", "quant": "QUANT", "ds-cnn": "DS-CNN",
          "multirocket-hydra": "MultiRocket-Hydra", "paper-cnn": "paper’s CNN, raw", "paper-cnn-centred": "paper’s CNN", "minirocket": "MiniRocket",
          "tactnet2": "TactNet-II", "st-hmp": "ST-HMP"}  # fmt: skip

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 
 from appliance.core.storage import put
 from train.calibration.novelty import KEPT
+from train.models.methods import SHIPPED
 from train.reports import formatting, html
 from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, SMALL, set_ticks, single_axes, to_svg
 
@@ -49,6 +50,7 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
     page = html.render(
         "uncertainty.html.j2",
         figures=figures,
+        shipped=SHIPPED,
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         targets=list(_targets(figures)),
         temperature=" to ".join(dict.fromkeys(f"{t:.1f}" for t in (min(heat), max(heat)))),
