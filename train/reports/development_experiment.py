@@ -151,7 +151,7 @@ def _points(case: DevelopmentCase) -> list[tuple[int, str]]:
 
 
 def join(run: Json, earlier: Sequence[Json]) -> Json:
-    """`run` with what it lacks of `earlier` runs: methods, their entries, what they left out, and who ran when.
+    """`run` with what it lacks of `earlier` runs: methods, their entries, what they left out, who ran when, and times.
 
     Raises FormatError where an earlier run was of other sweeps.
     """
@@ -165,6 +165,8 @@ def join(run: Json, earlier: Sequence[Json]) -> Json:
             "methods": sorted(names, key=lambda name: (*OURS, *PEERS, name).index(name)),
             "results": [*made["results"], *more], "runs": [*made["runs"], *one["runs"]],
         }  # fmt: skip
+        if one.get("times"):
+            made.setdefault("times", one["times"])
         done = {f"{entry['method']}, {entry['case']}" for entry in made["results"]}
         made["left_out"] = {k: why for k, why in (one["left_out"] | made["left_out"]).items() if k not in done}
     return made
