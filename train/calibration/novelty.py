@@ -18,6 +18,7 @@ from sklearn.covariance import ledoit_wolf
 from appliance.bundle.bundle import Classes
 from appliance.core.errors import FormatError
 from appliance.inference.novelty import shaped_distances
+from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
 KEPT = 0.985
@@ -93,7 +94,8 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     white, coloured = _whitening(x, labels)
     axes = np.linalg.svd((means - means.mean(axis=0)) @ white)[2][: classes - 1].T
     axes = np.linalg.qr(np.hstack([axes, coloured[:, size - fixed :]]))[0]
-    projection = (white @ axes).astype(np.float32)
+    whole, steps = sixteen_bits(white @ axes)  # as a bundle's graph holds it
+    projection = whole * steps
     means = (means @ projection).astype(np.float32)
     own = min(fixed, projection.shape[1])
     away = ((x - middle) @ projection - means[labels])[:, projection.shape[1] - own :]

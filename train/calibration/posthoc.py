@@ -7,6 +7,7 @@ the graph of all of it. What was fitted is judged by sweeps that it did not see,
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -28,6 +29,7 @@ from train.models.compact.copies import COPIES, copies
 from train.models.compact.fitted import Fit
 from train.models.compact.heads import HeadPart, HeadPlan
 from train.onnx_tools.graph_builder import joined, run
+from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
 
@@ -194,12 +196,13 @@ def assemble_model(
     add = partial(_add, model.graph)
     whole, *tenths = [output.name for output in trunk.graph.output]
     weight, bias = (np.asarray(part, np.float32) for part in head)
-    add("Gemm", whole, weight - weight.mean(1, keepdims=True), bias - bias.mean(), output="logits")
+    centred = _sixteen_bits(add, weight - weight.mean(1, keepdims=True), "head.weight")
+    add("Gemm", whole, centred, bias - bias.mean(), output="logits")
     outputs: dict[str, list[int]] = {"logits": [1, len(bias)]}
     projection, offset = "embedding.projection", "embedding.offset"
     if known or steps is not None:
-        for name, value in ((projection, embedding.projection), (offset, embedding.offset)):
-            model.graph.initializer.append(numpy_helper.from_array(np.array(value, order="C"), name))
+        _sixteen_bits(add, embedding.projection, projection)
+        model.graph.initializer.append(numpy_helper.from_array(embedding.offset, offset))
     if steps is not None:
         count = len(steps.weight)
         z = add("MatMul", *tenths, projection, output="head.turned")
@@ -218,6 +221,13 @@ def assemble_model(
         model.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
     onnx.checker.check_model(model, full_check=True)
     return model
+
+
+def _sixteen_bits(add: Callable[..., str], matrix: Array, name: str) -> str:
+    """A matrix [F, n] in 16 bits, a step for each column: half the bytes of what is largest in a bundle. onnxruntime turns
+    it into floats once, when it opens the model."""
+    whole, steps = sixteen_bits(matrix)
+    return add("Mul", add("Cast", whole, output=f"{name}.whole", to=TensorProto.FLOAT), steps, output=name)
 
 
 def _add(graph: onnx.GraphProto, op: str, *inputs: str | Array, output: str, **attributes: Any) -> str:

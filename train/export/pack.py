@@ -37,7 +37,7 @@ from train.metrics.score import accuracy_figure, fuse
 from train.models.compact.fitted import Fit
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
-from train.onnx_tools.graph_builder import run
+from train.onnx_tools.graph_builder import run, slim
 
 Array = NDArray[Any]
 MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
@@ -100,7 +100,7 @@ def pack(
     content = with_posthoc(content, place is not None)
     logits = run(content.model, model_inputs(content.input, train))
     golden = golden_sweeps(train, logits, logits_of_means(content, train) if content.known else logits)
-    files = {bundle.MODEL: content.model.SerializeToString(), bundle.GOLDEN: golden}
+    files = {bundle.MODEL: slim(content.model).SerializeToString(), bundle.GOLDEN: golden}
     files |= {bundle.MEANS: content.means} if content.known else {}
     manifest = bundle.Manifest(
         name=name, version=version, format=train.format, input=content.input, labels=train.materials,

@@ -20,6 +20,14 @@ PERCENTILE = 99.9
 """Of the values, the one that int8 reaches: with the full range one outlier sweep costs all others their resolution."""
 
 
+def sixteen_bits(matrix: Array) -> tuple[Array, Array]:
+    """(int16 [F, n], steps float32 [n]) of a matrix [F, n]: a step for each column. Their product is the matrix, rounded."""
+    steps = np.maximum(np.abs(matrix).max(axis=0) / np.iinfo(np.int16).max, np.finfo(np.float32).tiny).astype(
+        np.float32
+    )
+    return np.rint(matrix / steps).astype(np.int16), steps
+
+
 def quantize(model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv", "Relu")) -> onnx.ModelProto:
     """`model` with its nodes `ops` in int8, ranges found on some of `sweeps`: raw counts [N, T, R, C].
 

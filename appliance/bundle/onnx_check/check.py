@@ -45,7 +45,7 @@ MOST_LETTERS = 400
 """Of what is wrong: names and lists come from the file."""
 Form = Sequence[int | None]
 """A shape, None standing for any number."""
-CONSTANTS = ("float32", "uint8", "int8", "int32", "int64")
+CONSTANTS = ("float32", "uint8", "int8", "int16", "int32", "int64")
 """Types of constants; the others only come in by the sweep, or out of a comparison."""
 
 
