@@ -8,12 +8,13 @@ terminal, or a dumb one, it gets one line a second.
 from __future__ import annotations
 
 import os
-from typing import Self, TextIO
+from typing import Generic, Self, TextIO, TypeVar
 
 from appliance.alignment.view import View
 from appliance.core.clock import Clock
 from appliance.signal.contact import Point
 
+Shown = TypeVar("Shown")
 LINE_NS = 1_000_000_000
 """Time between two plain lines."""
 ENTER, LEAVE = "\033[?1049h\033[?25l", "\033[?1049l\033[?25h"
@@ -28,8 +29,11 @@ HEAT = (236, 23, 30, 37, 79, 158)
 """Colours of loads in a terminal that knows 256, from none to the strongest."""
 
 
-class Screen:
-    """Shows Views on `out`; `address`: of the page, where there is one. Restores the terminal at the end."""
+class LiveScreen(Generic[Shown]):
+    """Shows one thing after another on `out`; `address`: of the page, where there is one. Restores the terminal at the end.
+
+    A subclass says what it looks like: `_picture` and `_line`.
+    """
 
     def __init__(self, out: TextIO, clock: Clock, address: str = "") -> None:
         self._out, self._clock, self._address = out, clock, address
@@ -46,19 +50,37 @@ class Screen:
     def __exit__(self, *_: object) -> None:
         self._write(LEAVE if self._live else "")
 
-    def show(self, view: View) -> None:
+    def show(self, view: Shown) -> None:
         """Draw `view` over the one before, in one write so that nothing flickers; or print a line, once a second."""
         if self._live:
             width, height = os.get_terminal_size(self._out.fileno())
-            lines = Canvas(view, self._signs, width or 80, height or 24, self._address).lines(self._colours)
+            lines = self._picture(view, width or 80, height or 24)
             self._write("\033[H" + "".join(f"{line}\033[K\n" for line in lines[:-1]) + f"{lines[-1]}\033[J")
         elif (now_ns := self._clock.now_ns()) >= self._next_ns:
             self._next_ns = now_ns + LINE_NS
-            self._write(line(view) + "\n")
+            self._write(self._line(view) + "\n")
+
+    def _picture(self, view: Shown, width: int, height: int) -> list[str]:
+        """`view` line by line, for a terminal of this size."""
+        raise NotImplementedError
+
+    def _line(self, view: Shown) -> str:
+        """`view` in one line."""
+        raise NotImplementedError
 
     def _write(self, text: str) -> None:
         self._out.write(text)
         self._out.flush()
+
+
+class Screen(LiveScreen[View]):
+    """Shows Views."""
+
+    def _picture(self, view: View, width: int, height: int) -> list[str]:
+        return Canvas(view, self._signs, width, height, self._address).lines(self._colours)
+
+    def _line(self, view: View) -> str:
+        return line(view)
 
 
 def line(view: View) -> str:
