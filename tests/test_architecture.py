@@ -246,7 +246,7 @@ def test_the_desktop_is_installed_without_running_tests(tmp_path: Path):
     (tmp_path / "appliance" / "requirements.lock").touch()
     steps = run("make", "--dry-run", "desktop", cwd=tmp_path)
     assert "-e 'train[minirocket,dask]'" in steps
-    assert "pytest" not in steps
+    assert "-m pytest" not in steps  # a folder may have its name
     for page in ("README.md", "CONTRIBUTING.md", "docs/manual.md", "docs/import.md"):
         text = (ROOT / page).read_text()
         assert "make desktop" in text

@@ -209,8 +209,6 @@ def run_calibrate(args: argparse.Namespace) -> None:
 
 def run_cnn_curve(args: argparse.Namespace) -> None:
     """Train, write the curve, print it."""
-    if args.steps is not None and args.steps < 1:
-        raise FormatError(f"--steps {args.steps} is none; use 1 or more")
     log = options.Log()
     from train.evaluation import cnn_curve  # here: it imports PyTorch
 

@@ -113,4 +113,4 @@ def test_the_command_prints_the_curve(tmp_path: Path, capsys: pytest.CaptureFixt
     assert lines[2].split()[0] == "2"
     assert len(lines) == 3
     assert main(["cnn-curve", "--steps", "0", "--out", str(out)]) != 0
-    assert "--steps 0 is none; use 1 or more" in capsys.readouterr().err
+    assert "--steps 0 is out of range; use a whole number from 1 on" in capsys.readouterr().err
