@@ -8,6 +8,7 @@ terminal, or a dumb one, it gets one line a second.
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from typing import Generic, Self, TextIO, TypeVar
 
 from appliance.alignment.view import View
@@ -29,7 +30,7 @@ HEAT = (236, 23, 30, 37, 79, 158)
 """Colours of loads in a terminal that knows 256, from none to the strongest."""
 
 
-class LiveScreen(Generic[Shown]):
+class LiveScreen(ABC, Generic[Shown]):
     """Shows one thing after another on `out`; `address`: of the page, where there is one. Restores the terminal at the end.
 
     A subclass says what it looks like: `_picture` and `_line`.
@@ -60,13 +61,15 @@ class LiveScreen(Generic[Shown]):
             self._next_ns = now_ns + LINE_NS
             self._write(self._line(view) + "\n")
 
+    @abstractmethod
     def _picture(self, view: Shown, width: int, height: int) -> list[str]:
         """`view` line by line, for a terminal of this size."""
-        raise NotImplementedError
+        ...
 
+    @abstractmethod
     def _line(self, view: Shown) -> str:
         """`view` in one line."""
-        raise NotImplementedError
+        ...
 
     def _write(self, text: str) -> None:
         self._out.write(text)

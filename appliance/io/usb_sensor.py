@@ -5,6 +5,7 @@ No failure of the link makes `read` raise: it returns no frames, `state` and `tr
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -209,7 +210,7 @@ class Stream:
             self._mark = first, start_ns
 
 
-class LinkSensor:
+class LinkSensor(ABC):
     """A skin behind a link: what all skins have in common.
 
     States: `streaming`, or `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent`, where `trouble` says what to do.
@@ -271,9 +272,10 @@ class LinkSensor:
             link, self._link = self._link, None
             link.close()
 
+    @abstractmethod
     def _open(self) -> tuple[SkinLink, packets.Identity]:
         """Find, open, check and start the skin. Raises SensorError, with nothing left open."""
-        raise NotImplementedError
+        ...
 
     def _mute(self, quiet_ms: int, unheard: int) -> SensorError:
         """Why no frame has come for `quiet_ms`. unheard: bytes that came in this time."""

@@ -116,16 +116,22 @@ def listen(
     try:
         for command in starter.commands(starter.start, starter.rate_hz) if starter else ():
             port.write(command)
-        until_ns = clock.now_ns() + round(seconds * 1e9)
-        while (left_ns := until_ns - clock.now_ns()) > 0:
-            if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
-                reads.append((data, clock.now_ns()))
+        reads = collect(port, clock, seconds)
     finally:
         with contextlib.suppress(SensorError):
             for command in starter.commands(starter.stop, starter.rate_hz) if starter else ():
                 port.write(command)
         port.close()
     return HeardBytes(reads)
+
+
+def collect(port: BytePort, clock: Clock, seconds: float) -> list[tuple[bytes, int]]:
+    """What comes from an open port within `seconds`: each read, and when it ended. Raises SensorError."""
+    reads, until_ns = [], clock.now_ns() + round(seconds * 1e9)
+    while (left_ns := until_ns - clock.now_ns()) > 0:
+        if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
+            reads.append((data, clock.now_ns()))
+    return reads
 
 
 def fits(profile: SkinProfile, heard: HeardBytes) -> bool:

@@ -103,9 +103,10 @@ class SkinMonitor:
         load = np.where(np.isfinite(level), level - self._lowest, 0)
         self._full = max(self._full, float(load.max()))
         passed_ns = int(self._t_ns[-1] - self._t_ns[0])
-        stuck, dead = self._stuck(), self._dead()
+        noise = self._noise()
+        stuck, dead = self._stuck(), self._dead(noise)
         return {
-            "load": _nested(load), "full": self._full, "noise": _nested(self._noise()),
+            "load": _nested(load), "full": self._full, "noise": _nested(noise),
             "rate_hz": (len(self._t_ns) - 1) * 1e9 / passed_ns if passed_ns > 0 else None,
             "stuck": self._names(stuck), "dead": self._names(dead & ~stuck), "saturated": self._names(self._saturated()),
         }  # fmt: skip
@@ -119,8 +120,8 @@ class SkinMonitor:
         still = self._t_ns[-1] - self._changed_ns >= STUCK_S * 1e9
         return np.asarray(still & ~still.all())
 
-    def _dead(self) -> NDArray[np.bool_]:
-        moved, noise = self._highest - self._lowest, self._noise()
+    def _dead(self, noise: NDArray[np.float64]) -> NDArray[np.bool_]:
+        moved = self._highest - self._lowest
         touched = np.median(moved, axis=(0, 1)) > MOVED * np.maximum(1e-12, np.median(noise, axis=(0, 1)))
         return np.asarray(touched & (moved < DEAD * np.median(moved, axis=(0, 1))))
 

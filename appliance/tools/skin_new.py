@@ -15,9 +15,9 @@ from appliance.core.errors import ConfigError, SensorMismatch, SensorSilent
 from appliance.io import skin_codecs, skin_profile
 from appliance.io.serial_port import PortInfo
 from appliance.io.serial_sensor import BytePort
+from appliance.tools.skin_detect import collect
 from appliance.tools.stream_analysis import Grid, Proposal, Read, analyse
 
-READ_BYTES = 65_536
 BAUDS = 115_200, 2_000_000, 921_600, 1_000_000, 460_800, 230_400
 """Speeds that makers use, the most frequent first; over a port that is USB down to the microcontroller any of them does."""
 
@@ -41,9 +41,11 @@ def listen(open_port: Callable[[int], BytePort], bauds: Sequence[int], seconds: 
     for baud in bauds:
         port = open_port(baud)
         try:
-            reads = _reads(port, seconds, clock)
+            heard = collect(port, clock, seconds)
         finally:
             port.close()
+        # the first read holds what had piled up before, and may begin anywhere
+        reads = [Read(t_ns, data) for data, t_ns in heard[1:]]
         count += sum(len(read.data) for read in reads)
         if found := analyse(reads):
             return PortSample(baud, reads, found)
@@ -54,14 +56,6 @@ def listen(open_port: Callable[[int], BytePort], bauds: Sequence[int], seconds: 
     raise SensorMismatch(
         f"{count} bytes at {tried} baud have no pattern; name the skin's speed with --set sensor.baud=N, or listen longer"
     )
-
-
-def _reads(port: BytePort, seconds: float, clock: Clock) -> list[Read]:
-    reads, until_ns = [], clock.now_ns() + round(seconds * 1e9)
-    while (now_ns := clock.now_ns()) < until_ns:
-        if data := port.read(READ_BYTES, max(1, (until_ns - now_ns) // 1_000_000)):
-            reads.append(Read(clock.now_ns(), data))
-    return reads[1:]  # the first holds what had piled up before, and may begin anywhere
 
 
 def words(proposal: Proposal) -> str:
