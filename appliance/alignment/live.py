@@ -58,7 +58,7 @@ class Alignment:
 
     def __init__(self, settings: Config, expected: Expected, devices: Devices) -> None:
         self._sensor = skins.sensor(settings, expected.format, devices)
-        self._expected, self._source = expected, devices.source
+        self._expected, self._source, self._fingertip = expected, devices.source, settings.sensor.fingertip
         self._shape = expected.format.rows, expected.format.cols
         self._span = max(1, round(SPAN_S * expected.format.rate_hz))
         self._number = 0
@@ -125,12 +125,12 @@ class Alignment:
         if place.within(offset):
             away = f"{np.hypot(*offset):.1f} mm from the nearest trained position"
             return self._view("in-place", IN_PLACE, f"{away}; up to {place.limit_mm:.1f} mm is fine", **shown)
-        hint = "move the skin on the finger as far the same way, then look again"
+        hint = "move the skin on the finger as far that way, then look again"
         return self._view("off", advice(offset, self._shape), hint, **shown)
 
     def _view(self, state: str, message: str, hint: str, **shown: Any) -> View:
         return View(self._number, self._source, self._expected.bundle, self._sensor.state, state, message, hint,
-                    self._shape, place=self._expected.place, **shown)  # fmt: skip
+                    self._shape, place=self._expected.place, fingertip=self._fingertip, **shown)  # fmt: skip
 
 
 def run(

@@ -16,7 +16,7 @@ class View:
     state: "no-skin", "wait", "lift", "no-contact", "no-positions", "off" or "in-place". message: that in words. hint:
     what the person may do. load: raw counts above the unloaded skin, [rows][columns]; empty before there are any. full:
     load that is shown as the strongest. centre: of the contact, and nearest: the trained position nearest to it, mm
-    from the centre of taxel 1.1 (taxels where there is no `place`).
+    from the centre of taxel 1.1 (taxels where there is no `place`). fingertip: setting `sensor.fingertip`.
     """
 
     number: int
@@ -32,6 +32,7 @@ class View:
     centre: Point | None = None
     nearest: Point | None = None
     place: ContactPositions | None = None
+    fingertip: str = ""
 
     @property
     def origin(self) -> str:

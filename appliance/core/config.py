@@ -28,7 +28,8 @@ class SensorConfig:
 
     skin: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" in place of the profile's, "" for that. rate_hz:
     frames per second in place of the profile's, 0 for that. tare: send the profile's command for it whenever the skin
-    is found, which must be unloaded then.
+    is found, which must be unloaded then. fingertip: the side of the grid that is nearest to the end of the finger, for
+    pictures; "" where nobody has said it.
     vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link: "vendor" (bulk transfers),
     "acm" (a serial port over USB, without the kernel's driver), or "serial" (any serial port, with the kernel's
     driver). port: path of this serial port; "" finds the one with the ids. baud: its bits per second, 0 takes the
@@ -41,6 +42,7 @@ class SensorConfig:
     grid: str = ""
     rate_hz: float = number(0.0, 0.0, 100_000.0)
     tare: bool = False
+    fingertip: Literal["", "first-row", "last-row", "first-column", "last-column"] = ""
     vendor_id: int = number(0x1209, 1, 0xFFFF, hex=True)
     product_id: int = number(0x7AC7, 1, 0xFFFF, hex=True)
     serial: str = ""

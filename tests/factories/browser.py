@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -53,3 +53,16 @@ class BrowsedPage:
     def text(self, where: str) -> str:
         """The text of an element, with plain spaces."""
         return str(self.page.inner_text(where)).replace("\xa0", " ")
+
+
+def luminance(colour: Sequence[float]) -> float:
+    """Relative luminance of red, green and blue of 0 to 255 (WCAG 2.1): 0 to 1."""
+    parts = [part / 255 for part in colour]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(w * part for w, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+def contrast(one: Sequence[float], other: Sequence[float]) -> float:
+    """Contrast of two colours (WCAG 2.1): 1 to 21."""
+    dark, light = sorted((luminance(one), luminance(other)))
+    return (light + 0.05) / (dark + 0.05)

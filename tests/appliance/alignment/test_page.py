@@ -12,6 +12,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from itertools import pairwise
+from math import dist, hypot
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ from appliance.bundle.bundle import Manifest
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ConfigError
 from appliance.signal.contact import ContactPositions
-from tests.factories.browser import WAIT_S, BrowsedPage, until
+from tests.factories.browser import WAIT_S, BrowsedPage, contrast, luminance, until
 
 PLACE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 LOADS = tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4))
@@ -254,8 +256,9 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
     assert seen.page.text_content("#spoken").startswith(VIEW.message)
     assert seen.page.get_attribute("#spoken", "aria-live") == "polite"
     assert not seen.page.is_visible("#simulated")
-    shades = seen.page.eval_on_selector_all(".load", "all => all.map(e => Number(e.style.opacity))")
-    assert shades == pytest.approx([load / 80 for row in LOADS for load in row])
+    fills = seen.page.eval_on_selector_all(".tile", FILLS)
+    assert all(light[2] - light[0] <= dark[2] - dark[0] for light, dark in pairwise(fills[:4]))  # bluer with the load
+    assert fills[0] == [0xE9, 0xED, 0xF2]
     assert seen.page.locator(".count").all_text_contents() == [f"{load:.0f}" for row in LOADS for load in row]
     centre = seen.page.evaluate("new DOMMatrix(document.getElementById('centre').style.transform)")
     assert (centre["e"], centre["f"]) == pytest.approx((6.0 / 4 * 100 + 50, 3.8 / 4 * 100 + 50))
@@ -265,6 +268,7 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
     seen.state("in-place")
     assert seen.text("#message") == "✓ in place"
     assert not seen.page.is_visible("#way")
+    assert not seen.page.is_visible("#push")
     page.show(replace(VIEW, number=9, state="no-skin", skin="absent", message="no skin: absent", load=(), centre=None))
     seen.state("no-skin")
     assert seen.text("#state") == "skin absent"
@@ -283,6 +287,81 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     return seen.page.eval_on_selector_all(
         which, "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r: e.r.baseVal.value}))"
     )
+
+
+FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number))"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("centre", "message", "way"),
+    [
+        ((2.0, 6.0), "4.0 mm too far towards row 1", (0, -1)),
+        ((10.0, 6.0), "3.6 mm too far towards row 4", (0, 1)),
+        ((6.4, 1.8), "4.0 mm too far towards column 1", (-1, 0)),
+        ((6.0, 11.0), "5.0 mm too far towards column 4", (1, 0)),
+    ],
+)
+def test_the_arrow_points_where_the_skin_has_to_go(
+    browser: Any, page: Page, centre: tuple[float, float], message: str, way: tuple[int, int]
+):
+    """Towards the row or column that the message names, in the picture and beside the words: a skin on which the contact
+    lies too far towards row 1 is moved towards row 1."""
+    nearest = min(zip(PLACE.rows_mm, PLACE.cols_mm, strict=True), key=lambda spot: dist(spot, centre))
+    page.show(replace(VIEW, message=message, centre=centre, nearest=nearest))
+    seen = BrowsedPage(browser.new_context(), page.address)
+    seen.state("off")
+    path = [float(n) for n in re.findall(r"-?[\d.]+", str(seen.page.locator("#way .line").get_attribute("d")))]
+    drawn = path[2] - path[0], path[3] - path[1]
+    turned = seen.page.evaluate("new DOMMatrix(getComputedStyle(document.querySelector('#push path')).transform)")
+    pushed = turned["c"] * -1, turned["d"] * -1  # where the arrow's head, at (0, -1), has got to
+    for arrow in (drawn, pushed):
+        assert (arrow[0] * way[0] + arrow[1] * way[1]) / hypot(*arrow) > 0.9
+    seen.page.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_count_can_be_read_on_its_taxel(browser: Any, page: Page, scheme: str):
+    """A contrast of 4.5 between the number and its taxel, from no load to the full one (WCAG 2.1, 1.4.3)."""
+    page.show(replace(VIEW, load=tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4)), full=15.0))
+    context = browser.new_context(color_scheme=scheme)
+    seen = BrowsedPage(context, page.address)
+    seen.state("off")
+    tiles, counts = (seen.page.eval_on_selector_all(which, FILLS) for which in (".tile", ".count"))
+    assert len(tiles) == 16
+    assert len({tuple(one) for one in counts}) == 2  # black on light ones, white on dark ones
+    assert min(contrast(*pair) for pair in zip(tiles, counts, strict=True)) >= 4.5
+    context.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("side", "at"), [("first-row", "top"), ("last-row", "bottom"), ("first-column", "left"), ("last-column", "right")]
+)
+def test_the_picture_shows_which_end_is_the_fingertip(browser: Any, page: Page, side: str, at: str):
+    """A cap at the side that `sensor.fingertip` names; where it is not set, the page says how to find it out."""
+    seen = BrowsedPage(browser.new_context(viewport={"width": 1024, "height": 768}), page.address)
+    seen.state("off")
+    assert seen.page.locator(".finger").count() == 0
+    assert "press one end of the skin" in seen.text("#where")
+    page.show(replace(VIEW, number=8, fingertip=side))
+    until(lambda: seen.page.locator(".finger").count() == 1)
+    board, cap = (seen.page.locator(which).bounding_box() for which in (".board", ".finger"))
+    assert beyond(board, cap) == at
+    name = seen.page.locator("text=fingertip").last.bounding_box()
+    assert beyond(board, name) == at
+    assert min(name["x"], name["y"]) >= 0
+    assert not seen.page.is_visible("#where")
+    seen.page.close()
+
+
+def beyond(board: dict[str, float], box: dict[str, float]) -> str:
+    """The side of the board beyond whose edge the middle of a box lies."""
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    out = {"left": board["x"] - x, "right": x - board["x"] - board["width"], "top": board["y"] - y}
+    out["bottom"] = y - board["y"] - board["height"]
+    return max(out, key=lambda side: out[side])
 
 
 @pytest.mark.slow
@@ -331,23 +410,15 @@ def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, 
     for what in ("#message", "#hint", "#figures"):
         box = seen.page.locator(what).bounding_box()
         assert box["x"] + box["width"] <= width
-        assert contrast(seen, what) > 4.5
-    assert (luminance(seen, "body", "backgroundColor") > 0.5) == (scheme == "light")
+        assert contrast(style(seen, what, "color"), style(seen, "body", "backgroundColor")) >= 4.5
+    assert (luminance(style(seen, "body", "backgroundColor")) > 0.5) == (scheme == "light")
     context.close()
 
 
-def luminance(seen: BrowsedPage, what: str, colour: str) -> float:
-    """Relative luminance of a colour (WCAG 2.1), 0 to 1."""
-    text = seen.page.locator(what).evaluate(f"e => getComputedStyle(e).{colour}")
-    parts = [int(part) / 255 for part in re.findall(r"\d+", text)[:3]]
-    linear = [part / 12.92 if part <= 0.03928 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
-    return sum(w * part for w, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
-
-
-def contrast(seen: BrowsedPage, what: str) -> float:
-    """Contrast of a text with the page's background (WCAG 2.1)."""
-    dark, light = sorted((luminance(seen, what, "color"), luminance(seen, "body", "backgroundColor")))
-    return (light + 0.05) / (dark + 0.05)
+def style(seen: BrowsedPage, what: str, name: str) -> list[float]:
+    """A colour of an element, as red, green and blue."""
+    text = seen.page.locator(what).evaluate(f"e => getComputedStyle(e).{name}")
+    return [float(part) for part in re.findall(r"\d+", text)[:3]]
 
 
 @pytest.mark.slow
