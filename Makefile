@@ -107,7 +107,7 @@ paper: $(DESKTOP) ## the paper's experiment, run again: docs/paper/ (goes on whe
 	$(BIN)/palpate-train paper $(PAPER)
 
 deploy: $(FLEET) ## put a signed BUNDLE= on a box, HOST=user@box, or on many, HOSTS=inventory.py; SHADOW=1: as the candidate
-	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(SIGNERS)) $(if $(SHADOW),--shadow) \
+	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(SIGNERS)) $(if $(SHADOW),--shadow) $(if $(OTHER_SKIN),--other-skin) \
 	  $(or $(BUNDLE),$(error name the bundle with BUNDLE=its folder))
 
 install: $(FLEET) wheel ## install or upgrade bare Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE of whose bundles it takes

@@ -45,13 +45,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     parser.add_argument("--signers", type=Path, metavar="FILE", help="check the signature here, too, by this file")
     parser.add_argument("--shadow", action="store_true", help="as the candidate, which classifies beside")
+    parser.add_argument(
+        "--other-skin", action="store_true", help="another skin than the one that streams there comes with it"
+    )
     args = parser.parse_args(argv)
     try:
         packed = checked(args.bundle, args.signers)
     except ApplianceError as e:
         print(f"palpate: {e}", file=sys.stderr)
         return e.exit_code
-    return each(args, lambda box: deliver(box, packed, args.shadow))
+    return each(args, lambda box: deliver(box, packed, args.shadow, args.other_skin))
 
 
 def checked(folder: Path, signers: Path | None) -> BundleArchive:
@@ -75,7 +78,7 @@ def checked(folder: Path, signers: Path | None) -> BundleArchive:
     return BundleArchive(sha, f"{m.name} {m.version} ({loaded.id})", archive.getvalue())
 
 
-def deliver(box: FleetBox, packed: BundleArchive, shadow: bool) -> str:
+def deliver(box: FleetBox, packed: BundleArchive, shadow: bool, other_skin: bool) -> str:
     """Install the bundle on one box, or make it the candidate there; the line for this box."""
     store, status = where(box)
     if not shadow and _runs(box, packed, store, status):
@@ -86,7 +89,8 @@ def deliver(box: FleetBox, packed: BundleArchive, shadow: bool) -> str:
     fresh = f"umask 077; mkdir -p {incoming} && find {incoming} -mindepth 1 -delete && mkdir {incoming}/{packed.sha}"
     box.run("copying", f"{fresh} && tar -x -C {incoming}/{packed.sha}", user="palpate", stdin=file)
     box.run("tidying up", f"rm {file}")
-    install = f"{PALPATE} install {incoming}/{packed.sha}{' --shadow' if shadow else ''}"
+    how = (" --shadow" if shadow else "") + (" --other-skin" if other_skin else "")
+    install = f"{PALPATE} install {incoming}/{packed.sha}{how}"
     box.run("checking it there", install, user="palpate", limit_s=120)
     box.run("tidying up", f"rm -r {incoming}/{packed.sha}", user="palpate")
     return outcome(box, packed, ready=box.restart(READY_S, STARTS), shadow=shadow)

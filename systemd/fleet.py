@@ -47,6 +47,21 @@ PROPERTIES = (
 """Properties of the service that systemd is asked for."""
 
 
+REMEDIES = (
+    ("No space left on device", "free some room there (df -h; journalctl --vacuum-size=50M)"),
+    ("sudo: a password is required",
+     "let the user in without: USER ALL=(ALL) NOPASSWD: ALL in /etc/sudoers.d/palpate"),
+    ("sudo: command not found", "log in as root, or install sudo there"),
+    ("sudo: not found", "log in as root, or install sudo there"),
+    ("not in the sudoers file", "let the user in: USER ALL=(ALL) NOPASSWD: ALL in /etc/sudoers.d/palpate"),
+    ("Authentication", "let your key in: ssh-copy-id USER@HOST"),
+    ("host key", "if the box was set up anew, forget its old key: ssh-keygen -R HOST"),
+    ("Could not resolve", "check the name, or use the address"),
+    ("Could not connect", "check the address, and that the box is on: ssh USER@HOST must get in"),
+)  # fmt: skip
+"""Words in what a box or the way to it says, and what to do then; the first that fits."""
+
+
 class Failed(Exception):
     """The work cannot be done on this box; the message says why and what to try."""
 
@@ -86,15 +101,18 @@ class FleetBox:
         except TimeoutError as e:
             raise Failed(f"{what}: no answer within {limit_s:.0f} s; look whether the box is well") from e
         if not done:
-            lines = [line for line in (output.stderr or output.stdout).splitlines() if line.strip()] or [
-                "no reason given"
-            ]
-            raise Failed(f"{what}: {lines[-1].removeprefix('palpate: ')}")
+            lines = [line for line in (output.stderr or output.stdout).splitlines() if line.strip()]
+            # what it stumbled over may stand before what it made of that
+            line = next((line for line in lines if remedy(line)), lines[-1] if lines else "no reason given")
+            raise Failed(with_remedy(f"{what}: {line.removeprefix('palpate: ')}"))
         return str(output.stdout).strip()
 
     def put(self, content: Path | IO[bytes], name: str) -> None:
-        """Copy a file into the home of the login user."""
-        self._host.put_file(str(content) if isinstance(content, Path) else content, name)
+        """Copy a file into the home of the login user. Raises Failed."""
+        try:
+            self._host.put_file(str(content) if isinstance(content, Path) else content, name)
+        except OSError as e:  # over SFTP a full disk is no more than "Failure"
+            raise Failed(f"copying {name}: {e}; see whether its disk is full (df -h) and try again") from e
 
     def service(self) -> dict[str, str]:
         """Properties of the service, from systemd."""
@@ -141,6 +159,16 @@ class FleetBox:
         return f"{own[-1]} ({service['ActiveState']}, {service['NRestarts']} restarts)"
 
 
+def remedy(text: str) -> str:
+    """What to do about what a box or the way to it said, "" where that is not known."""
+    return next((do for words, do in REMEDIES if words in text), "")
+
+
+def with_remedy(text: str) -> str:
+    """`text`, and after it what to do, where that is known."""
+    return "; ".join(filter(None, (text, remedy(text))))
+
+
 def options(about: str, limit_s: int) -> argparse.ArgumentParser:
     """A parser with the options that say which boxes, and how long the work on one may take."""
     parser = argparse.ArgumentParser(description=about)
@@ -179,7 +207,7 @@ def each(args: argparse.Namespace, work: Callable[[FleetBox], str]) -> int:
         except gevent.Timeout:
             why[box.name] = f"not done within {args.limit} s and given up; look whether the box is well, then try again"
         except ConnectError as e:
-            why[box.name] = f"cannot be reached: {e}"
+            why[box.name] = with_remedy(f"cannot be reached: {e}")
         except (Failed, OSError, EOFError, SSHException, PyinfraError) as e:
             why[box.name] = str(e) or type(e).__name__
 
@@ -221,6 +249,4 @@ def _inventory(args: argparse.Namespace) -> Inventory:
 
 def _no_password(prompt: str = "", stream: TextIO | None = None) -> str:
     """Replaces pyinfra's password prompt, which would stop all boxes until somebody types. Raises Failed."""
-    raise Failed(
-        "sudo wants a password there; let the user in without: USER ALL=(ALL) NOPASSWD: ALL in /etc/sudoers.d/palpate"
-    )
+    raise Failed(with_remedy("sudo: a password is required"))

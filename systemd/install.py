@@ -13,10 +13,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from fleet import Failed, FleetBox, each, options
+from fleet import Failed, FleetBox, each, options, remedy
 from release import ROOT, ReleaseArchives
 
 from appliance import __version__
+from appliance.core.config import boards
 
 WHEEL = ROOT / "dist" / f"palpate-{__version__}-py3-none-any.whl"
 PACKAGES = ("python3-venv", "libusb-1.0-0", "openssh-client")
@@ -76,10 +77,22 @@ def main(argv: list[str] | None = None) -> int:
     for file in (args.wheel, *([args.signers] if args.signers else [])):
         if not file.is_file():
             sys.exit(f"palpate: no file {file}; check the path (make wheel makes the wheel)")
+    try:
+        known_board(args.board)
+    except Failed as e:
+        sys.exit(f"palpate: {e}")
     signers = args.signers.read_text() if args.signers else ""
     with tempfile.TemporaryDirectory() as folder:
         archives = ReleaseArchives(args.wheel, [*PATHS, SKINS], Path(folder))
-        return each(args, lambda box: install(box, archives, box.data("board", args.board), signers))
+        return each(args, lambda box: install(box, archives, known_board(box.data("board", args.board)), signers))
+
+
+def known_board(board: str) -> str:
+    """`board`, "" for none. Raises Failed where no board file of this checkout has that name."""
+    known = boards(ROOT / "firmware_config")
+    if board and board not in known:
+        raise Failed(f"BOARD={board} has no file firmware_config/board-{board}.toml; boards there: {', '.join(known)}")
+    return board
 
 
 def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) -> str:
@@ -97,11 +110,11 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
         box.report("building its environment")
         box.run("building the environment", build(release), user="root", stdin=f".palpate-{name}.tar", limit_s=BUILD_S)
     box.run("tidying up", "rm -f .palpate-*.tar")  # of an install that was cut after it had built, too
-    kept = box.run("users, folders and settings", prepare(release, board, signers), user="root")
-    if kept:
-        box.report(f"{' '.join(kept.split())} stays as it is there: a file, not the link to the release's")
+    said = box.run("users, folders and settings", prepare(release, board, signers), user="root").splitlines()
+    for line in said:
+        box.report(line)
     box.run("self-test", self_test(release), user="root", limit_s=120)
-    return switch(box, name, release)
+    return switch(box, name, release, restart=any(line.startswith("board = ") for line in said))
 
 
 def survey(box: FleetBox) -> str:
@@ -133,9 +146,8 @@ def packages(box: FleetBox) -> None:
     try:
         box.run("apt-get", f"{get} || {{ apt-get update -q && {get}; }}", user="root", limit_s=PACKAGES_S)
     except Failed as e:
-        raise Failed(
-            f"{missing} cannot be installed: {e}; give the box a way to Debian's mirrors, or install it there"
-        ) from e
+        mirrors = "" if remedy(str(e)) else "; give the box a way to Debian's mirrors, or install it there"
+        raise Failed(f"{missing} cannot be installed: {e}{mirrors}") from e
 
 
 def build(release: str) -> str:
@@ -156,8 +168,8 @@ sync -f {release}"""
 
 
 def prepare(release: str, board: str, signers: str) -> str:
-    """Commands that set up users, folders, settings and links outside the release. The old release can run with them,
-    too."""
+    """Commands that set up users, folders, settings and links outside the release, and print a line for each file that
+    was there and for a changed board. The old release can run with them, too."""
     share = f"{release}/share/palpate"
     lines = [
         "set -e; umask 022",
@@ -171,12 +183,20 @@ def prepare(release: str, board: str, signers: str) -> str:
             f" echo '{file} is another one there, and stays; change it on the box' >&2; exit 1; fi"
         ]
     if board:
-        file = "/etc/palpate/palpate.toml"
-        text = shlex.quote(f'board = "{board}"\n')
-        lines += [f"if [ ! -e {file} ]; then {_put(file, text)}; fi"]
+        file, line = "/etc/palpate/palpate.toml", f'board = "{board}"'
+        # what somebody added to the settings stays
+        new = f"{{ echo {shlex.quote(line)}; sed '/^board *=/d' {file} 2> /dev/null || true; }} > {file}.new"
+        lines += [
+            f"if ! grep -qxF {shlex.quote(line)} {file} 2> /dev/null; then {new} && sync -f {file}.new &&"
+            f" mv {file}.new {file} && echo {shlex.quote(f'{line} stands in {file} now')}; fi"
+        ]
     for path, target in LINKS.items():
         settings = path.startswith("/etc/palpate/")
-        own = f"echo {path}" if settings else f"echo '{path} is a file there, not a link; move it away' >&2; exit 1"
+        own = (
+            f"echo '{path} stays as it is there: a file, not the link'"
+            if settings
+            else f"echo '{path} is a file there, not a link; move it away' >&2; exit 1"
+        )
         lines += [
             f"mkdir -p {Path(path).parent}",
             f"if [ -e {path} ] && [ ! -L {path} ]; then {own}; else ln -sfn {target} {path}; fi",
@@ -195,12 +215,15 @@ def self_test(release: str) -> str:
     return f"{as_user} {release}/bin/python -I -c {shlex.quote(SELF_TEST)} {release}/share/palpate"
 
 
-def switch(box: FleetBox, name: str, release: str) -> str:
-    """Swap the link and start the service from it, unless that is done already; the line for this box."""
+def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
+    """Swap the link and start the service from it, unless that is done already; the line for this box.
+
+    restart: start it even if this release runs, since its settings have changed.
+    """
     before = box.run("looking for the old release", f"readlink {LINK} || true")
     runs = f"""pid=$(systemctl show palpate -p MainPID --value)
 [ "$pid" != 0 ] && grep -q {release}/ /proc/$pid/maps && echo runs || true"""
-    if before == Path(release).name and box.run("looking at the process", runs, user="root"):
+    if not restart and before == Path(release).name and box.run("looking at the process", runs, user="root"):
         return f"{name} runs already"
     if before != Path(release).name:
         box.run("swapping the link", swap(release, before), user="root")

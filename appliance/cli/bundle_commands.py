@@ -14,13 +14,18 @@ from typing import TYPE_CHECKING
 
 from appliance.bundle import bundle
 from appliance.cli.commands import load_settings
-from appliance.core.errors import BundleError
+from appliance.core.clock import SystemClock
+from appliance.core.errors import ApplianceError, BundleError
 from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
 from appliance.deployment.store import SHA, Store
+from appliance.io.usb_sensor import fits
 from appliance.runtime import assembly
+from appliance.service import status
 
 if TYPE_CHECKING:
-    from appliance.core.config import StoreConfig
+    from appliance.bundle.bundle import Bundle
+    from appliance.core.config import Config, StoreConfig
+    from appliance.core.types import SweepFormat
 
 NEXT = "from the next start on: systemctl restart palpate"
 
@@ -106,11 +111,33 @@ def run_bundles(args: argparse.Namespace) -> int:
 
 def run_install(args: argparse.Namespace) -> int:
     """`palpate install`: a signed bundle comes into the store."""
-    store = assembly.store(load_settings(args))
-    sha = store.install(args.folder, args.shadow)
+    settings = load_settings(args)
+    store = assembly.store(settings)
+    skin = None if args.other_skin else streaming(settings, store)
+    sha = store.install(args.folder, args.shadow, lambda new: suits(new, skin))
     committed = "it is committed already" if store.state.of(sha).committed else f"it runs on trial {NEXT}"
     print(f"bundle {sha[:8]} is installed; {'it is the candidate' if args.shadow else committed}")
     return 0
+
+
+def streaming(settings: Config, store: Store) -> SweepFormat | None:
+    """The format of the skin that streams into the service now: that of the bundle that runs. None where that is not
+    known."""
+    try:
+        report = status.read(Path(settings.store.status), SystemClock().now_ns())
+        running = store.running()
+    except ApplianceError:  # `palpate status` and `palpate bundles` say what is wrong with them
+        return None
+    return running.format if report["running"] and report["streams"] and report["bundle"] == running.id else None
+
+
+def suits(new: Bundle, skin: SweepFormat | None) -> None:
+    """Raises BundleError where `new` is for another skin than the one that streams; None: nothing is known of it."""
+    if skin and not fits(skin, new.format):
+        raise BundleError(
+            f"bundle {new.id} is for a skin of {new.format}, and the one that streams has {skin}: it would answer no "
+            "sweep; if another skin comes with it, use --other-skin (make deploy OTHER_SKIN=1)"
+        )
 
 
 def run_verify(args: argparse.Namespace) -> int:

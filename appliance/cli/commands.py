@@ -245,7 +245,9 @@ def run_enrol(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         box = assembly.box(settings, current, devices, port, stack, observers=[taken], labels=(args.label,))
         box.run(lambda: taken.enough or stopped() or devices.finished(box.answered))
     new = enrolment.enrol(current, args.label, taken.windows())
-    for warning in new.warnings:
+    if new.disagreement and not args.scattered:
+        raise BundleError(f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was written")
+    for warning in filter(None, (new.disagreement, *new.warnings)):
         log.warning(f"warning: {warning}")
     enrolment.write(new.files, args.out, args.replace)
     m = new.bundle.manifest

@@ -125,6 +125,7 @@ def _service_commands(
         "--sweeps", type=int, choices=range(1, MOST_SWEEPS + 1), default=5, dest="good", metavar="N",
         help=f"how many good sweeps it takes, 1 to {MOST_SWEEPS} (default 5)",
     )  # fmt: skip
+    enrol.add_argument("--scattered", action="store_true", help="even if the sweeps are unlike one another")
     enrol.set_defaults(sweeps=None)
 
 
@@ -204,6 +205,9 @@ def _bundle_commands(add: Callable[..., Any]) -> None:
     listed.add_argument("--json", action="store_true")
     install = add("install", "check the signed bundle in DIR, and run it on trial from the next start on")
     install.add_argument("--shadow", action="store_true", help="as the candidate of `run --shadow` instead")
+    install.add_argument(
+        "--other-skin", action="store_true", help="even if it is for another skin than the one that streams"
+    )
     for command in (install, add("verify", "check the signed bundle in DIR, and change nothing")):
         command.add_argument("folder", type=Path, metavar="DIR")
     add("commit", "end the trial of the bundle that runs: it stays")

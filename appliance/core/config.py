@@ -225,6 +225,11 @@ def describe(config: Config) -> str:
     return "\n".join(f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items())
 
 
+def boards(folder: Path | None = None) -> dict[str, Path]:
+    """The delivered boards' files by name; folder: as for `load`."""
+    return {path.stem.removeprefix("board-"): path for path in sorted((folder or _folder()).glob("board-*.toml"))}
+
+
 def _folder() -> Path:
     beside = Path(__file__).resolve().parents[2] / "firmware_config"
     return beside if beside.is_dir() else SITE.parent
@@ -244,11 +249,11 @@ def _read(path: Path, *, needed: bool) -> dict[str, Any]:
 
 
 def _board_file(folder: Path, board: Any, where: str) -> Path:
-    boards = {path.stem.removeprefix("board-"): path for path in sorted(folder.glob("board-*.toml"))}
-    if not (isinstance(board, str) and board in boards):
-        there = ", ".join(boards) or "none"
+    known = boards(folder)
+    if not (isinstance(board, str) and board in known):
+        there = ", ".join(known) or "none"
         raise ConfigError(f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: {there}")
-    return boards[board]
+    return known[board]
 
 
 def _parse_set(text: str) -> dict[str, Any]:

@@ -165,13 +165,17 @@ class Store:
         run_limited(lambda: self._prove(signed.bundle))
         return signed
 
-    def install(self, incoming: Path, shadow: bool = False) -> str:
+    def install(
+        self, incoming: Path, shadow: bool = False, admit: Callable[[Bundle], object] = lambda bundle: None
+    ) -> str:
         """Install the bundle in `incoming`, so that it runs on trial from the next start on; its sha256.
 
-        shadow: it becomes the candidate instead. Other files in `incoming` are ignored. Somebody else may own the
-        folder and change it meanwhile: the files are read once, and what was checked is what is written.
+        shadow: it becomes the candidate instead. admit: raises BundleError for one that is not wanted now. Other files
+        in `incoming` are ignored. Somebody else may own the folder and change it meanwhile: the files are read once,
+        and what was checked is what is written.
         """
         signed = self.examine(incoming)
+        admit(signed.bundle)
         self.bundles.folder.mkdir(parents=True, exist_ok=True)
         with self._locked() as state:
             state.admit(signed.sha, signed.bundle.manifest.counter)

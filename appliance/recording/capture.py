@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from appliance.core.errors import ConfigError, FormatError, SensorError, SensorMismatch
-from appliance.core.log import TroubleLog
+from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
 from appliance.core.schema import typed
 from appliance.core.types import Edge, EdgeKind, Frames, SweepFormat
@@ -28,6 +28,8 @@ from appliance.io.trigger import EdgeCounters
 from appliance.io.usb_sensor import SensorCounters
 
 MAGIC = b"PPLPCAP1"
+MOST_KEPT = 99
+"""Most captures of the same name from earlier starts."""
 _RECORD = struct.Struct("<BQI")
 _EDGE = struct.Struct("<QB")
 _KINDS = tuple(EdgeKind)
@@ -48,7 +50,8 @@ class CaptureWriter(Observer):
     """Writes a capture while the box runs; a power failure loses at most what the system had not written yet.
 
     If the file cannot be written any more the capture ends, since one with a gap would replay differently; classifying
-    goes on. profile: of the skin, which decides how its bytes are read. Raises ConfigError if the file cannot be opened.
+    goes on. A file that is there, of an earlier start, becomes `path.1`, or the next number that is free. profile: of the
+    skin, which decides how its bytes are read. Raises ConfigError if the file cannot be opened.
     """
 
     def __init__(self, path: Path, fmt: SweepFormat, profile: SkinProfile = PALPATE) -> None:
@@ -57,6 +60,7 @@ class CaptureWriter(Observer):
         self._ended = False
         self._log = TroubleLog(f"capture: {path} cannot be written", "it ends here, classifying goes on")
         try:
+            _set_aside(path)
             self._file: IO[bytes] = path.open("wb")
         except OSError as e:
             raise ConfigError(f"--capture {path}: {e.strerror}; name a file that can be written") from e
@@ -88,6 +92,19 @@ class CaptureWriter(Observer):
 
     def _put(self, write: Callable[[], object]) -> None:
         self._ended = not self._log.attempt(write) or self._ended
+
+
+def _set_aside(path: Path) -> None:
+    """Give the capture of an earlier start another name: a box restarts by itself. Raises OSError, and ConfigError where
+    there are too many."""
+    if not path.is_file() or not path.stat().st_size:  # /dev/full, a pipe
+        return
+    kept = (path.with_name(f"{path.name}.{i}") for i in range(1, MOST_KEPT + 1))
+    free = next((name for name in kept if not name.exists()), None)
+    if not free:
+        raise ConfigError(f"--capture {path}: {MOST_KEPT} captures of earlier starts are beside it; move them away")
+    path.rename(free)
+    log.info(f"capture: {path} was there, of an earlier start; it is {free.name} now")
 
 
 class Playback:

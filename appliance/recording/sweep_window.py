@@ -75,7 +75,8 @@ class SweepCutter:
         self._newest = int(frames.seq[-1])
 
     def trigger(self, edges: Iterable[Edge], ready: bool, now_ns: int) -> None:
-        """Process trigger edges in their order. ready: whether the box could take a sweep when they came."""
+        """Process trigger edges of one turn in their order. ready: whether the box could take a sweep when they came."""
+        before = self._count
         for edge in edges:
             if edge.kind is EdgeKind.START:
                 self._start(edge.t_ns, ready, now_ns)
@@ -83,7 +84,8 @@ class SweepCutter:
                 self._stop(edge.t_ns, now_ns)
             elif edge.kind is EdgeKind.NEW_OBJECT:
                 self.new_object()
-            elif not self.interrupt(Status.EDGES_LOST, now_ns):
+            elif not self.interrupt(Status.EDGES_LOST, now_ns) and self._count == before:
+                # otherwise a sweep of this turn was answered: the robot counts one answer for it
                 self._answer(self._begin(edge.t_ns), edge.t_ns, Status.EDGES_LOST, now_ns)
 
     def new_object(self) -> None:

@@ -122,13 +122,33 @@ def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: st
 def test_a_second_install_changes_nothing(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
     """The same command again: the process goes on, settings and signers stay."""
     pid, name = host.service["MainPID"], release(host)
-    done = site.desktop("install", *at, "--wheel", wheel, "--board", "rpi4", "--signers", site.work / "signers")
+    done = site.desktop("install", *at, "--wheel", wheel, "--board", "rpi5", "--signers", site.work / "signers")
     assert (done.returncode, done.stdout.partition(": ")[2].strip()) == (
         0,
         f"{name.removeprefix('palpate-')} runs already",
     )
     assert (host.service["MainPID"], release(host)) == (pid, name)
     assert host.machine.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
+
+
+def test_the_board_that_is_named_last_holds(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
+    """It replaces a wrong one, what a person added stays, and the service starts with it."""
+    file, pid = "/etc/palpate/palpate.toml", host.service["MainPID"]
+    host.machine.put(file, 'board = "rpi9"\n# mine\n')
+    done = site.desktop("install", *at, "--wheel", wheel, "--board", "rpi5")
+    assert done.returncode == 0, done.stdout
+    assert f'board = "rpi5" stands in {file} now' in done.stderr
+    assert host.machine.get("cat", file) == 'board = "rpi5"\n# mine'
+    assert host.service["MainPID"] != pid
+    host.machine.put(file, 'board = "rpi5"\n')
+
+
+def test_a_board_without_a_file_is_refused_before_any_box_is_asked():
+    """With the boards that there are."""
+    command = [sys.executable, SCRIPTS / "install.py", "--host", "robot@127.0.0.1:1", "--wheel", __file__]
+    done = subprocess.run([*command, "--board", "rpi9"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "BOARD=rpi9 has no file firmware_config/board-rpi9.toml; boards there: rpi4, rpi5" in done.stderr
 
 
 def test_signers_are_never_overwritten(
@@ -435,9 +455,33 @@ def test_a_user_who_needs_a_password_for_sudo_is_refused(
     try:
         done = site.desktop("deploy", *at, sender.made(), limit_s=30)
         assert done.returncode == 1
-        assert "FAILED: sudo wants a password there; let the user in without" in done.stdout
+        assert "sudo: a password is required; let the user in without" in done.stdout
     finally:
         host.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) NOPASSWD: ALL\n")
+
+
+@pytest.mark.parametrize(
+    ("stderr", "why"),
+    [
+        ("tar: x: write error: No space left on device\ntar: Exiting with failure", "No space left.*; free some room"),
+        ("sudo: a password is required", "a password is required; let the user in without"),
+        ("robot is not in the sudoers file.", "sudoers file.; let the user in"),
+        ("E: one\nE: two", "^copying: E: two$"),
+        ("", "no reason given"),
+    ],
+)
+def test_what_a_box_says_comes_with_what_to_do(stderr: str, why: str):
+    """Also where the cause stands before the last line; words that are not known stand alone."""
+    code = f"""
+import fleet
+from types import SimpleNamespace
+host = SimpleNamespace(name="box", run_shell_command=lambda *a, **k: (False, SimpleNamespace(stderr={stderr!r}, stdout="")))
+try:
+    fleet.FleetBox(host, False).run("copying", "tar")
+except fleet.Failed as e:
+    print(e)
+"""
+    assert re.search(why, run_here(code))
 
 
 @pytest.mark.slow

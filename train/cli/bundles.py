@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -12,6 +13,7 @@ from typing import Any
 
 from appliance.bundle import bundle
 from appliance.bundle.manifest import Manifest
+from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
@@ -255,8 +257,16 @@ def _print(manifest: Manifest, out: Path) -> None:
     if why := manifest.made.get("contact_unknown_because"):
         print(f"no-contact cannot be told: {why}")
     _print_figures(manifest.figures)
+    if few := [f"{board} wires {bits}" for board, bits in _class_bits().items() if 1 << bits <= len(manifest.labels)]:
+        needed = len(manifest.labels).bit_length()
+        print(f"answers on lines: {len(manifest.labels)} labels need {needed} of output.class_bits; {', '.join(few)}")
     size = measure.sizes(out)[1]
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
+
+
+def _class_bits() -> dict[str, int]:
+    """How many lines each delivered board file wires for the class code."""
+    return {name: len(config.load(name, site=Path(os.devnull)).output.class_bits) for name in config.boards()}
 
 
 def _print_figures(figures: Mapping[str, dict[str, Any]]) -> None:

@@ -186,11 +186,13 @@ def test_early_answers_end_with_an_enrolment(tmp_path: Path):
         ([(0, 0), (6.2, 0)], ["disagree", "close to"]),
     ],
 )
-def test_unsuitable_sweeps_give_a_warning(old: Bundle, at: list[tuple[float, float]], hints: list[str]):
-    """Like a trained material, or unlike one another: a warning with numbers, and enrolled all the same."""
+def test_unsuitable_sweeps_are_told_with_numbers(old: Bundle, at: list[tuple[float, float]], hints: list[str]):
+    """Like a trained material, or unlike one another: told, and enrolled all the same."""
     new = enrolment.enrol(old, "felt", counts(*at))
-    assert len(new.warnings) == len(hints), new.warnings
-    assert all(hint in warning for hint, warning in zip(hints, new.warnings, strict=True))
+    found = [text for text in (new.disagreement, *new.warnings) if text]
+    assert len(found) == len(hints), found
+    assert all(hint in text for hint, text in zip(hints, found, strict=True))
+    assert bool(new.disagreement) == any("close" not in hint for hint in hints)
     assert "felt" in new.bundle.manifest.labels
 
 
@@ -372,6 +374,16 @@ def test_the_command_enrols(rig, old: Bundle, tmp_path: Path, capsys: pytest.Cap
     assert main(["check", "--set", f"classifier.bundle={tmp_path / 'new'}", "--virtual", "--sim",
                  f"replay:{tmp_path / 's.npz'}"]) == 0  # fmt: skip
     assert "4 labels, felt enrolled from 5" in capsys.readouterr().out
+
+
+def test_sweeps_of_several_materials_are_not_enrolled(rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Nothing is written, unless the person says that the material scatters."""
+    unlike = counts((20, 20), (20, 20), (30, 20), (20, 20), (20, 20))
+    assert rig(unlike) == BundleError.exit_code
+    assert "number 3 most of all; take others, or give --scattered if all are of 'felt'" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+    assert rig(unlike, "--scattered") == 0
+    assert "warning: the sweeps of 'felt' disagree" in capsys.readouterr().err
 
 
 def test_the_command_takes_the_requested_number_of_sweeps(rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -13,12 +13,12 @@ import pytest
 
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import SweepConfig
-from appliance.core.errors import FormatError
-from appliance.core.types import Frames, Status, Sweep, Verdict, load, save
+from appliance.core.errors import ConfigError, FormatError
+from appliance.core.types import Edge, EdgeKind, Frames, Status, Sweep, Verdict, load, save
 from appliance.inference.classifier import Classifier
 from appliance.io import packets
 from appliance.io.robot_link import StdoutPort
-from appliance.recording.capture import CaptureWriter, Playback
+from appliance.recording.capture import MOST_KEPT, CaptureWriter, Playback
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Box, Pipeline
 from appliance.sim import devices, rig, script, skin
@@ -138,6 +138,23 @@ def test_a_capture_that_was_cut_off_plays_up_to_there(
     assert len(played(tmp_path / "cut", default_bundle)[0]) == 1
     (tmp_path / "half").write_bytes(data[: len(data) * 2 // 3])
     assert len(played(tmp_path / "half", default_bundle)[0]) == 1
+
+
+def test_a_restart_keeps_the_capture_before(tmp_path: Path, logged: list[str]):
+    """Under the next number; when there are too many, the start is refused and nothing is overwritten."""
+    path = tmp_path / "capture"
+    for edges in range(3):
+        capture = CaptureWriter(path, skin.FORMAT)
+        capture.edges(7, [Edge(EdgeKind.START, 7)] * edges)
+        capture.close()
+    sizes = [(tmp_path / name).stat().st_size for name in ("capture.1", "capture.2", "capture")]
+    assert sizes == sorted({*sizes})
+    assert logged[-1] == f"capture: {path} was there, of an earlier start; it is capture.2 now"
+    for i in range(3, MOST_KEPT + 1):
+        (tmp_path / f"capture.{i}").touch()
+    with pytest.raises(ConfigError, match="99 captures of earlier starts are beside it; move them away"):
+        CaptureWriter(path, skin.FORMAT)
+    assert path.stat().st_size == sizes[-1]
 
 
 @pytest.mark.parametrize(

@@ -255,6 +255,15 @@ def test_lost_edges():
     assert one(bench) is Status.EDGES_LOST
 
 
+@pytest.mark.parametrize("ready", [False, True])
+def test_a_start_beside_lost_edges_gets_one_answer(ready: bool):
+    """Both come in one turn, in which the trigger is blind already, or is not: the sweep that began ends once."""
+    bench = Bench()
+    edges = [Edge(EdgeKind.START, t_ns(100)), Edge(EdgeKind.LOST, t_ns(101))]
+    bench.recorder.trigger(edges, ready, bench.now)
+    assert one(bench) is (Status.EDGES_LOST if ready else Status.NOT_READY)
+
+
 def test_new_enumeration_cuts_the_sweep():
     """Frames of a skin that was plugged in again end the sweep that began before, at once."""
     bench = Bench()

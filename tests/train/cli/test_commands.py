@@ -5,14 +5,18 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle
 from appliance.core.errors import FormatError
 from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import easy
+from train.cli import bundles
 from train.cli.main import main
 from train.data import pull, sets
 from train.models.compact.fit import Fit
@@ -147,3 +151,14 @@ def test_ctrl_c_during_the_imports_is_one_line(tmp_path: Path):
     command = [sys.executable, "-m", "train", "methods"]
     done = subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (130, "palpate-train: interrupted before anything was done\n")
+
+
+@pytest.mark.parametrize(("labels", "told"), [(15, False), (16, True)])
+def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
+    default_bundle: Bundle, capsys: pytest.CaptureFixture[str], labels: int, told: bool
+):
+    """Four lines have fifteen codes beside 0: with one label more the figures say how many lines are needed."""
+    manifest = replace(default_bundle.manifest, labels=tuple(f"m{i}" for i in range(labels)))
+    bundles._print(manifest, bundle.DEFAULT)
+    line = "answers on lines: 16 labels need 5 of output.class_bits; rpi4 wires 4, rpi5 wires 4"
+    assert (line in capsys.readouterr().out) == told

@@ -1,0 +1,58 @@
+"""`palpate install` beside a service that runs: a bundle for another skin than the one that streams is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from appliance.bundle import bundle
+from appliance.cli import bundle_commands
+from appliance.core import config
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.errors import BundleError
+from appliance.core.health import Health
+from appliance.deployment.store import Store
+from appliance.service.status import StatusFile
+
+RUNNING = bundle.load(bundle.DEFAULT)
+HEALTH = Health(
+    time_ns=0, skin="streaming", trouble="", streams=True, sweeping=False, answered=7, frames=5_000, lost_frames=0,
+    garbage_bytes=0, enumerations=1, dropped=0, bundle=RUNNING.id, source="usb",
+    stale_frames=0, overflows=0, fifo_overflows=0, glitches=0, lost_edges=0, storms=0,
+)  # fmt: skip
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Config:
+    """Of a box without deliveries, so that the packaged bundle runs."""
+    store = (f"store.folder={tmp_path}", f"store.status={tmp_path / 'status.json'}")
+    return config.load(None, store, site=Path("/dev/null"))
+
+
+def streaming(settings: Config, health: Health | None) -> object:
+    """What an install learns of a service in this state, None where it does not run."""
+    if health:
+        StatusFile(Path(settings.store.status), SystemClock()).turn(health)
+    return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
+
+
+def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config):
+    """Without a service, without a skin, or with a bundle that is not the store's, nothing is known."""
+    assert streaming(settings, None) is None
+    assert streaming(settings, HEALTH) == RUNNING.format
+    assert streaming(settings, replace(HEALTH, skin="mismatch", streams=False)) is None
+    assert streaming(settings, replace(HEALTH, bundle="9f3c2a1b")) is None
+
+
+def test_a_bundle_for_another_skin_is_refused_with_both_formats():
+    """One for the same skin with another window is taken, and any where the skin is not known."""
+    fmt = RUNNING.format
+    other = replace(RUNNING, manifest=replace(RUNNING.manifest, format=replace(fmt, rows=5, cols=3, rate_hz=100.0)))
+    with pytest.raises(BundleError, match=r"is for a skin of 5x3 uint8 at 100 Hz.*the one that streams has 4x4 uint8"):
+        bundle_commands.suits(other, fmt)
+    bundle_commands.suits(other, None)
+    shorter = replace(RUNNING, manifest=replace(RUNNING.manifest, format=replace(fmt, window=750)))
+    bundle_commands.suits(shorter, fmt)
