@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace, open_devices: OpenDevices) -> int:
             "shadow": lambda: shadow.agreement.text if shadow else "",
         }
         observers: list[Observer | None] = [
-            Notifier(SystemClock()), trial, shadow, *_reports(settings, current, facts, stack),
+            Notifier(SystemClock()), trial, shadow, *_reports(settings, current, devices.source, facts, stack),
         ]  # fmt: skip
         box = assembly.box(
             settings, current, devices, port, stack, capture=_capture(args, settings, current.format, stack),
@@ -122,10 +122,11 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:g} s")
         if slow := skin_profile.warning(fmt):
             log.warning(f"record: {slow}")
-        status = _status(settings, {"model": lambda: "none: sweeps are recorded"})
+        facts = {"model": lambda: "none: sweeps are recorded"}
+        feed = _feed(settings, fmt, devices.source, {"bundle": "", "labels": []}, facts)
         box = assembly.recorder(
             settings, fmt, devices, port, stack, capture=_capture(args, settings, fmt, stack),
-            observers=[Notifier(SystemClock()), recording, *status], commands=recording.commands,
+            observers=[Notifier(SystemClock()), recording, *_status(settings, facts), *feed], commands=recording.commands,
         )  # fmt: skip
         box.run(_done(args, box, devices, stopped))
     return 0
@@ -167,9 +168,10 @@ def _done(args: argparse.Namespace, box: Box, devices: Devices, stopped: Callabl
 
 
 def _reports(
-    settings: Config, current: Bundle, facts: Mapping[str, Callable[[], str]], stack: ExitStack
+    settings: Config, current: Bundle, source: str, facts: Mapping[str, Callable[[], str]], stack: ExitStack
 ) -> list[Observer]:
-    """What reports to a person and keeps sweeps, as the settings say: the log, the black box, the status with `facts`."""
+    """What reports to a person and keeps sweeps, as the settings say: the log, the black box, status and feed with
+    `facts`. source: where the frames come from."""
     observers: list[Observer] = [VerdictLog()] if in_journal() else []
     if settings.store.black_box:
         from appliance.recording.black_box import BlackBox
@@ -179,7 +181,9 @@ def _reports(
         observers.append(black_box)
     m = current.manifest
     model = f"{m.name} {m.version}, {len(m.labels)} labels"
-    return observers + _status(settings, {"model": lambda: model, **facts})
+    facts = {"model": lambda: model, **facts}
+    known = {"bundle": current.id, "labels": m.labels}
+    return [*observers, *_status(settings, facts), *_feed(settings, current.format, source, known, facts)]
 
 
 def _status(settings: Config, facts: Mapping[str, Callable[[], str]]) -> list[Observer]:
@@ -188,6 +192,21 @@ def _status(settings: Config, facts: Mapping[str, Callable[[], str]]) -> list[Ob
     if not settings.store.status or not os.access(path.parent, os.W_OK):
         return []
     return [StatusFile(path, SystemClock(), lambda: {name: text() for name, text in facts.items()})]
+
+
+def _feed(
+    settings: Config, fmt: SweepFormat, source: str, model: Mapping[str, Any], facts: Mapping[str, Callable[[], str]]
+) -> list[Observer]:
+    """What programs that watch the box read, where the settings name a socket; its default is for a service, whose
+    folder is there. model: what the feed's first line says of it."""
+    path = Path(settings.feed.socket)
+    default = settings.sources["feed.socket"] == "code"
+    if not settings.feed.socket or (default and not os.access(path.parent, os.W_OK)):
+        return []
+    from appliance.service.feed import FeedServer
+
+    known = {"source": source, "skin": settings.sensor.skin, **model}
+    return [FeedServer(path, fmt, known, SystemClock(), lambda: {name: text() for name, text in facts.items()})]
 
 
 def _shadow(settings: Config, current: Bundle, devices: Devices, named: str | None) -> Shadow | None:

@@ -20,6 +20,8 @@ from appliance.core.schema import Key, closest, gpio_line, keys, number, read_ta
 
 SITE = Path("/etc/palpate/palpate.toml")
 """The settings of this robot's installation; the file may be missing."""
+FEED_SCHEMA = 1
+"""Version of the feed's lines (PROTOCOL.md, part 4), for who writes and who reads them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +165,13 @@ class StoreConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class FeedConfig:
+    """What the box offers to programs that watch it (PROTOCOL.md, part 4). socket: path of the feed, "" for none."""
+
+    socket: str = "/run/palpate/feed.sock"
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """All settings. board: the board file's name, "" for none. folder: where the files are, skins/ among them.
 
@@ -177,6 +186,7 @@ class Config:
     serial: SerialConfig
     classifier: ClassifierConfig
     store: StoreConfig
+    feed: FeedConfig
     sources: Mapping[str, str] = field(compare=False)
     folder: Path = field(default=SITE.parent, compare=False)
 

@@ -83,6 +83,12 @@ class PortError(ApplianceError):
     exit_code = EX_UNAVAILABLE
 
 
+class FeedError(ApplianceError):
+    """The feed of the running box cannot be read, or gives nothing."""
+
+    exit_code = EX_UNAVAILABLE
+
+
 class FormatError(ApplianceError):
     """An array, file or sentence does not have the required form."""
 

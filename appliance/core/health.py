@@ -11,10 +11,11 @@ class Health:
     """State of the box at the end of a turn.
 
     time_ns: host monotonic. skin: sensor state (PROTOCOL.md). trouble: why the skin does not stream, "" where it does.
-    streams: frames are arriving. The counts, since the program started, are those of the STA sentence: of the sensor
-    from `frames` to `enumerations` and from `stale_frames` to `fifo_overflows` (see SensorCounters), of the serial line
-    `dropped`, of the trigger `glitches`, `lost_edges` and `storms` (see EdgeCounters). loss_known: the skin counts its
-    frames; without that, `lost_frames` holds what can be inferred.
+    streams: frames are arriving. ready: a sweep can be taken now, as the line READY shows. The counts, since the
+    program started, are those of the STA sentence: of the sensor from `frames` to `enumerations` and from `stale_frames`
+    to `fifo_overflows` (see SensorCounters), of the serial line `dropped`, of the trigger `glitches`, `lost_edges` and
+    `storms` (see EdgeCounters). loss_known: the skin counts its frames; without that, `lost_frames` holds what can be
+    inferred.
     """
 
     time_ns: int
@@ -37,6 +38,7 @@ class Health:
     lost_edges: int
     storms: int
     loss_known: bool = True
+    ready: bool = False
 
     @property
     def text(self) -> str:

@@ -240,7 +240,7 @@ class Box:
             dropped=self._port.dropped if self._port else 0, bundle=self._answerer.model, source=self._source,
             stale_frames=counters.stale_frames, overflows=counters.overflows, fifo_overflows=counters.fifo_overflows,
             glitches=edges.glitches, lost_edges=edges.lost_edges, storms=edges.storms,
-            loss_known=sensor.loss_known,
+            loss_known=sensor.loss_known, ready=self._able and not self._cutter.sweeping,
         )  # fmt: skip
 
     def circumstances(self) -> dict[str, Any]:

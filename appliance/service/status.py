@@ -36,16 +36,34 @@ _START = "systemctl start palpate, then see journalctl -u palpate"
 WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
 
 
-class StatusFile(Observer):
-    """Writes the state of the box and its latest answers; removed when the program has ended in order.
+class Report:
+    """The state of the box as an object for JSON, in the status file and in the feed.
 
     clock: the host's real one, which a reader in another process shares. more: further facts for JSON; a text among them
     is a line of its own in words, unless it is empty.
     """
 
+    def __init__(self, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
+        self._clock, self._more = clock, more
+        self._since_ns = clock.now_ns()
+
+    def __call__(self, health: Health) -> dict[str, Any]:
+        """The state now."""
+        return {
+            **self._more(), **asdict(health), "time_ns": self._clock.now_ns(), "since_ns": self._since_ns,
+            "pid": os.getpid(), "version": __version__,
+        }  # fmt: skip
+
+
+class StatusFile(Observer):
+    """Writes the state of the box and its latest answers; removed when the program has ended in order.
+
+    clock, more: as for Report.
+    """
+
     def __init__(self, path: Path, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
-        self._path, self._clock, self._more = path, clock, more
-        self._since_ns = self._next_ns = clock.now_ns()
+        self._path, self._clock, self._report = path, clock, Report(clock, more)
+        self._next_ns = clock.now_ns()
         self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
         self._fresh, self._skin = False, ""
         self._log = TroubleLog(f"status: {path} cannot be written", "classifying goes on")
@@ -63,10 +81,7 @@ class StatusFile(Observer):
         if now_ns < self._next_ns - (PERIOD_NS - SOON_NS if self._fresh else 0):
             return
         self._next_ns, self._fresh = now_ns + PERIOD_NS, False
-        report = {
-            **self._more(), **asdict(health), "time_ns": now_ns, "since_ns": self._since_ns, "pid": os.getpid(),
-            "version": __version__, "schema": SCHEMA, "verdicts": list(self._verdicts),
-        }  # fmt: skip
+        report = self._report(health) | {"schema": SCHEMA, "verdicts": list(self._verdicts)}
         # every user of the box may ask; the file lies in memory (/run), and on a card one sync a second would wear it
         self._log.attempt(lambda: storage.put(self._path, json.dumps(report).encode(), durable=False, mode=0o644))
 

@@ -137,6 +137,7 @@ def _places(tree: Any) -> Any:
 MUTATORS: dict[str, Mutator] = {
     "unpack": packets,
     "command": sentences,
+    "feed": tables,
     "settings": tables,
     "manifest": trees,
     "recording": headed,

@@ -73,6 +73,16 @@ def command() -> list[bytes]:
     return [b"".join(sealed), b"".join(by_hand), *sealed, *written, b"$PPLP,ID*00\r\n", b"x" * 130 + b"\nPPLP,NEW\n"]
 
 
+def feed() -> list[bytes]:
+    """What a reader may ask for, at once and in one line, the document's examples, and lines that are no requests."""
+    asked = [json.dumps(one).encode() for one in (*({"frames": hz} for hz in (0, 0.5, 20)), {"sweeps": True})]
+    both = json.dumps({"frames": 5, "sweeps": False}).encode()
+    protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
+    written = [text.encode() + b"\n" for text in re.findall(r"`(\{[^`]*\})`", protocol) if "HZ" not in text]
+    wrong = [b'{"frames": 21}\n', b"{}\n", b"[[\n", b"x" * 1100, b'{"frames": true}\n', b'{"frames": NaN}\n', b"\n"]
+    return [b"\n".join([*asked, both, b""]), both + b"\n", *written, *wrong]
+
+
 def settings() -> list[bytes]:
     """The files that come with the box without their comments, and all settings as `palpate config` prints them."""
     files = sorted((ROOT / "firmware_config").glob("*.toml"))
@@ -128,7 +138,7 @@ def capture() -> list[bytes]:
 
 
 SEEDS: dict[str, Callable[[], list[bytes]]] = {
-    **{f.__name__: f for f in (unpack, command, settings, manifest, recording, capture)}, "profile": skins.profile_seeds,
+    **{f.__name__: f for f in (unpack, command, feed, settings, manifest, recording, capture)}, "profile": skins.profile_seeds,
     **{f"skin-{name}": partial(skins.seeds, name) for name in skins.GRIDS},
 }  # fmt: skip
 
@@ -139,6 +149,8 @@ def words(target: str) -> Sequence[bytes]:
         return [packets.MAGIC, ENDLESS, *(b"%c%c" % (packets.VERSION, kind) for kind in packets.PacketKind)]
     if target == "command":
         return [b"$PPLP,", b"*", b"\r\n", b"\xff", *(name.encode() for name in robot_link.COMMANDS)]
+    if target == "feed":
+        return [b'{"frames": ', b'"sweeps": true', b"NaN", b"1e999", b"-0.0", b"null", b"}\n", b", "]
     if target == "settings":
         groups = {
             f.name: type(getattr(config.load(None, site=Path("/dev/null")), f.name)) for f in fields(config.Config)

@@ -6,6 +6,7 @@ Each target is a pure function of its bytes; what is in the folder is only what 
 
 from __future__ import annotations
 
+import json
 import re
 import struct
 import zlib
@@ -20,6 +21,7 @@ from appliance.core.errors import FormatError, SensorMismatch
 from appliance.core.types import SweepFormat
 from appliance.io import packets as wire
 from appliance.io import robot_link, usb_sensor
+from appliance.service import feed
 from tests.fuzz import files, skins
 from tests.fuzz.files import one_line
 
@@ -27,6 +29,8 @@ Target = Callable[[bytes, Path], None]
 
 SKIN = SweepFormat(4, 4, 750.0, 1500, "uint8")
 LONGEST = wire.HEADER.size + wire.MAX_PAYLOAD + wire.CRC.size
+REQUEST = 1024
+"""Bytes of a request to the feed by PROTOCOL.md, part 4."""
 LINE = 128
 """Characters of a sentence or command by PROTOCOL.md, part 2."""
 ITEM_SIZES = {0: 1, 1: 2, 2: 2, 3: 4}
@@ -190,7 +194,44 @@ def _answer(parsed: robot_link.Command) -> None:
     assert parsed.error or name == parsed.name
 
 
+def requests(data: bytes, folder: Path) -> None:
+    """feed.requests: what the document allows is taken, whatever else is refused in one line, in parts as at once."""
+    *lines, last = data.split(b"\n")
+    right = len(last) <= REQUEST and all(map(_is_request, lines))
+    try:
+        got, rest = feed.requests(data)
+    except FormatError as e:
+        refused = one_line(e)
+    else:
+        refused = ""
+    assert right != bool(refused), f"{data!r}: {refused or got}"
+    if refused:
+        return
+    assert len(got) == len(lines)
+    assert rest == last
+    for asked in got:
+        assert asked.frames_hz is None or 0 <= asked.frames_hz <= 20
+        assert asked.sweeps in (None, True, False)
+        assert asked != feed.Asked()
+    for cut in cuts(data):
+        first, left = feed.requests(data[:cut])
+        then, left = feed.requests(data[cut:], left)
+        assert (first + then, left) == (got, rest), f"cut at {cut}, other requests come out"
+
+
+def _is_request(line: bytes) -> bool:
+    """Whether a line is a request by PROTOCOL.md."""
+    try:
+        asked = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    if len(line) > REQUEST or not isinstance(asked, dict) or set(asked) - {"frames", "sweeps"} or not asked:
+        return False
+    hz, sweeps = asked.get("frames", 0), asked.get("sweeps", True)
+    return not isinstance(hz, bool) and isinstance(hz, (int, float)) and 0 <= hz <= 20 and isinstance(sweeps, bool)
+
+
 TARGETS: dict[str, Target] = {
-    "unpack": unpack, "command": command, "settings": files.settings, "manifest": files.manifest,
+    "unpack": unpack, "command": command, "feed": requests, "settings": files.settings, "manifest": files.manifest,
     "recording": files.recording, "capture": files.played, **skins.TARGETS,
 }  # fmt: skip

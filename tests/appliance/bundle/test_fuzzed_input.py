@@ -18,6 +18,7 @@ from appliance.core.errors import ApplianceError
 from appliance.io import packets, robot_link, skin_codecs, skin_profile, usb_sensor
 from appliance.io.skin_codecs import fixed, papillarray, robotiq, text, xela
 from appliance.recording import capture
+from appliance.service import feed
 from tests.fuzz import corpus, files, seeds, skins, targets
 from tests.fuzz.mutators import MUTATORS
 
@@ -122,6 +123,7 @@ def frames_of(name: str, data: bytes, folder: Path) -> int:
 READ: dict[str, Callable[[bytes, Path], Any]] = {
     "unpack": lambda data, folder: packets.unpack(data).packets,
     "command": lambda data, folder: any(not c.error for c in robot_link.parse(data)[0]),
+    "feed": lambda data, folder: feed.requests(data)[0],
     "settings": lambda data, folder: config.load(None, folder=folder, site=written(folder, "palpate.toml", data)),
     "manifest": read_manifest,
     "recording": read_recording,
@@ -252,6 +254,11 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
     ("command", "any checksum is right", robot_link, "checksum", lambda body: "00"),
     ("command", "an answer has no limit", robot_link, "MAX_LINE", 200),
     ("command", "a command is obeyed twice", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0] * 2, got[1]))),
+    ("feed", "a request is lost", feed, "requests", changed(feed, "requests", lambda got: (got[0][1:], got[1]))),
+    ("feed", "the rest is dropped", feed, "requests", changed(feed, "requests", lambda got: (got[0], b""))),
+    ("feed", "frames without a limit", feed, "MOST_HZ", 1e9),
+    ("feed", "a line has no limit", feed, "MOST_REQUEST", 10**9),
+    ("feed", "a message of two lines", feed, "_shown", lambda line: "line 1\nline 2"),
     ("settings", "limits are not looked at", schema.Key, "fit",
      lambda key, value: value if key.hint in (int, float) else FIT(key, value)),
     ("settings", "any text is a choice", schema.Key, "fit",
@@ -293,7 +300,7 @@ def test_each_promise_can_be_seen_broken(
 
 @pytest.mark.parametrize(
     ("target", "module", "name"),
-    [("unpack", packets, "unpack_identity"), ("command", robot_link, "_command"), ("settings", config, "_checked"),
+    [("unpack", packets, "unpack_identity"), ("command", robot_link, "_command"), ("feed", feed, "_request"), ("settings", config, "_checked"),
      ("manifest", manifest, "typed"), ("recording", types, "typed"), ("capture", capture, "typed")],
 )  # fmt: skip
 def test_another_error_is_not_kept_back(

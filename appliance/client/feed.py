@@ -1,0 +1,181 @@
+"""Reads the feed of the running box (PROTOCOL.md, part 4), and comes back to it when the box restarts.
+
+In: the path of its socket. Out: each line as a dict. numpy is not needed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from appliance.core.clock import Clock, SystemClock, wait_readable
+from appliance.core.config import FEED_SCHEMA, FeedConfig
+from appliance.core.errors import FeedError, FormatError
+
+DEFAULT = FeedConfig().socket
+MOST_LINE = 1 << 20
+"""Bytes of a line; the box sends far shorter ones."""
+RETRY_NS = 500_000_000
+"""Time between two attempts to connect."""
+ENDED = "the box has closed the feed; it is read again when the box is back"
+
+
+def parse(data: bytes, rest: bytes = b"") -> tuple[list[dict[str, Any]], bytes]:
+    """The lines in `data`, which continues `rest`, and the new unfinished rest. Raises FormatError for what is no line."""
+    *lines, rest = (rest + data).split(b"\n")
+    if len(rest) > MOST_LINE:
+        raise FormatError(f"a line of over {MOST_LINE} bytes; is this socket the feed of a palpate?")
+    return [_line(line) for line in lines], rest
+
+
+def _line(text: bytes) -> dict[str, Any]:
+    """Raises FormatError."""
+    try:
+        line = json.loads(text)
+        if not isinstance(line["type"], str):
+            raise TypeError
+    except (ValueError, TypeError, KeyError, RecursionError) as e:
+        raise FormatError(f"{text[:40]!a} is no line of a feed; is this socket the feed of a palpate?") from e
+    if line["type"] == "hello" and line.get("schema") != FEED_SCHEMA:
+        raise FormatError(
+            f"the box speaks schema {line.get('schema')!r} of the feed, this reader {FEED_SCHEMA}; update one of them"
+        )
+    return dict(line)
+
+
+class Feed:
+    """The feed at `path`. `read` connects where that is needed, so a box that is not there yet is no error.
+
+    frames_hz, sweeps: what is asked for at each connection, see `ask`. trouble: why nothing is read now, "" where the
+    feed is. Usable in one thread; `fileno` is for waiting elsewhere.
+    """
+
+    def __init__(
+        self, path: str | Path = DEFAULT, *, frames_hz: float = 0, sweeps: bool = False,
+        clock: Clock | None = None,
+    ) -> None:  # fmt: skip
+        self.path = Path(path)
+        self.trouble = "not connected yet"
+        self._asked: dict[str, Any] = {"frames": frames_hz, "sweeps": sweeps}
+        self._clock = clock or SystemClock()
+        self._retry_ns = self._clock.now_ns()
+        self._connection: socket.socket | None = None
+        self._lines: deque[dict[str, Any]] = deque()
+        self._rest = b""
+
+    def __enter__(self) -> Feed:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Every line, also over restarts of the box. Raises FeedError where none comes for ten seconds."""
+        while True:
+            line = self.read(10.0)
+            if line is None:
+                raise FeedError(f"{self.path}: {self.trouble or 'nothing came for 10 s; see palpate status'}")
+            yield line
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection."""
+        return self._connection is not None
+
+    def fileno(self) -> int:
+        """The connection's file descriptor, -1 without one."""
+        return self._connection.fileno() if self._connection else -1
+
+    def ask(self, *, frames_hz: float | None = None, sweeps: bool | None = None) -> None:
+        """Ask for frames at this rate (0 to 20 a second), and for the windows of cut sweeps; None: as before."""
+        if frames_hz is not None:
+            self._asked["frames"] = frames_hz
+        if sweeps is not None:
+            self._asked["sweeps"] = sweeps
+        self._request()
+
+    def read(self, timeout_s: float = 1.0) -> dict[str, Any] | None:
+        """The next line; None where none has come in that time, `trouble` then says why if there is a reason."""
+        end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while not self._lines:
+            left_ns = end_ns - self._clock.now_ns()
+            if self._connection is None and not self._connect():
+                if left_ns <= 0:
+                    return None
+                self._clock.sleep_until(min(end_ns, self._retry_ns))
+            elif wait_readable(self.fileno(), max(0, left_ns) / 1e9):
+                self._receive()
+            elif left_ns <= 0:
+                return None
+        return self._lines.popleft()
+
+    def close(self) -> None:
+        """End the connection; the next `read` opens another."""
+        if self._connection:
+            self._connection.close()
+            self._connection = None
+        self._rest = b""
+
+    def _connect(self) -> bool:
+        """Connect where it is time to try, and ask again for what was asked for."""
+        now_ns = self._clock.now_ns()
+        if now_ns < self._retry_ns:
+            return False
+        self._retry_ns = now_ns + RETRY_NS
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            connection.settimeout(RETRY_NS / 1e9)
+            connection.connect(os.fspath(self.path))
+        except OSError as e:
+            connection.close()
+            self.trouble = _why(e)
+            return False
+        self._connection, self.trouble = connection, ""
+        self._request()
+        return self._connection is not None
+
+    def _request(self) -> None:
+        if not self._connection:
+            return
+        try:
+            self._connection.sendall(json.dumps(self._asked).encode() + b"\n")
+        except OSError as e:
+            self._lose(_why(e))
+
+    def _receive(self) -> None:
+        if not self._connection:
+            return
+        try:
+            data = self._connection.recv(1 << 16)
+            if not data:
+                raise FeedError(ENDED)
+            lines, self._rest = parse(data, self._rest)
+        except OSError as e:
+            self._lose(_why(e))
+        except (FeedError, FormatError) as e:
+            self._lose(str(e))
+        else:
+            for line in lines:
+                if line["type"] == "closed":  # what the box says before it closes
+                    self.trouble = str(line.get("why"))
+            self._lines += lines
+
+    def _lose(self, why: str) -> None:
+        """Close, and connect again after a while; what the box said last is the better reason."""
+        self.close()
+        self.trouble = self.trouble or why
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
+
+
+def _why(e: OSError) -> str:
+    """Why the feed cannot be read, for a person."""
+    if isinstance(e, PermissionError):
+        return "you may not read the feed; join group palpate (sudo adduser NAME palpate), and log in again"
+    if isinstance(e, (FileNotFoundError, ConnectionRefusedError)):
+        return "no palpate offers its feed there; start it (systemctl start palpate), or see feed.socket"
+    return f"{str(e.strerror or e).lower()}; see palpate status"

@@ -1,0 +1,88 @@
+"""A feed on a virtual clock, and plain sockets that read it: what a test does to the one is seen at the other."""
+
+from __future__ import annotations
+
+import json
+import select
+import socket
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appliance.core.health import Health
+from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
+from appliance.service.feed import FeedServer
+from appliance.sim import rig, skin
+from tests.factories.simulated_box import SECOND, numbered
+
+HEALTH = Health(
+    time_ns=0, skin="streaming", trouble="", streams=True, sweeping=False, answered=7, frames=5_000_000, lost_frames=3,
+    garbage_bytes=0, enumerations=1, dropped=0, bundle="9f3c2a1b", source="usb", stale_frames=0, overflows=0,
+    fifo_overflows=0, glitches=0, lost_edges=0, storms=0, ready=True,
+)  # fmt: skip
+OK = Verdict(
+    sweep=7, time_ns=0, status=Status.OK, label="plastic rough", probability=0.987, margin=0.9,
+    scores=np.array([0.987, 0.013]), fused=1, lost=0, latency_ns=1_200_000, bundle="9f3c2a1b", moved="moved 2 mm",
+)  # fmt: skip
+
+
+def frames(n: int = 6, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> Frames:
+    """Numbered frames."""
+    at = np.arange(first, first + n)
+    return Frames(at * 1000, at, numbered(n, fmt, first))
+
+
+def cut(fmt: SweepFormat = skin.FORMAT) -> Sweep:
+    """A sweep with a window."""
+    return Sweep(7, 5, 6, Status.OK, frames(fmt.window, fmt))
+
+
+class FeedPeer:
+    """A reader as another program is one."""
+
+    def __init__(self, path: Path, *, wait_s: float = 5.0) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.socket.settimeout(wait_s)
+        self.socket.connect(str(path))
+        self.ended, self._rest = False, b""
+
+    def ask(self, text: str | bytes) -> None:
+        """Send a request, or something else."""
+        self.socket.sendall(text.encode() + b"\n" if isinstance(text, str) else text)
+
+    def lines(self) -> list[dict[str, Any]]:
+        """What has come by now; `ended` is set once the box has closed."""
+        while select.select([self.socket], [], [], 0)[0]:
+            try:
+                data = self.socket.recv(1 << 16)
+            except ConnectionResetError:  # the box had not read all that was sent
+                data = b""
+            if not data:
+                self.ended = True
+                break
+            self._rest += data
+        *lines, self._rest = self._rest.split(b"\n")
+        return [json.loads(line) for line in lines]
+
+
+class Offered:
+    """A feed whose turns a test takes."""
+
+    def __init__(self, path: Path, fmt: SweepFormat = skin.FORMAT, **facts: Any) -> None:
+        self.path, self.clock = path, rig.VirtualClock()
+        known = {"source": "usb", "bundle": "9f3c2a1b", "labels": ["plastic rough", "wood"], "skin": "palpate"}
+        self.feed = FeedServer(path, fmt, known, self.clock, lambda: facts)
+
+    def turns(self, n: int = 1, health: Health = HEALTH, step_s: float = 0.008) -> None:
+        """Take turns, `step_s` apart."""
+        for _ in range(n):
+            self.feed.turn(health)
+            self.clock.sleep_until(self.clock.now_ns() + round(step_s * SECOND))
+
+    def peer(self) -> FeedPeer:
+        """A connected reader that the box has taken up."""
+        self.turns()
+        peer = FeedPeer(self.path)
+        self.turns(2, step_s=0)
+        return peer
