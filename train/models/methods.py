@@ -36,6 +36,7 @@ MODULES = (
     "train.models.minirocket_augmented",
     "train.models.aeon_peers",
     "train.models.ds_cnn",
+    "train.models.lite",
     "train.models.edge_spectral",
     "train.models.compact.default",
     "train.models.paper_cnn",

@@ -44,7 +44,12 @@ def quantize(model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv"
             reduce_range=True, activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8,
             calibrate_method=CalibrationMethod.Percentile, extra_options={"CalibPercentile": PERCENTILE},
         )  # fmt: skip
-        return onnx.load(path)
+        made = onnx.load(path)
+    for constant in made.graph.initializer:
+        constant.ClearField(
+            "data_location"
+        )  # set to its default where onnxruntime had moved it; the box refuses the field
+    return made
 
 
 def calibration_sweeps(sweeps: Array) -> Array:

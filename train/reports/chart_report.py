@@ -49,6 +49,7 @@ FAMILIES = {
     "train.models.minirocket_augmented": "MiniRocket",
     "train.models.aeon_peers": "aeon",
     "train.models.ds_cnn": "edge tools",
+    "train.models.lite": "edge tools",
     "train.models.edge_spectral": "edge tools",
 }
 OTHERS = "related work"
@@ -109,6 +110,7 @@ FULL = Chart(
         "multirocket-hydra",
         "quant",
         "ds-cnn",
+        "lite",
         "edge-spectral",
         "tactnet2",
         "paper-cnn-centred",

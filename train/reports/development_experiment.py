@@ -25,7 +25,7 @@ Json = dict[str, Any]
 Log = Callable[[str], None]
 OURS = ("default", "filter-bank", "compact-50k")
 """No peers; the first of them that is there is compared with the peers."""
-PEERS = ("minirocket", "minirocket-augmented", "multirocket-hydra", "quant", "ds-cnn", "edge-spectral")
+PEERS = ("minirocket", "minirocket-augmented", "multirocket-hydra", "quant", "ds-cnn", "lite", "edge-spectral")
 EACH = (5, 10, 20)
 """Training sweeps of each material along a learning curve, before all of them."""
 

@@ -43,8 +43,8 @@ PLACES = [(0, 10, "center"), (6, 0, "left"), (-6, 0, "right"), (0, -10, "center"
           (-8, 16, "right"), (-8, -16, "right")]  # fmt: skip
 """Where a name may stand, points from its dot, and its alignment; the best first."""
 SHORT = {SHIPPED: "Palpate, as shipped", "minirocket-augmented": "MiniRocket, augmented", "quant": "QUANT", "ds-cnn": "DS-CNN",
-         "multirocket-hydra": "MultiRocket-Hydra", "paper-cnn": "paper’s CNN, raw", "paper-cnn-centred": "paper’s CNN", "minirocket": "MiniRocket",
-         "tactnet2": "TactNet-II", "st-hmp": "ST-HMP"}  # fmt: skip
+         "lite": "LITE", "multirocket-hydra": "MultiRocket-Hydra", "paper-cnn": "paper’s CNN, raw", "paper-cnn-centred": "paper’s CNN",
+         "minirocket": "MiniRocket", "tactnet2": "TactNet-II", "st-hmp": "ST-HMP"}  # fmt: skip
 Box = tuple[float, float, float, float]
 Spot = tuple[Dot, float, float, bool]
 

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from appliance.bundle.onnx_check import reader
 from appliance.core.types import SweepFormat
 from appliance.inference.classifier import softmax
 from tests.factories.sweep_sets import easy
 from train.models import ds_cnn, edge_spectral, methods
 from train.onnx_tools import cost, graph_builder
+from train.onnx_tools.quantize import quantize
 
 
 @pytest.mark.parametrize(
@@ -44,6 +46,17 @@ def test_ds_cnn_has_an_int8_form():
     assert cost.precision(int8.graph()) == "int8"
     assert len(int8.graph().SerializeToString()) < 0.6 * len(model.graph().SerializeToString())
     np.testing.assert_allclose(softmax(int8.logits(s.samples)), softmax(model.logits(s.samples)), atol=0.25)
+
+
+@pytest.mark.parametrize("classes", [3, 26])
+def test_the_box_reads_its_int8_form(classes: int):
+    """A head of more than a kilobyte was once marked as lying in a file of its own, which the box refuses."""
+    form = SweepFormat(2, 2, 100.0, 128, "int16")
+    sweeps = np.random.default_rng(1).integers(-99, 99, (8, 128, 2, 2), np.int16)
+    network = ds_cnn.build(form, classes, sweeps).eval()
+    model = quantize(network.graph(), sweeps, ds_cnn.INT8_NODES)
+    assert reader.read(model.SerializeToString()).graph is not None
+    np.testing.assert_allclose(graph_builder.run(model, sweeps), graph_builder.run(network.graph(), sweeps), atol=0.1)
 
 
 @pytest.mark.parametrize(

@@ -18,14 +18,14 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.data.sets import Dataset
 from train.evaluation import evaluate, fold
-from train.models import ds_cnn, edge_spectral, methods, paper_cnn, recurrent, training
+from train.models import ds_cnn, edge_spectral, lite, methods, paper_cnn, recurrent, training
 from train.models.compact import fit, network
 from train.models.compact.fit import FitRecipe
 from train.models.linear_head import closed_form_head
 from train.models.methods import Effort, Method
 from train.onnx_tools import graph_builder
 
-NETS = ("paper-cnn", "paper-cnn-centred", "tactnet2", "recurrent", "ds-cnn", "edge-spectral")
+NETS = ("paper-cnn", "paper-cnn-centred", "tactnet2", "recurrent", "ds-cnn", "lite", "edge-spectral")
 NAMES = (*NETS, "compact")
 BRIEF = Effort(share=0.01, paper_steps=2)
 """Two to eight iterations: enough for what is not about accuracy."""
@@ -155,6 +155,7 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
         "tactnet2": paper_cnn.build_tactnet2,
         "recurrent": recurrent.build_recurrent,
         "ds-cnn": ds_cnn.build,
+        "lite": lite.build,
         "edge-spectral": edge_spectral.build,
     }.get(name)
     counts = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
@@ -295,7 +296,7 @@ def test_bfloat16_is_used_where_it_is_asked_for_and_there():
 
 def test_effort_is_kept():
     """Names, iterations and logs follow the effort; methods can be sent to another process."""
-    networks = (*paper_cnn.METHODS, *recurrent.METHODS, *ds_cnn.METHODS, *edge_spectral.METHODS)
+    networks = (*paper_cnn.METHODS, *recurrent.METHODS, *ds_cnn.METHODS, *lite.METHODS, *edge_spectral.METHODS)
     assert tuple(m.name for m in networks) == NETS
     assert all(m.input == "raw" and "\n" not in m.about for m in networks)
     if not torch.cuda.is_available():
