@@ -3,7 +3,7 @@
 Messages are lower case, name the value that was wrong and say what to try. Exit codes are those of sysexits.h.
 """
 
-from os import EX_CONFIG, EX_DATAERR, EX_UNAVAILABLE
+EX_DATAERR, EX_UNAVAILABLE, EX_CONFIG = 65, 69, 78  # `os` has them on Unix alone, and the client runs elsewhere, too
 
 
 class ApplianceError(Exception):
@@ -87,6 +87,20 @@ class FeedError(ApplianceError):
     """The feed of the running box cannot be read, or gives nothing."""
 
     exit_code = EX_UNAVAILABLE
+
+
+class LinkLost(PortError):
+    """The line to the box is not open, or was lost while something was waited for."""
+
+
+class NoAnswer(ApplianceError):
+    """The box did not answer in time."""
+
+    exit_code = EX_UNAVAILABLE
+
+
+class CommandRefused(ApplianceError):
+    """The box answered a command with an error."""
 
 
 class FormatError(ApplianceError):

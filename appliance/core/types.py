@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from appliance.core import storage
 from appliance.core.errors import FormatError
 from appliance.core.schema import typed
+from appliance.core.status import Status as Status
 
 DATA_TYPES = ("uint8", "int16", "uint16", "float32")
 """Data types of a taxel's raw count; the position in this tuple is its code in packets (PROTOCOL.md)."""
@@ -35,39 +36,6 @@ SCHEMA = 2
 """Version of a recorded sweep's sidecar. Version 1 holds nothing but the sweep and is still read."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
 """What numpy raises for a broken .npy, beside OSError; MemoryError if its header names an impossible size."""
-
-
-class Status(StrEnum):
-    """The outcome of a sweep, in sentences, lines and files. PROTOCOL.md explains each; a test compares the lists."""
-
-    OK = "ok"
-    UNSURE = "unsure"
-    UNDECIDED = "undecided"
-    UNKNOWN = "unknown"
-    SHORT = "short"
-    LONG = "long"
-    GAP = "gap"
-    NO_CONTACT = "no-contact"
-    SATURATED = "saturated"
-    STUCK_TAXEL = "stuck-taxel"
-    DEAD_TAXEL = "dead-taxel"
-    SENSOR_LOST = "sensor-lost"
-    NO_START = "no-start"
-    NO_STOP = "no-stop"
-    NOT_READY = "not-ready"
-    EDGES_LOST = "edges-lost"
-    ABORTED = "aborted"
-    RECORDED = "recorded"
-
-    @property
-    def classified(self) -> bool:
-        """True if a label was computed."""
-        return self in (Status.OK, Status.UNSURE, Status.UNDECIDED)
-
-    @property
-    def faulty(self) -> bool:
-        """True if there is a window, but its counts show that the skin did not measure a contact as it should."""
-        return self in (Status.NO_CONTACT, Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
 
 
 @dataclass(frozen=True, slots=True)

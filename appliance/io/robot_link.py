@@ -1,42 +1,34 @@
 """The serial line to the robot. In: verdicts, and bytes of the robot controller. Out: sentences, and its commands.
 
-Pure functions write and read sentences (PROTOCOL.md, part 2). Nothing here waits for the port: if the peer does not
+What sentences are stands in `core.sentences`. Nothing here waits for the port: if the peer does not
 read, sentences are dropped and counted, and no frame is lost.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import reduce
-from operator import xor
 from typing import Any, Protocol
 
 import serial
 
+from appliance.core import sentences
 from appliance.core.clock import Clock
 from appliance.core.config import SerialConfig
+from appliance.core.sentences import MAX_LINE, TALKER, UNSAFE, sentence
 from appliance.core.types import Verdict
 from appliance.io import serial_port
 
-TALKER = "PPLP"
 COMMANDS = (
-    "ID", "STATE", "TEST", "TARE", "NEW", "ABORT", "START", "STOP", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD",
+    "ID", "STATE", "TEST", "LABEL", "TARE", "NEW", "ABORT", "START", "STOP", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD",
 )  # fmt: skip
-LABEL_COMMANDS = ("MATERIAL", "POSITION", "SESSION")
+TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION")
 """The commands that have a text after a comma."""
-MAX_LINE = 128
-"""Characters of a sentence or command."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
-_UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
-_SENTENCE = re.compile(
-    rb"(?s:.*\$)?(?P<body>PPLP[, ](?P<name>[A-Za-z]{0,16})(?:[, ](?P<text>[ -#%-)+-~]*))?)(?:\*(?P<sum>[0-9A-Fa-f]{2}))?"
-)
 
 
 class Port(Protocol):
@@ -75,23 +67,7 @@ class Command:
     @property
     def line(self) -> str:
         """The command as it is written in a sentence or a capture."""
-        return f"{self.name},{self.text}" if self.name in LABEL_COMMANDS else self.name
-
-
-def checksum(body: str) -> str:
-    """Checksum of NMEA 0183: exclusive or of the characters between $ and *, as two hexadecimal digits."""
-    return f"{reduce(xor, body.encode('ascii'), 0):02X}"
-
-
-def sentence(kind: str, *fields: object) -> bytes:
-    """`$PPLP,KIND,field,…*hh` with CR and LF. Characters that NMEA reserves become spaces; a line that is too long is
-    cut, but never within a number: last fields that are whole numbers are left out until the rest fits."""
-    body = ",".join([TALKER, kind, *(_UNSAFE.sub(" ", str(f)) for f in fields)])
-    if len(body) > MAX_LINE - 6:
-        if fields and isinstance(fields[-1], int):
-            return sentence(kind, *fields[:-1])
-        body = body[: MAX_LINE - 6]
-    return f"${body}*{checksum(body)}\r\n".encode("ascii")
+        return f"{self.name},{self.text}" if self.name in TEXT_COMMANDS else self.name
 
 
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
@@ -108,41 +84,17 @@ def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
-    """The commands in `data`, which continues `rest`, and the new unfinished rest.
-
-    A checksum may be missing, and commas be spaces, so that a person can type commands; no checksum may be wrong. Each line gives one Command, however
-    it is split. A line of over MAX_LINE characters is reported once; the rest then holds one character more than these,
-    so that the end of the line is not taken for a command.
-    """
-    reported = len(rest) > MAX_LINE
-    *lines, rest = re.split(rb"[\r\n]+", rest + data)
-    commands = [_command(line) for line in lines[reported:] if line]
-    if len(rest) > MAX_LINE and (lines or not reported):
-        commands.append(_command(rest))
-    return commands, rest[: MAX_LINE + 1]
-
-
-def _command(line: bytes) -> Command:
-    if len(line) > MAX_LINE:
-        return Command("", error=f"line of over {MAX_LINE} characters without an end")
-    # the name holds letters only: it is sent back, and noise in its place could displace the fields of the answer
-    # a sentence begins at its $: noise or a break may have left bytes before it
-    match = _SENTENCE.fullmatch(line.strip())
-    if not match:  # examples are given without what a sentence cannot hold
-        return Command("", error=f"not a command; send for example {TALKER} ID")
-    name, body = match["name"].decode(), match["body"].decode()
-    text, given = (None if group is None else group.decode() for group in match.group("text", "sum"))
-    if given and given.upper() != checksum(body):
-        return Command(name, error=f"checksum {given} should be {checksum(body)}")
-    return command(name, text)
+    """The commands in `data`, which continues `rest`, and the new unfinished rest: see `sentences.parse`."""
+    found, rest = sentences.parse(data, rest)
+    return [Command(s.kind, error=s.error) if s.error else command(s.kind, s.text) for s in found], rest
 
 
 def command(name: str, text: str | None = None) -> Command:
     """The command `name` with its text, or a Command whose `error` says why there is none."""
-    if name not in COMMANDS or _UNSAFE.search(text or ""):
+    if name not in COMMANDS or UNSAFE.search(text or ""):
         return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
-    if (name in LABEL_COMMANDS) != (text is not None):
-        return Command(name, error=f"send it as {TALKER} {name}" + " TEXT" * (name in LABEL_COMMANDS))
+    if (name in TEXT_COMMANDS) != (text is not None):
+        return Command(name, error=f"send it as {TALKER} {name}" + " TEXT" * (name in TEXT_COMMANDS))
     return Command(name, text or "")
 
 

@@ -23,8 +23,8 @@ from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError, ConfigError, FormatError
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
+from appliance.core.sentences import sentence
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict, save, sidecar
-from appliance.io.robot_link import sentence
 from appliance.recording.progress import RecordingProgress
 from appliance.service.systemd import words
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -11,7 +12,7 @@ from appliance.bundle.bundle import Bundle
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import Config, TriggerConfig
 from appliance.core.devices import Devices
-from appliance.core.errors import ConfigError
+from appliance.core.errors import ConfigError, FormatError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
@@ -66,6 +67,7 @@ def _assembled(
 ) -> Box:  # fmt: skip
     """Put the components together. codes: labels that the class bits hold."""
     watching = [*observers, *([capture] if capture else [])]
+    commands = {**commands, "LABEL": partial(_label, codes)}
     trigger = _trigger(settings.trigger, answerer.format, devices, port, stack)
     if isinstance(trigger, KeyTrigger):
         watching.append(AnswerWatch(trigger))
@@ -111,6 +113,15 @@ def _trigger(config: TriggerConfig, fmt: SweepFormat, devices: Devices, port: Po
             "or do without lines: --trigger serial, key or timed"
         )
     return stack.enter_context(GpioTrigger(config, gpio(devices)))
+
+
+def _label(labels: tuple[str, ...], code: str) -> list[object]:
+    """The label with this code on the class bits, and the number of labels. Raises FormatError if there is none."""
+    if not labels:
+        raise FormatError("sweeps are recorded without a bundle, so there are no labels")
+    if not (code.isdecimal() and 1 <= int(code) <= len(labels)):
+        raise FormatError(f"label {code} is not there; use 1 to {len(labels)}")
+    return [int(code), labels[int(code) - 1], len(labels)]
 
 
 def _outputs(settings: Config, devices: Devices, stack: ExitStack) -> Lines | None:

@@ -17,9 +17,10 @@ from appliance.core.errors import ApplianceError
 from appliance.core.health import Health
 from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
+from appliance.core.sentences import sentence
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.early_exit import Decider
-from appliance.io.robot_link import Command, Port, sentence
+from appliance.io.robot_link import Command, Port
 from appliance.io.trigger import Trigger
 from appliance.io.usb_sensor import Sensor, SensorCounters
 from appliance.recording.sweep_window import SweepCutter

@@ -20,8 +20,8 @@ from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.health import Health
 from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
+from appliance.core.status import REASONS
 from appliance.core.types import Status, Verdict
-from appliance.service.systemd import REASONS
 
 SCHEMA = 1
 VERDICTS = 20

@@ -8,37 +8,17 @@ import os
 import socket
 from collections.abc import Mapping
 from logging import INFO, WARNING
-from types import MappingProxyType
 
 from appliance.core.clock import Clock
 from appliance.core.errors import ConfigError
 from appliance.core.health import Health
 from appliance.core.log import log
 from appliance.core.observer import Observer
-from appliance.core.types import Status, Verdict
+from appliance.core.status import REASONS, Status
+from appliance.core.types import Verdict
 
 FEEDS = 10
 """How often the watchdog is fed within its time, so that nearly all of it is left for one turn of the loop."""
-REASONS: Mapping[Status, str] = MappingProxyType(
-    {
-        Status.UNKNOWN: "it is like no material that was trained or enrolled",
-        Status.SHORT: "the stop edge came before a window's length had passed",
-        Status.LONG: "no stop edge came in time",
-        Status.GAP: "too many frames in a row are missing; look at the skin's cable",
-        Status.NO_CONTACT: "no taxel is loaded; see that the finger lies on the object",
-        Status.SATURATED: "too many raw counts at full scale; press less",
-        Status.STUCK_TAXEL: "a loaded taxel does not move; look at the skin",
-        Status.DEAD_TAXEL: "a taxel between loaded ones is silent; look at the skin",
-        Status.SENSOR_LOST: "the skin went away during the sweep; look at its cable",
-        Status.NO_START: "a stop edge without a start; look at the start line",
-        Status.NO_STOP: "a second start edge came; look at the stop line",
-        Status.NOT_READY: "a start edge while READY was low; the robot must wait for READY",
-        Status.EDGES_LOST: "trigger edges were lost; look at the trigger lines",
-        Status.ABORTED: "by command, or because the box was stopping",
-        Status.RECORDED: "sweeps are recorded, not classified",
-    }
-)
-"""Why a sweep has no label, and what to check; PROTOCOL.md has the details."""
 
 
 class Notifier(Observer):

@@ -12,11 +12,12 @@ from typing import IO, Any
 
 from numpy.typing import NDArray
 
+from appliance.client.answers import Answer
 from appliance.core.clock import Clock
 from appliance.core.types import normal
 from appliance.runtime.loop import Box
 from appliance.sim.rig import Act
-from appliance.tools.score import Answer, AnswerScore
+from appliance.tools.score import AnswerScore
 
 FRAME_NS = 66_000_000
 """Time between two pictures of the skin."""

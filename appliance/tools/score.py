@@ -6,34 +6,10 @@ import statistics
 from collections import Counter
 from dataclasses import dataclass, field
 
+from appliance.client.answers import Answer
 from appliance.core.statistics import wilson
-from appliance.core.types import Status
+from appliance.core.status import Status
 from appliance.sim.rig import Act
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """A RES sentence as the robot read it."""
-
-    sweep: int
-    status: str
-    label: str
-    probability: float
-    lost: int
-    latency_ms: float
-    fused: int
-    share: float
-
-    @classmethod
-    def read(cls, line: str) -> Answer | None:
-        """The answer in a line, or None for another sentence."""
-        parts = line.split("*")[0].split(",")
-        if parts[:2] != ["$PPLP", "RES"]:
-            return None
-        return cls(
-            int(parts[2]), parts[4], parts[5], float(parts[6]), int(parts[9]), float(parts[10]), int(parts[8]),
-            float(parts[13]),
-        )  # fmt: skip
 
 
 @dataclass(slots=True)

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 from appliance.bundle import bundle
+from appliance.client.answers import Answer
 from appliance.core import config
-from appliance.io.robot_link import StdoutPort, sentence
+from appliance.core.sentences import sentence
+from appliance.io.robot_link import StdoutPort
 from appliance.runtime import assembly
 from appliance.sim import devices, script, skin
 from appliance.sim.rig import VirtualClock
-from appliance.tools.score import Answer
 from tests.factories.paths import NO_SITE
 from tests.rig import soak, soak_judge, soak_page
 from tests.rig.soak_boxes import Gone, Reckoned, Script, ThisMachine, process

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from appliance.bundle import bundle
-from appliance.core import config, types
+from appliance.core import config, sentences, types
 from appliance.core.errors import BundleError, ConfigError, FormatError
 from appliance.io import robot_link
 from appliance.recording import capture
@@ -116,7 +116,7 @@ def _usable(read: bundle.Manifest) -> None:
         assert isinstance(text, str)
         assert text.isprintable(), f"{text!r} cannot be shown"
     for label in read.labels:
-        assert f",{label},".encode("ascii") in robot_link.sentence("RES", 1, label, "")
+        assert f",{label},".encode("ascii") in sentences.sentence("RES", 1, label, "")
     for entry in read.files.values():
         assert isinstance(entry, dict)
     assert isinstance(read.figures, dict)

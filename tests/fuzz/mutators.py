@@ -11,8 +11,8 @@ from collections.abc import Callable
 from random import Random
 from typing import Any
 
+from appliance.core.sentences import checksum
 from appliance.io import packets as wire
-from appliance.io import robot_link
 from tests.fuzz.skins import GRIDS
 
 Plain = Callable[[bytes], bytes]
@@ -47,7 +47,7 @@ def sentences(data: bytes, random: Random, plain: Plain) -> bytes:
     """Bytes changed, and then most checksums made right again."""
 
     def seal(match: re.Match[bytes]) -> bytes:
-        right = robot_link.checksum(match[1].decode("latin-1").encode("ascii", "replace").decode())
+        right = checksum(match[1].decode("latin-1").encode("ascii", "replace").decode())
         return match[0] if random.random() < 0.2 else b"$" + match[1] + b"*" + right.encode()
 
     return re.sub(rb"\$([^*\r\n]*)\*..", seal, plain(data))

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from appliance.bundle import bundle
-from appliance.core import config
+from appliance.core import config, sentences
 from appliance.core.types import DATA_TYPES, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat, save
 from appliance.io import packets, robot_link
 from appliance.io.skin_profile import SkinProfile
@@ -64,7 +64,7 @@ def unpack() -> list[bytes]:
 def command() -> list[bytes]:
     """Each command as a program and as a person sends it, the document's sentences, and lines that are none."""
     sealed = [
-        robot_link.sentence(name, *["plastic rough"] * (name in robot_link.LABEL_COMMANDS))
+        sentences.sentence(name, *["plastic rough"] * (name in robot_link.TEXT_COMMANDS))
         for name in robot_link.COMMANDS
     ]
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")

@@ -17,6 +17,7 @@ from operator import xor
 from pathlib import Path
 from typing import Any
 
+from appliance.core import sentences
 from appliance.core.errors import FormatError, SensorMismatch
 from appliance.core.types import SweepFormat
 from appliance.io import packets as wire
@@ -174,7 +175,7 @@ def _is_command(line: bytes, name: str) -> bool:
         body.startswith(b"PPLP,")
         and head == name
         and name in robot_link.COMMANDS
-        and bool(comma) == (name in robot_link.LABEL_COMMANDS)
+        and bool(comma) == (name in robot_link.TEXT_COMMANDS)
     )
     # what a sentence may not hold (PROTOCOL.md); a command has one field
     known = known and "," not in text and not re.search(rb"[^ -~]|[!\\~^]", body)
@@ -184,7 +185,7 @@ def _is_command(line: bytes, name: str) -> bool:
 
 def _answer(parsed: robot_link.Command) -> None:
     """The sentence that answers a command has all its fields, whatever stood in the line."""
-    line = robot_link.sentence("ANS", parsed.name, "error" if parsed.error else "ok", parsed.error)
+    line = sentences.sentence("ANS", parsed.name, "error" if parsed.error else "ok", parsed.error)
     assert len(line) <= LINE
     body, given = line.removeprefix(b"$").removesuffix(b"\r\n").split(b"*")
     assert body.decode("ascii").isprintable()

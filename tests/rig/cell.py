@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from appliance.client.answers import Answer
 from appliance.core.clock import SystemClock
 from appliance.sim import rig, script, skin
-from appliance.tools.score import Answer
 from tests.rig.machine import Guest
 
 FIFO = 22_500

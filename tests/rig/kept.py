@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from appliance.core.sentences import checksum
 from appliance.core.types import Status, Sweep, load
-from appliance.io.robot_link import checksum
 from tests.factories.emulated_machines import ROOT
 from tests.rig.machine import Guest
 

@@ -20,11 +20,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from appliance.client.answers import Answer
 from appliance.core import storage
 from appliance.core.provenance import commit
-from appliance.io.robot_link import checksum
+from appliance.core.sentences import checksum
 from appliance.sim import skin
-from appliance.tools.score import Answer
 from tests.factories.paths import ROOT
 from tests.rig import soak_judge, soak_page
 from tests.rig.soak_boxes import BoxUnderTest, Gone, Script, ThisMachine

@@ -26,12 +26,12 @@ import numpy as np
 import onnxruntime as ort
 
 from appliance.bundle import bundle
+from appliance.client.answers import Answer
 from appliance.core.clock import SystemClock
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
 from appliance.sim import rig, script, skin
 from appliance.tools import pseudo_terminal
-from appliance.tools.score import Answer
 from tests.rig.soak_judge import short_answer
 
 STOP_S = 30

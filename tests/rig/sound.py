@@ -12,11 +12,11 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from appliance.bundle import bundle
+from appliance.client.answers import Answer
 from appliance.core.clock import SystemClock
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
 from appliance.sim import rig, skin
-from appliance.tools.score import Answer
 from tests.rig.cell import BEGUN_S, Cell, Touch
 
 FIELDS = (

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from appliance.bundle import bundle
-from appliance.io.robot_link import MAX_LINE, checksum
+from appliance.client.answers import Answer
+from appliance.core.sentences import MAX_LINE, checksum
 from appliance.sim import script
-from appliance.tools.score import Answer
 from tests.rig.cell import Cell, Touch
 from tests.rig.far_end import ADAPTER, FarEnd
 from tests.rig.sound import known, not_wrong

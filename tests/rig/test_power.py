@@ -18,8 +18,8 @@ from pathlib import Path
 
 import pytest
 
+from appliance.core.sentences import sentence
 from appliance.core.types import Frames, Status, Sweep
-from appliance.io.robot_link import sentence
 from appliance.sim import script, skin
 from tests.rig.cell import Cell, Touch
 from tests.rig.image import Image

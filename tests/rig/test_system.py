@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from appliance.client.answers import Answer
 from appliance.recording.capture import Playback
 from appliance.sim import script
-from appliance.tools.score import Answer
 from tests.rig.cell import Cell
 from tests.rig.image import GUEST_PYTHON
 from tests.rig.kept import KEPT, runs_with

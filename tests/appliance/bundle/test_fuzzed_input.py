@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from appliance.bundle import bundle, manifest
-from appliance.core import config, schema, types
+from appliance.core import config, schema, sentences, types
 from appliance.core.errors import ApplianceError
 from appliance.io import packets, robot_link, skin_codecs, skin_profile, usb_sensor
 from appliance.io.skin_codecs import fixed, papillarray, robotiq, text, xela
@@ -196,7 +196,7 @@ def unguarded(kind: Any, table: Any) -> Any:
 def hasty(data: bytes, rest: bytes = b"") -> tuple[list[robot_link.Command], bytes]:
     """Drops a line as soon as it is too long, as was done once."""
     found, rest = PARSE(rest + data)
-    return found, b"" if len(rest) > robot_link.MAX_LINE else rest
+    return found, b"" if len(rest) > sentences.MAX_LINE else rest
 
 
 COLLECTED = text.collected

@@ -16,7 +16,7 @@ import pytest
 from appliance import __version__
 from appliance.cli import bundle_commands, parser
 from appliance.cli.main import RUNS
-from appliance.core import config, errors
+from appliance.core import config, errors, sentences
 from appliance.core.schema import Key
 from appliance.core.types import Status, Verdict
 from appliance.deployment import state
@@ -74,7 +74,7 @@ def test_sentences_are_as_the_box_forms_and_reads_them():
     found = re.findall(r"\$PPLP,([A-Z]+)([^*`\n]*)\*([0-9A-F]{2})", MANUAL)
     kinds = set()
     for kind, rest, given in found:
-        assert given == robot_link.checksum(f"PPLP,{kind}{rest}"), f"{kind}{rest}"
+        assert given == sentences.checksum(f"PPLP,{kind}{rest}"), f"{kind}{rest}"
         kinds.add(kind)
         if kind in robot_link.COMMANDS:
             ((command,), _) = robot_link.parse(f"$PPLP,{kind}{rest}*{given}\r\n".encode())

@@ -14,6 +14,7 @@ import pytest
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle, Early, Manifest, Thresholds
 from appliance.cli.main import main
+from appliance.client.answers import Answer
 from appliance.core.config import SweepConfig
 from appliance.core.errors import BundleError
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load, save
@@ -25,7 +26,6 @@ from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Box, Pipeline
 from appliance.sim import devices, gpio, rig, script
 from appliance.tools import demo
-from appliance.tools.score import Answer
 from tests.factories.simulated_box import SECOND, SETTLE_S, OnSweep, Rigged
 
 onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")

@@ -19,10 +19,11 @@ import numpy as np
 import pytest
 
 from appliance.core.errors import LineError
+from appliance.core.sentences import checksum, sentence
 from appliance.core.types import EPOCH_BITS, EdgeKind, Frames
 from appliance.io.gpio_lines import Lines
 from appliance.io.link import REPLY_MS
-from appliance.io.robot_link import Command, SerialSink, checksum, sentence
+from appliance.io.robot_link import Command, SerialSink
 from appliance.io.trigger import GpioTrigger
 from appliance.io.usb_sensor import UsbSensor
 from tests import backends

@@ -17,20 +17,11 @@ from hypothesis import strategies as st
 
 from appliance.core.config import OutputConfig, SerialConfig
 from appliance.core.errors import ConfigError
+from appliance.core.sentences import MAX_LINE, checksum, sentence
 from appliance.core.types import Status, Verdict
 from appliance.io import serial_port
 from appliance.io.gpio_lines import Lines
-from appliance.io.robot_link import (
-    COMMANDS,
-    MAX_LINE,
-    Command,
-    SerialSink,
-    StdoutPort,
-    checksum,
-    parse,
-    result,
-    sentence,
-)
+from appliance.io.robot_link import COMMANDS, Command, SerialSink, StdoutPort, parse, result
 from appliance.io.verdict_lines import LineSink
 from appliance.sim import gpio, rig
 from appliance.tools import pseudo_terminal

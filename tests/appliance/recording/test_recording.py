@@ -98,6 +98,7 @@ def test_a_label_applies_to_sweeps_that_start_after_it(recorded: Callable[..., R
     simulated = devices.build(skin.FORMAT, [first, *others], rig.VirtualClock(), "sim")
     box = recorded(simulated, Labels(session="first day"))
     box.seconds(0.1)
+    assert ",LABEL,error,sweeps are recorded without a bundle" in box.ask("$PPLP,LABEL,1")
     assert ",MATERIAL,ok,wood,,first day*" in box.ask("$PPLP,MATERIAL,wood")
     box.until(lambda: box.box.health.sweeping)
     assert ",POSITION,ok,wood,1,first day*" in box.ask("$PPLP,POSITION,1")

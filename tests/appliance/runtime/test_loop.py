@@ -13,6 +13,7 @@ import pynmea2
 import pytest
 
 from appliance.bundle import bundle
+from appliance.client.answers import Answer
 from appliance.core import config
 from appliance.core.health import Health
 from appliance.core.observer import Observer
@@ -20,7 +21,6 @@ from appliance.core.types import Status, Sweep, Verdict
 from appliance.io.robot_link import StdoutPort
 from appliance.runtime import assembly
 from appliance.sim import devices, rig, script, skin
-from appliance.tools.score import Answer
 from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
 
 RATE = round(skin.FORMAT.rate_hz)
@@ -253,6 +253,11 @@ def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):
     assert ",TARE,ok,largest 0.0 digits" in box.ask("$PPLP,TARE")
     assert ",NEW,ok" in box.ask("$PPLP,NEW")
     assert ",ABORT,error,no sweep is open" in box.ask("$PPLP,ABORT")
+    labels = default_bundle.manifest.labels
+    for code, label in enumerate(labels, 1):
+        assert f",LABEL,ok,{code},{label},{len(labels)}*" in box.ask(f"$PPLP,LABEL,{code}")
+    for code in (0, len(labels) + 1, "wood"):
+        assert f",LABEL,error,label {code} is not there; use 1 to {len(labels)}*" in box.ask(f"$PPLP,LABEL,{code}")
     assert "known are" in box.ask("$PPLP,DANCE")
 
 

@@ -11,9 +11,10 @@ import pytest
 
 from appliance.bundle.bundle import Bundle
 from appliance.core.observer import Observer
+from appliance.core.sentences import MAX_LINE
 from appliance.core.types import Frames, Status, Verdict
 from appliance.io import skins
-from appliance.io.robot_link import MAX_LINE, result
+from appliance.io.robot_link import result
 from appliance.io.skin_profile import from_json
 from appliance.recording.capture import CaptureWriter, Playback
 from appliance.service import status

@@ -16,11 +16,12 @@ import pytest
 
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.health import Health
+from appliance.core.sentences import MAX_LINE, sentence
+from appliance.core.status import REASONS
 from appliance.core.types import Status, Verdict
-from appliance.io.robot_link import MAX_LINE, sentence
 from appliance.service import status
 from appliance.service.status import StatusFile
-from appliance.service.systemd import REASONS, VerdictLog
+from appliance.service.systemd import VerdictLog
 from appliance.sim import devices, rig
 from tests.factories.simulated_box import SECOND, Rigged, idle_devices
 

@@ -11,8 +11,9 @@ import pytest
 
 from appliance.bundle.bundle import Bundle, Manifest
 from appliance.core.errors import BundleError
+from appliance.core.sentences import MAX_LINE
 from appliance.core.types import Status, Verdict
-from appliance.io.robot_link import MAX_LINE, result
+from appliance.io.robot_link import result
 from appliance.signal.contact import ContactPositions, advice, centre, fill_dead_taxels, moved
 from appliance.sim import skin
 from tests.factories.contacts import MIDDLE, TARE, counts, patch

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from appliance.client.answers import Answer
 from appliance.core.types import Status, Verdict
 from appliance.io.robot_link import result
 from appliance.sim.rig import Act
-from appliance.tools.score import Answer, AnswerScore
+from appliance.tools.score import AnswerScore
 
 
 def answer(number: int, label: str, status: Status = Status.OK, share: float = 1.0) -> Answer:

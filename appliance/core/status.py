@@ -1,0 +1,62 @@
+"""The outcomes of a sweep: one Status each, with the reason why there is no label."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from types import MappingProxyType
+
+
+class Status(StrEnum):
+    """The outcome of a sweep, in sentences, lines and files. PROTOCOL.md explains each; a test compares the lists."""
+
+    OK = "ok"
+    UNSURE = "unsure"
+    UNDECIDED = "undecided"
+    UNKNOWN = "unknown"
+    SHORT = "short"
+    LONG = "long"
+    GAP = "gap"
+    NO_CONTACT = "no-contact"
+    SATURATED = "saturated"
+    STUCK_TAXEL = "stuck-taxel"
+    DEAD_TAXEL = "dead-taxel"
+    SENSOR_LOST = "sensor-lost"
+    NO_START = "no-start"
+    NO_STOP = "no-stop"
+    NOT_READY = "not-ready"
+    EDGES_LOST = "edges-lost"
+    ABORTED = "aborted"
+    RECORDED = "recorded"
+
+    @property
+    def classified(self) -> bool:
+        """True if a label was computed."""
+        return self in (Status.OK, Status.UNSURE, Status.UNDECIDED)
+
+    @property
+    def faulty(self) -> bool:
+        """True if there is a window, but its counts show that the skin did not measure a contact as it should."""
+        return self in (Status.NO_CONTACT, Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
+
+
+REASONS: Mapping[Status, str] = MappingProxyType(
+    {
+        Status.UNKNOWN: "it is like no material that was trained or enrolled",
+        Status.SHORT: "the stop edge came before a window's length had passed",
+        Status.LONG: "no stop edge came in time",
+        Status.GAP: "too many frames in a row are missing; look at the skin's cable",
+        Status.NO_CONTACT: "no taxel is loaded; see that the finger lies on the object",
+        Status.SATURATED: "too many raw counts at full scale; press less",
+        Status.STUCK_TAXEL: "a loaded taxel does not move; look at the skin",
+        Status.DEAD_TAXEL: "a taxel between loaded ones is silent; look at the skin",
+        Status.SENSOR_LOST: "the skin went away during the sweep; look at its cable",
+        Status.NO_START: "a stop edge without a start; look at the start line",
+        Status.NO_STOP: "a second start edge came; look at the stop line",
+        Status.NOT_READY: "a start edge while READY was low; the robot must wait for READY",
+        Status.EDGES_LOST: "trigger edges were lost; look at the trigger lines",
+        Status.ABORTED: "by command, or because the box was stopping",
+        Status.RECORDED: "sweeps are recorded, not classified",
+    }
+)
+"""Why a sweep has no label, and what to check; PROTOCOL.md has the details."""
