@@ -251,8 +251,8 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
     ("command", "one command a line is lost", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0][1:], got[1]))),
     ("command", "the end of a long line is a command", robot_link, "parse", hasty),
     ("command", "the rest grows", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0], got[1] * 200))),
-    ("command", "any checksum is right", robot_link, "checksum", lambda body: "00"),
-    ("command", "an answer has no limit", robot_link, "MAX_LINE", 200),
+    ("command", "any checksum is right", sentences, "checksum", lambda body: "00"),
+    ("command", "an answer has no limit", sentences, "MAX_LINE", 200),
     ("command", "a command is obeyed twice", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0] * 2, got[1]))),
     ("feed", "a request is lost", feed, "requests", changed(feed, "requests", lambda got: (got[0][1:], got[1]))),
     ("feed", "the rest is dropped", feed, "requests", changed(feed, "requests", lambda got: (got[0], b""))),
@@ -300,7 +300,7 @@ def test_each_promise_can_be_seen_broken(
 
 @pytest.mark.parametrize(
     ("target", "module", "name"),
-    [("unpack", packets, "unpack_identity"), ("command", robot_link, "_command"), ("feed", feed, "_request"), ("settings", config, "_checked"),
+    [("unpack", packets, "unpack_identity"), ("command", sentences, "read"), ("feed", feed, "_request"), ("settings", config, "_checked"),
      ("manifest", manifest, "typed"), ("recording", types, "typed"), ("capture", capture, "typed")],
 )  # fmt: skip
 def test_another_error_is_not_kept_back(
