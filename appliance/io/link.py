@@ -14,6 +14,8 @@ from appliance.io import packets
 
 REPLY_MS = 500
 """Longest wait for the reply to a request."""
+TTY_BYTES = 4095
+"""What a serial port gives at once while more is waiting."""
 _MOST_BYTES = 4 * packets.MAX_PAYLOAD
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from appliance.core.clock import DeviceClock
 from appliance.core.errors import SensorMismatch
 from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
 from appliance.io import packets, skin_codecs
+from appliance.io.link import TTY_BYTES
 from appliance.io.skin_codecs import Codec, Decoded, Rest
 from appliance.io.skin_profile import SkinProfile
 from appliance.io.usb_sensor import FrameStream, SensorCounters, Stream
@@ -29,8 +31,6 @@ _FIT = {"settle_s": 0.5, "span_s": 2.5, "step_s": 0.1, "max_ppm": 1.2e6 * RATE_W
 """Of the fit of arrivals (DeviceClock). A short past: a loop that becomes slower by 2 % is 20 ms late before it is followed."""
 SUSPECT_NS, SUSPECT_FRAMES = 60_000_000, 3
 """Frames that come later than this are held back until it is known whether others are missing before them."""
-PILED_BYTES = 4095
-"""What a serial port gives at once while more is waiting."""
 _STEP_NS, _STEP_FRAMES = 250_000_000, 8
 """Arrivals are judged by steps of this length."""
 _STEPS = 8
@@ -60,12 +60,11 @@ def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacke
     if found.wrong:
         raise SensorMismatch(_of_another(found.wrong))
     made = []
-    if len(found):
-        cuts = np.flatnonzero(np.diff(found.counts) != 1) + 1
-        for part in np.split(np.arange(len(found)), cuts):
-            for at in range(part[0], part[-1] + 1, packets.MAX_FRAMES):
-                taxels = found.taxels[at : min(at + packets.MAX_FRAMES, part[-1] + 1)]
-                made.append(packets.Packet(int(found.counts[at]), int(found.times_us[at]), 0, taxels))
+    gaps = np.flatnonzero(found.counts[1:] - found.counts[:-1] != 1) + 1
+    for begin, end in pairwise([0, *gaps.tolist(), len(found)]):
+        for at in range(begin, end, packets.MAX_FRAMES):
+            taxels = found.taxels[at : min(at + packets.MAX_FRAMES, end)]
+            made.append(packets.Packet(int(found.counts[at]), int(found.times_us[at]), 0, taxels))
     return packets.Unpacked(made, [], found.garbage, found.rest.data)
 
 
@@ -122,7 +121,7 @@ class CountedStream:
         if not len(numbers):
             return Frames.empty(self._format)
         arrived_ns = self._arrival(begin + int(found.ends[-1]))
-        return self._timed(numbers, found.taxels, arrived_ns, piled=len(data) >= PILED_BYTES)
+        return self._timed(numbers, found.taxels, arrived_ns, piled=len(data) >= TTY_BYTES)
 
     def _begin(self) -> None:
         """Begin a new epoch with the next bytes."""

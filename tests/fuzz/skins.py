@@ -109,9 +109,12 @@ def _text(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 
 def _papillarray(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """Any beginning whose sum fits; the pillars are where the tables of offsets say."""
-    for start in (m.start() + 4 for m in re.finditer(re.escape(bytes.fromhex("55667788")), before)):
+    """Any beginning whose sum fits, and no other packet in between; the pillars are where the tables of offsets say."""
+    head, tail = bytes.fromhex("55667788"), bytes.fromhex("aabbccdd")
+    for start in (m.start() + 4 for m in re.finditer(re.escape(head), before)):
         body = before[start:-6]
+        if tail + head in body:
+            continue
         if sum(body) & 0xFFFF != int.from_bytes(before[-6:-4], "little") or not body:
             continue
         try:

@@ -1,44 +1,101 @@
 """What a skin costs the box at its full rate, in real time. In: the name of a profile, its bundle, seconds. Out: figures.
 
-The emulator plays in the same process, and its processor time is subtracted; the box classifies a sweep every 3.5 s.
+The emulator plays in a process of its own, and each frame carries its number in one taxel, so that a lost one is seen
+whatever the skin. The box classifies a sweep every EVERY_S. Both run under real-time scheduling where that is allowed:
+what is measured is the box, and not what else the machine does.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import cycle
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from appliance.bundle import bundle
 from appliance.core import config
 from appliance.core.clock import Clock, SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
 from appliance.core.observer import Observer
-from appliance.core.types import Sweep, Verdict
-from appliance.io import skins
+from appliance.core.types import Frames, Sweep, SweepFormat, Verdict
+from appliance.io import skin_profile
 from appliance.io.robot_link import SerialSink
+from appliance.io.skin_profile import SkinProfile
 from appliance.runtime import assembly
+from appliance.runtime.loop import Box
 from appliance.sim import script
-from appliance.sim.skins import devices, sweeps
+from appliance.sim.skins import sweeps
+from appliance.sim.skins.devices import on_wire
+from appliance.sim.skins.player import Player
+from appliance.sim.skins.wires import wire
 from appliance.tools import pseudo_terminal
 from appliance.tools.bench_process import drain
+from tests.skins.subjects import PROFILES
 
 SETTLE_S = 3.0
 """Time before figures are taken: the skin is found, its rate measured."""
+EVERY_S, LEAD_S = 3.5, 0.5
+"""Time between two sweeps, and by how much each is longer than the window at its ends together."""
+NUMBERS = 100
+"""Frames are numbered in one taxel by so many numbers."""
+EMULATOR, BOX = 20, 10
+"""Real-time priorities; a skin does not wait for the box."""
+DRAIN = 50
+"""Turns between two looks at the far end of the serial line, which is no part of the box."""
+START_S = 20
+"""Longest wait for the emulator."""
 
 
-class AnswerTimes(Observer):
-    """answer_ms: from each stop edge to the sentence at the port. statuses: of all answers."""
+class Sliding:
+    """A finger that slides without end: the middle of a simulated sweep, again and again, with numbers in one taxel."""
+
+    def __init__(self, name: str, profile: SkinProfile, fmt: SweepFormat) -> None:
+        self._profile = profile
+        act = next(iter(script.tubes(7, 1, seen=sweeps.view(name, fmt))))
+        margin = round(fmt.rate_hz * LEAD_S / 2)
+        self._frames = act.frames[act.start + margin : act.stop - margin].copy()
+
+    def frame(self, i: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
+        """See FrameSource."""
+        taxels = self._frames[i % len(self._frames)]
+        taxels.flat[0] = i % NUMBERS
+        return on_wire(taxels, self._profile)
+
+
+class FrameCheck(Observer):
+    """Notes what comes. answer_ms: from each stop edge to the sentence at the port. statuses: of all answers."""
 
     def __init__(self, clock: Clock) -> None:
+        self.clear()
+        self._clock = clock
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._numbers: list[NDArray[Any]] = []
         self.answer_ms: list[float] = []
         self.statuses: list[str] = []
-        self._clock = clock
+
+    def frames(self, frames: Frames) -> None:
+        """Frames of one turn."""
+        self._numbers.append(frames.taxels.reshape(len(frames), -1)[:, 0].copy())
+
+    def counted(self) -> tuple[int, int]:
+        """How many frames came, and how many numbers are missing between them."""
+        numbers = np.concatenate(self._numbers).astype(np.int64)
+        return len(numbers), int(((np.diff(numbers) - 1) % NUMBERS).sum())
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """The sentence is out before observers of sweeps are told."""
@@ -46,50 +103,88 @@ class AnswerTimes(Observer):
         self.statuses.append(str(verdict.status))
 
 
-class _Meter:
-    """Processor time of this thread inside a function."""
-
-    def __init__(self) -> None:
-        self.ns = 0
-
-    def timed(self, call: Callable[[], None]) -> Callable[[], None]:
-        def measured() -> None:
-            begin = time.thread_time_ns()
-            call()
-            self.ns += time.thread_time_ns() - begin
-
-        return measured
+def hurry(priority: int) -> bool:
+    """Schedule this process before all usual ones; False where that is not allowed."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        return False
+    return True
 
 
 def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
-    """Let a box with the bundle in `folder` run so long on the skin `name`."""
-    settings = config.load(None, [f"sensor.skin={name}"], site=Path("/dev/null"))
-    current, profile = bundle.load(folder), skins.profile(settings)
-    acts = list(script.tubes(7, 60, seen=sweeps.view(name, profile.format)))
-    played = devices.build(name, profile, current.format, cycle(acts), SystemClock(), "sim", remember=False)
-    meter, times = _Meter(), AnswerTimes(played.clock)
-    played.player.step = meter.timed(played.player.step)  # type: ignore[method-assign]
+    """Let a box with the bundle in `folder` run so long on the skin `name`. Ends the program where the skin was lost."""
+    current, clock = bundle.load(folder), SystemClock()
+    check = FrameCheck(clock)
     with ExitStack() as stack:
+        link = Path(stack.enter_context(TemporaryDirectory())) / "ttySkin"
+        player = stack.enter_context(_playing(name, current.format.rate_hz, link))
+        real_time = hurry(BOX)
+        settings = _settings(name, current.format, link)
         far_end, port = stack.enter_context(pseudo_terminal.pair())
-        sink = SerialSink(replace(settings.serial, port=port), played.clock, played.source)
-        box = assembly.box(settings, current, played, sink, stack, observers=[times])
-
-        def turns(until_ns: int) -> None:
-            while time.monotonic_ns() < until_ns:
-                box.step()
-                drain(far_end)
-
-        turns(time.monotonic_ns() + round(SETTLE_S * 1e9))
-        meter.ns, begin, cpu = 0, time.monotonic_ns(), -time.process_time_ns()
-        before = box.counters.frames, played.player.frames
-        turns(begin + round(seconds * 1e9))
-        wall, cpu = time.monotonic_ns() - begin, cpu + time.process_time_ns() - meter.ns
-        counters = box.counters
-    sent, came = played.player.frames - before[1], counters.frames - before[0]
+        sink = SerialSink(replace(settings.serial, port=port), clock, "emulator")
+        box = assembly.box(settings, current, Devices(clock), sink, stack, observers=[check])
+        _turns(box, far_end, SETTLE_S)
+        check.clear()
+        lost, begin, cpu = box.counters.lost_frames, time.monotonic_ns(), time.process_time_ns()
+        _turns(box, far_end, seconds)
+        wall, cpu = time.monotonic_ns() - begin, time.process_time_ns() - cpu
+        if box.health.skin != "streaming" or box.counters.enumerations != 1:
+            raise SystemExit(f"{name}: the skin was lost: {box.health}")
+        player.send_signal(signal.SIGTERM)
+        thrown = json.loads(player.communicate()[0])["thrown"]
+    came, missing = check.counted()
     return {
         "skin": name, "format": str(current.format), "seconds": round(wall / 1e9, 1), "share": round(cpu / wall, 4),
-        "sent": sent, "came": came, "counted_lost": counters.lost_frames, "garbage": counters.garbage_bytes,
-        "thrown": played.player.thrown, "answers": len(times.answer_ms),
-        "statuses": {status: times.statuses.count(status) for status in sorted(set(times.statuses))},
-        "answer_ms": {f"p{q}": round(float(np.percentile(times.answer_ms, q)), 2) for q in (50, 99)},
+        "real_time": real_time, "came": came, "missing": missing, "counted_lost": box.counters.lost_frames - lost,
+        "garbage": box.counters.garbage_bytes, "thrown": thrown, "answers": len(check.answer_ms),
+        "statuses": {status: check.statuses.count(status) for status in sorted(set(check.statuses))},
+        "answer_ms": {f"p{q}": round(float(np.percentile(check.answer_ms, q)), 2) for q in (50, 99)},
     }  # fmt: skip
+
+
+def _settings(name: str, fmt: SweepFormat, link: Path) -> Config:
+    """A box with this skin and no lines."""
+    chosen = {
+        "sensor.skin": name, "sensor.port": link, "sensor.rate_hz": fmt.rate_hz, "trigger.mode": "timed",
+        "trigger.sweep_s": fmt.window / fmt.rate_hz + LEAD_S, "trigger.every_s": EVERY_S,
+    }  # fmt: skip
+    return config.load(None, [f"{key}={value}" for key, value in chosen.items()], site=Path("/dev/null"))
+
+
+def _turns(box: Box, far_end: int, seconds: float) -> None:
+    until_ns = time.monotonic_ns() + round(seconds * 1e9)
+    while time.monotonic_ns() < until_ns:
+        for _ in range(DRAIN):
+            box.step()
+        drain(far_end)
+
+
+def _playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
+    """The emulator in a process of its own, once its terminal is there."""
+    command = [sys.executable, "-m", "tests.skins.load", name, str(rate_hz), str(link)]
+    player = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    until = time.monotonic() + START_S
+    while not link.exists():
+        if player.poll() is not None or time.monotonic() > until:
+            player.kill()
+            raise SystemExit(f"the emulator of {name} did not start: exit code {player.wait()}")
+        time.sleep(0.01)
+    return player
+
+
+def play(name: str, rate_hz: float, link: Path) -> None:
+    """Play a skin at `link` until SIGTERM; prints how many bytes nobody took."""
+    stop = Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    profile = replace(skin_profile.load(name, [PROFILES]), rate_hz=rate_hz)
+    source = Sliding(name, profile, profile.format)
+    hurry(EMULATOR)
+    player = Player(wire(name, rate_hz), source, SystemClock(), link)
+    player.run(stop.is_set)
+    player.close()
+    print(json.dumps({"thrown": player.thrown}))
+
+
+if __name__ == "__main__":
+    play(sys.argv[1], float(sys.argv[2]), Path(sys.argv[3]))

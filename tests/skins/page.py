@@ -62,14 +62,13 @@ def _rate(wrong: int, faults: int) -> str:
 
 
 def _load(found: dict[str, Json]) -> Iterator[str]:
-    yield "| skin | frames | share of a core | edge to sentence | time | frames sent | lost |"
+    yield "| skin | frames | share of a core | edge to sentence | time | frames that came | lost |"
     yield "|---|---|---|---|---|---|---|"
     for name, row in found.items():
         times = f"{row['answer_ms']['p50']:.1f} ms, 99 % within {row['answer_ms']['p99']:.1f} ms (n = {row['answers']})"
-        lost = max(0, row["sent"] - row["came"])  # a read may end with frames that were sent before the first one
         yield (
-            f"| {name} | {row['format']} | {_percent(row['share'])} | {times} | {row['seconds']:.0f} s | {row['sent']:,} "
-            f"| {lost} |"
+            f"| {name} | {row['format']} | {_percent(row['share'])} | {times} | {row['seconds']:.0f} s | {row['came']:,} "
+            f"| {row['missing']} |"
         )
 
 

@@ -18,10 +18,12 @@ NONE = np.empty(0, np.int64)
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """What a codec left over. synced: it begins with a frame, as the bytes before it have shown."""
+    """What a codec left over. synced: it begins with a frame, as the bytes before it have shown. form: of the frames
+    before it, where a codec remembers that."""
 
     data: bytes = b""
     synced: bool = False
+    form: Any = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,120 +3,170 @@
 from __future__ import annotations
 
 import struct
-from itertools import pairwise
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.types import shown
-from appliance.io.skin_codecs.frames import MOST_PACKET, Decoded, Rest, collected
+from appliance.io.skin_codecs.frames import MOST_PACKET, Decoded, Rest, arranged
 from appliance.io.skin_profile import SkinProfile
 
-_PTS_HEAD, _PTS_TAIL = bytes.fromhex("55667788"), bytes.fromhex("aabbccdd")
-_PILLAR = np.dtype([("type", "<u2"), ("values", "<f4", 6)])
-_CLOCK = struct.Struct("<IQ")
+_HEAD, _TAIL = bytes.fromhex("55667788"), bytes.fromhex("aabbccdd")
 _U16 = struct.Struct("<H")
+_CLOCK = np.dtype([("count", "<u4"), ("us", "<u8")])
+_PILLAR, _TYPE = 26, 2
+"""Bytes of a pillar: a uint16 that is _TYPE, and six float32."""
+_LOW_32 = np.uint64(0xFFFFFFFF)
+
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class PtsForm:
+    """Where things are in the content of a packet. size: its bytes. clock: offset of counter and time. numbers: offsets of
+    the bytes of all numbers of all pillars. fixed: offsets of the bytes that say so. seen: what stands there."""
+
+    size: int
+    clock: int
+    numbers: NDArray[np.int64]
+    fixed: NDArray[np.int64]
+    seen: NDArray[np.uint8]
+
+    def run(self, contents: NDArray[np.uint8]) -> int:
+        """How many of `contents` [n, bytes], from the first on, are of this form."""
+        if contents.shape[1] != self.size:
+            return 0
+        same = (contents[:, self.fixed] == self.seen).all(axis=1)
+        return len(same) if same.all() else int(same.argmin())
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """Packets between head and tail with a sum of their bytes; a tail may occur inside, where the sum does not fit."""
     data = rest.data + new
-    numbers: list[NDArray[Any]] = []
-    ends: list[int] = []
-    skipped: list[int] = []
-    clocks: list[tuple[int, int]] = []
-    at = garbage = before = size = 0
+    spans, kept = _packets(data)
+    size = 4 * profile.rows * profile.cols * profile.values
+    numbers, clocks = [np.empty((0, size), np.uint8)], [np.empty((0, _CLOCK.itemsize), np.uint8)]
+    taken: list[Span] = []
     wrong = ""
-    while (start := data.find(_PTS_HEAD, at)) >= 0:
-        garbage, before = garbage + start - at, before + start - at
-        end = _pts_end(data, start + 4)
-        if end == 0:
-            return _pts_decoded(profile, numbers, ends, skipped, clocks, garbage, Rest(data[start:]), size, wrong)
-        found = _pts_content(data[start + 4 : end - 6]) if end > 0 else None
-        if found and found[0].size == profile.rows * profile.cols * profile.values:
-            numbers.append(found[0])
-            clocks.append(found[1])
-            ends.append(end)
-            skipped.append(before)
-            at, before, size = end, 0, end - start
-            continue
-        if found:
-            wrong = f"it sends {found[0].size // 6} pillars, its profile says {shown((profile.rows, profile.cols))}"
-        step = end - start if end > 0 else 1
-        at, garbage, before = start + step, garbage + step, before + step
-    kept = max(at, len(data) - len(_PTS_HEAD) + 1)
-    garbage += kept - at
-    return _pts_decoded(profile, numbers, ends, skipped, clocks, garbage, Rest(data[kept:]), size, wrong)
-
-
-def _pts_decoded(
-    profile: SkinProfile, numbers: list[NDArray[Any]], ends: list[int], skipped: list[int],
-    clocks: list[tuple[int, int]], garbage: int, rest: Rest, size: int, wrong: str,
-) -> Decoded:  # fmt: skip
-    counts, times_us = np.array(clocks, np.uint64).reshape(-1, 2).T & np.uint64(0xFFFFFFFF)
-    return collected(
-        profile, numbers, ends, skipped, garbage, rest, size,
-        counts=counts.astype(np.int64), times_us=times_us.astype(np.int64), wrong=wrong,
+    form: PtsForm | None = rest.form
+    for one, contents, where in _alike(data, spans, form):
+        form = one
+        if len(form.numbers) == size:
+            numbers.append(contents[:, form.numbers])
+            clocks.append(contents[:, form.clock : form.clock + _CLOCK.itemsize])
+            taken += where
+        else:
+            wrong = f"it sends {len(form.numbers) // (_PILLAR - 2)} pillars, its profile says {shown((profile.rows, profile.cols))}"
+    starts, ends = np.array(taken, np.int64).reshape(-1, 2).T
+    clock = np.concatenate(clocks).view(_CLOCK)[:, 0]
+    return Decoded(
+        arranged(profile, np.concatenate(numbers).view("<f4")), ends, starts - np.append(0, ends)[:-1],
+        taken[-1][1] - taken[-1][0] if taken else 0, kept - int((ends - starts).sum()), Rest(data[kept:], form=form),
+        clock["count"].astype(np.int64), (clock["us"] & _LOW_32).astype(np.int64), wrong,
     )  # fmt: skip
 
 
-def _pts_end(data: bytes, begin: int) -> int:
+def _packets(data: bytes) -> tuple[list[Span], int]:
+    """Where packets begin and end, and the beginning of what is left over."""
+    spans: list[Span] = []
+    at = 0
+    while (start := data.find(_HEAD, at)) >= 0:
+        end = _end(data, start + len(_HEAD))
+        if end == 0:
+            return spans, start
+        if end > 0:
+            spans.append((start, end))
+        at = end if end > 0 else start + 1
+    return spans, max(at, len(data) - len(_HEAD) + 1)
+
+
+def _end(data: bytes, begin: int) -> int:
     """Where the packet ends whose content begins at `begin`; 0 if more bytes are needed, -1 if there is no packet."""
     tail = begin
-    while (tail := data.find(_PTS_TAIL, tail)) >= 0 and tail - begin <= MOST_PACKET:
+    while (tail := data.find(_TAIL, tail)) >= 0 and tail - begin <= MOST_PACKET:
         if tail - 2 > begin and sum(data[begin : tail - 2]) & 0xFFFF == _U16.unpack_from(data, tail - 2)[0]:
-            return tail + len(_PTS_TAIL)
+            return tail + len(_TAIL)
+        # here it ended, damaged: among the bytes up to some later tail, one sum in 65,536 would fit by chance
+        if data.startswith(_HEAD, tail + len(_TAIL)):
+            return -1
         tail += 1
     return 0 if tail < 0 and len(data) - begin <= MOST_PACKET else -1
 
 
-def _pts_content(body: bytes) -> tuple[NDArray[Any], tuple[int, int]] | None:
-    """Numbers of all pillars [pillars * 6], and (counter, microseconds); None if the body does not hold them."""
+def _alike(
+    data: bytes, spans: list[Span], form: PtsForm | None
+) -> Iterator[tuple[PtsForm, NDArray[np.uint8], list[Span]]]:
+    """Packets of one form that follow each other: the form, their contents [n, bytes], and where they are. Those
+    without a form are left out. form: of the packets before these, which is not looked for again."""
+    for _, group in groupby(spans, lambda span: span[1] - span[0]):
+        where = list(group)
+        content = b"".join(data[start + len(_HEAD) : end - len(_TAIL) - 2] for start, end in where)
+        contents = np.frombuffer(content, np.uint8).reshape(len(where), -1)
+        while where:
+            n = form.run(contents) if form else 0
+            if not n:
+                form = _form(contents[0].tobytes())
+                n = form.run(contents) if form else 1
+            if form:
+                yield form, contents[:n], where[:n]
+            contents, where = contents[n:], where[n:]
+
+
+def _form(content: bytes) -> PtsForm | None:
+    """The form of a packet; None if it does not hold what it should."""
     try:
-        blocks = _pts_table(body)
-        ends = dict(pairwise([*sorted(blocks.values()), len(body)]))
-        if ends[blocks[1]] - blocks[1] != _CLOCK.size:
+        blocks, fixed = _table(content)
+        ends = dict(pairwise([*sorted(blocks.values()), len(content)]))
+        if ends[blocks[1]] - blocks[1] != _CLOCK.itemsize:
             return None
         # the sum does not see bytes of 0 that are missing; then block 4 no longer begins with the number of sensors
-        if 4 in blocks and _U16.unpack_from(body, blocks[4]) != _U16.unpack_from(body, blocks[3]):
-            return None
-        clock = _CLOCK.unpack_from(body, blocks[1])
+        if 4 in blocks:
+            fixed += range(blocks[4], blocks[4] + 2)
+            if _U16.unpack_from(content, blocks[4]) != _U16.unpack_from(content, blocks[3]):
+                return None
         # nor those that were added; the lengths of the blocks do
-        return _pts_pillars(body[: ends[blocks[3]]], blocks[3]), clock
+        pillars, more = _pillars(content[: ends[blocks[3]]], blocks[3])
     except (struct.error, KeyError, ValueError, IndexError):
         return None
+    numbers = np.add.outer(np.array(pillars, np.int64), np.arange(2, _PILLAR)).ravel()
+    known = np.array(fixed + more, np.int64)
+    return PtsForm(len(content), blocks[1], numbers, known, np.frombuffer(content, np.uint8)[known])
 
 
-def _pts_table(body: bytes) -> dict[int, int]:
-    """Type -> offset of each block. The table ends where the first block begins. Raises struct.error, IndexError or
-    ValueError where it does not fit."""
-    width = body[0]
+def _table(content: bytes) -> tuple[dict[int, int], list[int]]:
+    """Type -> offset of each block, and where that stands. The table ends where the first block begins. Raises struct.error,
+    IndexError or ValueError where it does not fit."""
+    width = content[0]
     if not 1 <= width <= 4:
         raise ValueError(f"offsets of {width} bytes")
     blocks: dict[int, int] = {}
-    at, first = 1, len(body)
+    at, first = 1, len(content)
     while at + 2 + width <= first:
-        offset = int.from_bytes(body[at + 2 : at + 2 + width], "little")
-        blocks[_U16.unpack_from(body, at)[0]] = offset
+        offset = int.from_bytes(content[at + 2 : at + 2 + width], "little")
+        blocks[_U16.unpack_from(content, at)[0]] = offset
         first, at = min(first, offset), at + 2 + width
-    return blocks
+    return blocks, list(range(at))
 
 
-def _pts_pillars(body: bytes, at: int) -> NDArray[Any]:
-    """The block of type 3: sensors, their offsets, of each sensor its pillars, their offsets, and their numbers."""
-    width = body[0]
-    (sensors,) = _U16.unpack_from(body, at)
+def _pillars(content: bytes, at: int) -> tuple[list[int], list[int]]:
+    """Offsets of all pillars, and of the bytes that say where they are, in the block of type 3: sensors, their offsets, of
+    each sensor its pillars, their offsets, and their numbers."""
+    width, found, fixed = content[0], [], [at, at + 1]
+    (sensors,) = _U16.unpack_from(content, at)
     at += 2 + sensors * width
-    parts = []
     for _ in range(sensors):
-        (pillars,) = _U16.unpack_from(body, at)
+        (pillars,) = _U16.unpack_from(content, at)
+        fixed += [at, at + 1]
         at += 2 + pillars * width
-        part = np.frombuffer(body, _PILLAR, pillars, at)
-        if (part["type"] != 2).any():
-            raise ValueError("numbers of another type")
-        parts.append(part["values"].reshape(-1))
-        at += part.nbytes
-    if at != len(body):
+        for _ in range(pillars):
+            if _U16.unpack_from(content, at)[0] != _TYPE:
+                raise ValueError("numbers of another type")
+            found.append(at)
+            fixed += [at, at + 1]
+            at += _PILLAR
+    if at != len(content):
         raise ValueError("a block of another length")
-    return np.concatenate(parts)
+    return found, fixed

@@ -88,6 +88,26 @@ def test_papillarray_with_a_tail_inside():
     assert found.garbage == 0
 
 
+def test_papillarray_of_changing_form():
+    """Packets of one length whose pillars are elsewhere are read by their own tables, and one that is no packet is left
+    out; what is read at once is what is read one by one."""
+    p = replace(profile("papillarray"), rows=6)
+    grids = [np.arange(108, dtype=np.float32).reshape(6, 3, 6) + i for i in range(5)]
+    data = [papillarray(grid, i, sensors=2 if i % 2 else 1) for i, grid in enumerate(grids)]
+    data[2] += bytes(len(data[1]) - len(data[2]))  # garbage; then all are equally far apart
+    alike = papillarray(grids[0], 7, sensors=2)
+    other = bytearray(alike)
+    at = other.index(b"\x02\x00", 40)
+    other[at], other[at + 2] = 3, (other[at + 2] - 1) % 256  # numbers of another type, and the same sum
+    stream = [*data, alike, bytes(other), alike]
+    found = decoded(p, b"".join(stream))
+    single = [decoded(p, packet).taxels for packet in stream]
+    assert found.taxels.tolist() == np.concatenate(single).tolist()
+    assert [len(one) for one in single] == [1, 1, 1, 1, 1, 1, 0, 1]
+    assert found.taxels[3].tolist() == grids[3][..., :3].tolist()
+    assert found.skipped.tolist() == [0, 0, 0, len(data[2]) - len(data[0]), 0, 0, len(other)]
+
+
 def test_papillarray_of_two_sensors():
     """Two sensors are 6x3, one below the other; a profile of 3x3 says that this is another skin."""
     grid = np.arange(108, dtype=np.float32).reshape(6, 3, 6)
