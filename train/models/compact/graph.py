@@ -2,7 +2,8 @@
 
 Float and int8 have the same nodes. In int8 everything is an integer up to the mean responses: the first convolution takes
 bytes as they come from the sensor, for its integer taps sum to zero and no offset matters, and the means are integer
-sums. So all machines give the same bits there.
+sums. So all machines give the same bits there. The filter bank is in int8 only where counts are bytes: wider counts lose
+too much in one.
 """
 
 from __future__ import annotations
@@ -62,17 +63,16 @@ def trunk_graph(
     g, parts = GraphBuilder(), []
     raw = g("Reshape", "sweep", g.constant([1, form.window, form.channels], "int64"))
     attenuation = _attenuation(g, raw, form)
-    if architecture.channels or architecture.pools:
+    if architecture.channels:
         x, step = _prepared(g, form, scale, architecture, raw, attenuation, ranges, tenths)
-        if architecture.channels:
-            parts.append(_log_means(g, form, architecture, weights, x, step, ranges, tenths))
-        if architecture.pools:
-            rowwise = tenths and not architecture.zero_sum(form.window)
-            asked = bank.Pooling(ranges is not None, architecture.pools > 1, tenths, rowwise)
-            pooled = bank.pooled(g, form, bank.Bank.of(weights), x, step, asked)
-            parts += (
-                [g("Reshape", part, g.constant([1, TENTHS, -1], "int64")) for part in pooled] if rowwise else pooled
-            )
+        parts.append(_log_means(g, form, architecture, weights, x, step, ranges, tenths))
+    if architecture.pools:
+        own = ranges if form.dtype == "uint8" else None  # a byte does not hold wider counts, see decision 11
+        x, step = _prepared(g, form, scale, architecture, raw, attenuation, own, tenths)
+        rowwise = tenths and not architecture.zero_sum(form.window)
+        asked = bank.Pooling(own is not None, architecture.pools > 1, tenths, rowwise)
+        pooled = bank.pooled(g, form, bank.Bank.of(weights), x, step, asked)
+        parts += [g("Reshape", part, g.constant([1, TENTHS, -1], "int64")) for part in pooled] if rowwise else pooled
     if keep_means:
         counts = nodes.known_steps(nodes.frames(form.window), form.window, tenths)
         parts.append(g("Mul", _levels(g, g("Cast", raw, to=FLOAT), form, counts), g.constant(scale)))

@@ -89,6 +89,22 @@ def test_int8_is_close_and_the_last_tenth_is_the_whole_window(form: SweepFormat)
         np.testing.assert_allclose(tenths[:, -1], whole, atol=1e-5)
 
 
+def test_wide_counts_keep_what_a_byte_would_round_away():
+    """One sweep of eight is ten thousand times as large as the others, which are below a step of 8 bits then: the int8 form
+    gives what the float form gives."""
+    form = FORMS[4]
+    given = counts(form, 8)
+    given[0] = (given[0] - 1000) * 1e4
+    assert graph.count_range(given, BANK) / 127 > given[1:].max() - given[1:].min()
+    ranges, filters = graph.Ranges(graph.count_range(given, BANK), ()), small(form)
+    rounded, precise = (
+        run(graph.trunk_graph(form, texture_scale(counts(form, 12)), filters.weights(), BANK, some), given)
+        for some in (ranges, None)
+    )
+    np.testing.assert_array_equal(rounded, precise)
+    assert len(np.unique(rounded[1:, len(filters) :])) > 20
+
+
 @forms
 def test_an_offset_changes_nothing(form: SweepFormat):
     """Every taxel higher by as much: the same bits in int8, where counts are whole."""
