@@ -6,11 +6,12 @@ import sys
 def main() -> int:
     """Run one command; its exit code."""
     try:
-        from train.cli import main as command  # here: these imports take seconds, in which Ctrl-C may come
+        from train.cli import main as command  # here: imports take seconds, in which Ctrl-C may come
+
+        return command.main()
     except KeyboardInterrupt:
         print("palpate-train: interrupted before anything was done", file=sys.stderr)
         return 130
-    return command.main()
 
 
 if __name__ == "__main__":

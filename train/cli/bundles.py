@@ -1,4 +1,4 @@
-"""The commands that make and judge bundles: fit, export, pack, score, parity, sign, references."""
+"""The commands that make and judge bundles: fit, export, pack, score, parity, references."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from appliance.core.provenance import commit
 from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
 from train.calibration.posthoc import calibrate
-from train.cli import options
+from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import labels
 from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
-from train.export import bundle_score, measure, pack, quantized_bundle, sign
+from train.export import bundle_score, measure, pack, quantized_bundle
 from train.models import methods
 from train.models.compact import recipe
 from train.models.compact.architectures import ARCHITECTURES
@@ -39,7 +39,7 @@ LEAST_STEPS = 2
 
 
 def register(add: Add) -> None:
-    """fit, export, pack, score, parity, sign, references."""
+    """fit, export, pack, score, parity, references."""
     _add_fit(add)
     _add_bundles(add)
     score = add("score", run_score, "run a set through the box's classifier with a bundle, and print what it named")
@@ -54,25 +54,15 @@ def register(add: Add) -> None:
     parity.add_argument("model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form")
     options.add_set(parity)
     parity.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    sign_command = add("sign", run_sign, "sign a bundle, so that boxes take it")
-    sign_command.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
-    sign_command.add_argument(
-        "--key", type=Path, required=True, metavar="KEY", help="your private key: ssh-keygen -t ed25519 makes one"
-    )
-    sign_command.add_argument(
-        "--counter",
-        type=options.whole("--counter", 1),
-        metavar="N",
-        help="above that of every bundle delivered before (1 for the first)",
-    )
 
 
 def _add_fit(add: Add) -> None:
     command = add("fit", run_fit, "choose a model and fit it to sweep sets")
+    command.set_defaults(resumes=True)
     options.add_set(command)
     command.add_argument(
         "--seed",
-        type=options.whole("--seed", 0),
+        type=numbers.whole("--seed", 0),
         required=True,
         help="of the training, and of simulated sets that name none",
     )
@@ -81,13 +71,13 @@ def _add_fit(add: Add) -> None:
     command.add_argument("--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set")
     command.add_argument(
         "--steps",
-        type=options.whole("--steps", 0),
+        type=numbers.whole("--steps", 0),
         default=STEPS,
         help=f"of training of stages (default {STEPS}; 0 for none)",
     )
-    command.add_argument("--row-shift", type=options.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"), metavar="SHARE", dest="moved",
+    command.add_argument("--row-shift", type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"), metavar="SHARE", dest="moved",
                      help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
-    command.add_argument("--stretch", type=options.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"), metavar="SHARE",
+    command.add_argument("--stretch", type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"), metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
     command.add_argument(
         "--size",
@@ -109,7 +99,7 @@ def _add_bundles(add: Add) -> None:
     pack_command.add_argument("--method", required=True, metavar="NAME", help="see palpate-train methods")
     pack_command.add_argument(
         "--seed",
-        type=options.whole("--seed", 0),
+        type=numbers.whole("--seed", 0),
         required=True,
         help="of the training, and of simulated sets that name none",
     )
@@ -122,12 +112,12 @@ def _add_bundles(add: Add) -> None:
         command.add_argument("--version", required=True)
         command.add_argument(
             "--full-scale",
-            type=options.above_zero("--full-scale"),
+            type=numbers.above_zero("--full-scale"),
             help="the sensor's highest raw count (default: the maximum of its type)",
         )
         command.add_argument(
             "--pitch-mm",
-            type=options.above_zero("--pitch-mm"),
+            type=numbers.above_zero("--pitch-mm"),
             help="from taxel to taxel; without it `palpate align` cannot show mm (known for the simulated skin)",
         )
     references = add("references", run_references, "write the models that palpate bench times beside the bundle")
@@ -236,14 +226,6 @@ def run_score(args: argparse.Namespace) -> None:
         print(
             f"the bundle was fitted to a set of this name, {sweeps.source}: sweeps that it has seen say nothing of new ones"
         )
-
-
-def run_sign(args: argparse.Namespace) -> None:
-    """Sign the bundle, and print what was signed."""
-    signed = sign.sign(args.bundle, args.key, args.counter)
-    print(
-        f"signed: {signed.name} {signed.version}, counter {signed.counter}, {bundle.identity(signed.json())} in {args.bundle}"
-    )
 
 
 def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None, float | None]:

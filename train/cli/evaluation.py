@@ -13,7 +13,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
-from train.cli import options
+from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import sets
 from train.evaluation import evaluate, robustness, sim_calibration, uncertainty
@@ -43,13 +43,13 @@ def register(add: Add) -> None:
                        help="small (a stand-in of a minute) or whole (an hour of one core)")  # fmt: skip
     follow.add_argument(
         "--seed",
-        type=options.whole("--seed", 0),
+        type=numbers.whole("--seed", 0),
         default=1,
         metavar="N",
         help="of the simulated world and the training (1)",
     )
     follow.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
-    follow.add_argument("--steps", type=options.whole("--steps", 1), metavar="N", help="iterations (those of the size)")
+    follow.add_argument("--steps", type=numbers.whole("--steps", 1), metavar="N", help="iterations (those of the size)")
     follow.add_argument("--out", type=Path, required=True, metavar="FILE",
                        help="where the curve goes; an interrupted training goes on from there")  # fmt: skip
     alignment = add(
@@ -107,7 +107,7 @@ def _add_certainty(add: Add) -> None:
         "--protocol", default="leave:position", help="what is tested on where --test is not given (leave:position)"
     )
     command.add_argument("--method", default="compact", metavar="NAME", help="compact or one of its family (compact)")
-    command.add_argument("--seed", type=options.whole("--seed", 0), default=1, help="of training and draws (1)")
+    command.add_argument("--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)")
     command.add_argument(
         "--out", type=Path, default=Path("docs/certainty"), metavar="DIR", help="where it goes (docs/certainty)"
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.core.types import DATA_TYPES
-from train.cli import options
+from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import labels, summary
 from train.data.file_names import EXAMPLE, NamePattern
@@ -33,7 +33,7 @@ def register(add: Add) -> None:
     command.add_argument(
         "--time", default="", metavar="COLUMN:UNIT", help="of sampling times in s, ms, us or ns: t:ms, 1:s"
     )
-    command.add_argument("--rate", type=options.above_zero("--rate"), metavar="HZ", help="frames per second")
+    command.add_argument("--rate", type=numbers.above_zero("--rate"), metavar="HZ", help="frames per second")
     command.add_argument("--window", default="2s", metavar="LENGTH", help="of a sweep: 2s, 500ms or 1500 frames (2s)")
     command.add_argument("--every", metavar="LENGTH",
                          help="cut windows from the start on, one each LENGTH (the middle window alone)")  # fmt: skip

@@ -6,17 +6,29 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 
 from appliance.core.errors import ApplianceError
-from train.cli import bundles, choose, evaluation, importing, reports, sets
 from train.metrics import score
+
+GROUPS = {
+    "sets": ("sets", "pull"),
+    "importing": ("import",),
+    "evaluation": ("methods", "evaluate", "stress", "certainty", "calibrate", "cnn-curve", "alignment"),
+    "bundles": ("fit", "export", "pack", "references", "score", "parity"),
+    "signing": ("sign",),
+    "choose": ("choose",),
+    "reports": ("paper", "chart", "development", "matrix", "overview", "bench-table"),
+}
+"""The modules of this package and their commands: only the one that is wanted is imported, since that takes seconds."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; its exit code. An error of this project is one line on the error stream."""
     args = argparse.Namespace()
     try:
-        args = parser().parse_args(argv)
+        words = sys.argv[1:] if argv is None else list(argv)
+        args = parser(words[0] if words else "").parse_args(words)
         score.provenance()  # read once, now: the code that runs is of this commit
         args.run(args)
         sys.stdout.flush()
@@ -31,14 +43,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"palpate-train: {e.filename}: {e.strerror}", file=sys.stderr)
         return ApplianceError.exit_code
     except KeyboardInterrupt:
+        if not hasattr(args, "run"):
+            raise  # during the imports
         kept = "goes on where it was" if getattr(args, "resumes", hasattr(args, "cache")) else "begins anew"
         print(f"palpate-train: interrupted; the same command {kept}", file=sys.stderr)
         return 130
     return 0
 
 
-def parser() -> argparse.ArgumentParser:
-    """The parser of all commands; `args.run` is what the one given runs."""
+def parser(wanted: str = "") -> argparse.ArgumentParser:
+    """The parser of the command `wanted`, or of all where there is no such command; `args.run` is what the one given
+    runs."""
     parser = argparse.ArgumentParser(prog="palpate-train", description="Trains, judges and exports Palpate's models.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -47,6 +62,7 @@ def parser() -> argparse.ArgumentParser:
         command.set_defaults(run=run)
         return command
 
-    for group in (sets, importing, evaluation, bundles, choose, reports):
-        group.register(add)
+    of_wanted = [group for group, names in GROUPS.items() if wanted in names]
+    for group in of_wanted or GROUPS:
+        import_module(f"train.cli.{group}").register(add)
     return parser

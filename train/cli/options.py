@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import tempfile
 import time
@@ -11,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from appliance.core.errors import FormatError
+from train.cli import numbers
 from train.data import labels, sets
 from train.evaluation import evaluate
 from train.models import methods
@@ -38,9 +38,9 @@ def add_rename(command: argparse.ArgumentParser) -> None:
 def add_effort(command: argparse.ArgumentParser) -> None:
     """Options for how long networks are trained."""
     usual = methods.FULL_EFFORT
-    command.add_argument("--effort", type=above_zero("--effort"), default=usual.share, metavar="SHARE",
+    command.add_argument("--effort", type=numbers.above_zero("--effort"), default=usual.share, metavar="SHARE",
                          help="of the networks' usual iterations (1)")  # fmt: skip
-    command.add_argument("--paper-steps", type=whole("--paper-steps", 1), metavar="N",
+    command.add_argument("--paper-steps", type=numbers.whole("--paper-steps", 1), metavar="N",
                          help="iterations of the paper's CNN (4000 on a GPU, fewer on a processor)")  # fmt: skip
     command.add_argument("--bfloat16", action="store_true", help="compute the paper's CNN in bfloat16 where that helps")
 
@@ -58,44 +58,9 @@ def add_jobs(command: argparse.ArgumentParser) -> None:
     command.add_argument("--jobs", type=jobs, default=-1, metavar="N", help="processes (one for each core)")
 
 
-def whole(name: str, least: int) -> Callable[[str], int]:
-    """Reads the option `name`, a whole number from `least` on; raises FormatError for anything else."""
-
-    def read(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = least - 1
-        if value < least:
-            raise FormatError(f"{name} {text} is out of range; use a whole number from {least} on")
-        return value
-
-    return read
-
-
-def number(name: str, fits: Callable[[float], bool], allowed: str) -> Callable[[str], float]:
-    """Reads the option `name`, a number that `fits`; raises FormatError for anything else, with what is `allowed`."""
-
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not (math.isfinite(value) and fits(value)):
-            raise FormatError(f"{name} {text} is out of range; use a number {allowed}")
-        return value
-
-    return read
-
-
-def above_zero(name: str) -> Callable[[str], float]:
-    """Reads the option `name`, a number above 0."""
-    return number(name, lambda x: x > 0, "above 0")
-
-
 def jobs(text: str) -> int:
     """Reads --jobs: processes from 1 on, or -1 for one on each core. Raises FormatError."""
-    return -1 if text == "-1" else whole("--jobs", 1)(text)
+    return -1 if text == "-1" else numbers.whole("--jobs", 1)(text)
 
 
 def writable(path: Path, option: str = "--out") -> None:

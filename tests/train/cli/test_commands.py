@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from appliance.core.errors import FormatError
 from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import easy
 from train.cli import bundles
-from train.cli.main import main
+from train.cli.main import GROUPS, main
 from train.data import pull, sets
 from train.models.compact.fit import Fit
 
@@ -123,7 +125,8 @@ def test_what_cannot_be_written_or_computed_is_refused_first(
 
 
 @pytest.mark.parametrize(("args", "message"), [
-    (["fit", "--set", "x", "--seed", "1", "--out", "fit.npz"], "the same command begins anew"),
+    (["fit", "--set", "x", "--seed", "1", "--out", "fit.npz"], "the same command goes on where it was"),
+    (["score", str(bundle.DEFAULT), "--set", "x"], "the same command begins anew"),
     (["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H"], "the same command goes on where it was"),
     (["pull", "user@box", "--out", "here"], "the same command goes on where it was"),
 ])  # fmt: skip
@@ -162,3 +165,25 @@ def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
     bundles._print(manifest, bundle.DEFAULT)
     line = "answers on lines: 16 labels need 5 of output.class_bits; rpi4 wires 4, rpi5 wires 4"
     assert (line in capsys.readouterr().out) == told
+
+
+def test_each_command_is_found_in_the_module_that_registers_it():
+    """So that one command needs the imports of one module; `palpate-train --help` has all."""
+    for group, names in GROUPS.items():
+        assert registered_by(group) == sorted(names)
+
+
+def registered_by(group: str) -> list[str]:
+    """The commands that a module of train.cli adds."""
+    commands = argparse.ArgumentParser().add_subparsers()
+    import_module(f"train.cli.{group}").register(lambda name, run, text: commands.add_parser(name))
+    return sorted(commands.choices)
+
+
+def test_signing_does_without_the_imports_of_training():
+    """They take seconds, and a bundle is signed on a machine that may not even have them."""
+    code = "import sys; from train.cli.main import main; main(['sign', '--help'])"
+    code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "usage: palpate-train sign" in done.stdout
+    assert not {"sklearn", "scipy", "torch", "onnx", "pandas", "matplotlib"} & {*done.stdout.split()}

@@ -1,0 +1,37 @@
+"""The command that signs bundles. It is apart from `bundles`, whose imports take seconds and which it does not need."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from appliance.bundle import bundle
+from train.cli import numbers
+from train.export import sign
+
+if TYPE_CHECKING:
+    from train.cli.options import Add
+
+
+def register(add: Add) -> None:
+    """sign."""
+    command = add("sign", run, "sign a bundle, so that boxes take it")
+    command.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    command.add_argument(
+        "--key", type=Path, required=True, metavar="KEY", help="your private key: ssh-keygen -t ed25519 makes one"
+    )
+    command.add_argument(
+        "--counter",
+        type=numbers.whole("--counter", 1),
+        metavar="N",
+        help="above that of every bundle delivered before (1 for the first)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Sign the bundle, and print what was signed."""
+    signed = sign.sign(args.bundle, args.key, args.counter)
+    print(
+        f"signed: {signed.name} {signed.version}, counter {signed.counter}, {bundle.identity(signed.json())} in {args.bundle}"
+    )
