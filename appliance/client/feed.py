@@ -176,6 +176,8 @@ def _why(e: OSError) -> str:
     """Why the feed cannot be read, for a person."""
     if isinstance(e, PermissionError):
         return "you may not read the feed; join group palpate (sudo adduser NAME palpate), and log in again"
+    if isinstance(e, BlockingIOError):
+        return "the box has no room for another connection now; it is tried again"
     if isinstance(e, (FileNotFoundError, ConnectionRefusedError)):
         return "no palpate offers its feed there; start it (systemctl start palpate), or see feed.socket"
     return f"{str(e.strerror or e).lower()}; see palpate status"

@@ -1,8 +1,8 @@
 """The feed: what the box does, for programs that watch it. In: health, verdicts, frames, readers' requests. Out: JSON
 lines on a local socket (PROTOCOL.md, part 4).
 
-Nothing here waits for a reader: what one does not take in time is dropped and counted. Each turn does a bounded part of
-the work, whatever the readers do, so many of them get their lines later, and the loop is none the slower.
+Nothing here waits for a reader: what one does not take in time is dropped and counted. Every PERIOD_NS a bounded part of
+the work is done, whatever the readers do: many of them get their lines later, and the loop is none the slower.
 """
 
 from __future__ import annotations
@@ -41,10 +41,13 @@ MOST_HZ = 20.0
 """Frames a second that a reader may ask for."""
 MOST_VALUES_S = 10_000
 """Raw counts a second that are written as text: of a large skin fewer frames a second are offered."""
-SERVED, HEARD, HEARD_BYTES = 4, 2, 128
-"""Readers that are written to, and sockets and bytes that are read, in one turn of the loop."""
+PERIOD_NS = 25_000_000
+"""Time between two looks at the sockets; system calls in every turn of the loop would cost more than all that is sent."""
+SERVED, HEARD, HEARD_BYTES = 16, 2, 128
+"""Readers that are written to, and sockets and bytes that are read, at one look."""
 KERNEL_BYTES = 16 * 1024
 """What the kernel may hold for a reader; it doubles this. Its default would come to 13 MB with 64 readers."""
+STATE = ("skin", "trouble", "sweeping", "ready")
 HEALTH_NS = 1_000_000_000
 RETRY_NS = 5_000_000_000
 """Time between two attempts to bind the socket."""
@@ -221,8 +224,9 @@ class FeedServer(Observer):
         self._readers: dict[int, Reader] = {}
         self._due: deque[Reader] = deque()  # those with something to send, in the order in which they get their turn
         self._newest: Frames | None = None
-        self._retry_ns = self._health_ns = clock.now_ns()
-        self._tick, self._state = 0, b""
+        self._retry_ns = self._health_ns = self._next_ns = clock.now_ns()
+        self._tick = 0
+        self._state: tuple[object, ...] = ()
         self._log = TroubleLog(
             f"feed: {path} cannot be offered", "classifying goes on; see feed.socket", end=f"feed: offered at {path}"
         )
@@ -252,12 +256,21 @@ class FeedServer(Observer):
             self._let_wait(reader)
 
     def turn(self, health: Health) -> None:
-        """Queue what is new, take up connections and requests, and send to the next few readers."""
+        """Queue what is new; when it is time, take up connections and requests, and send to the next few readers."""
+        state = health.skin, health.trouble, health.sweeping, health.ready
+        if state != self._state:
+            self._state = state
+            if self._readers:
+                self._to_all(encode("state", dict(zip(STATE, state, strict=True))))
         now_ns = self._clock.now_ns()
-        listener = self._listener or self._offer(now_ns)
-        if not listener:
+        if now_ns < self._next_ns:
             return
-        self._put_state(health)
+        self._next_ns = now_ns + PERIOD_NS
+        listener = self._listener or self._offer(now_ns)
+        if listener:
+            self._work(listener, health, now_ns)
+
+    def _work(self, listener: socket.socket, health: Health, now_ns: int) -> None:
         if now_ns >= self._health_ns:
             self._health_ns = now_ns + HEALTH_NS
             if self._readers:
@@ -301,13 +314,6 @@ class FeedServer(Observer):
             raise
         self._poll.register(listener, select.EPOLLIN)
         self._listener = listener
-
-    def _put_state(self, health: Health) -> None:
-        content = {name: getattr(health, name) for name in ("skin", "trouble", "sweeping", "ready")}
-        line = encode("state", content)
-        if line != self._state:
-            self._state = line
-            self._to_all(line)
 
     def _put_frame(self, now_ns: int) -> None:
         """Queue the newest frame for those whose next one is due; made once, however many want it."""

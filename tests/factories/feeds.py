@@ -12,7 +12,7 @@ import numpy as np
 
 from appliance.core.health import Health
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
-from appliance.service.feed import FeedServer
+from appliance.service.feed import PERIOD_NS, FeedServer
 from appliance.sim import rig, skin
 from tests.factories.simulated_box import SECOND, numbered
 
@@ -74,8 +74,8 @@ class Offered:
         known = {"source": "usb", "bundle": "9f3c2a1b", "labels": ["plastic rough", "wood"], "skin": "palpate"}
         self.feed = FeedServer(path, fmt, known, self.clock, lambda: facts)
 
-    def turns(self, n: int = 1, health: Health = HEALTH, step_s: float = 0.008) -> None:
-        """Take turns, `step_s` apart."""
+    def turns(self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND) -> None:
+        """Take turns, `step_s` apart: so that each is one in which the feed does its work."""
         for _ in range(n):
             self.feed.turn(health)
             self.clock.sleep_until(self.clock.now_ns() + round(step_s * SECOND))
@@ -84,5 +84,5 @@ class Offered:
         """A connected reader that the box has taken up."""
         self.turns()
         peer = FeedPeer(self.path)
-        self.turns(2, step_s=0)
+        self.turns(2)
         return peer

@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,12 +170,16 @@ class Reckoned:
 
 
 class ThisMachine:
-    """`palpate run --sim skin`, as installed beside this Python, in real time."""
+    """`palpate run --sim skin`, as installed beside this Python, in real time.
+
+    before: what starts it, such as `chrt -f 10`. sets: further settings.
+    """
 
     name = "this machine"
 
-    def __init__(self) -> None:
+    def __init__(self, before: Sequence[str] = (), sets: Sequence[str] = ()) -> None:
         self._stack, self._rest = ExitStack(), b""
+        self._before, self._sets = before, [f"--set={text}" for text in sets]
 
     @staticmethod
     def missing() -> str:
@@ -186,7 +190,8 @@ class ThisMachine:
         """As BoxUnderTest."""
         self._robot = Reckoned(sweeps)
         self._far, port = self._stack.enter_context(pseudo_terminal.pair())
-        command = [Path(sys.executable).with_name("palpate"), "run", "--sim", "skin", "--seed", str(seed)]
+        palpate = Path(sys.executable).with_name("palpate")
+        command = [*self._before, palpate, "run", "--sim", "skin", "--seed", str(seed), *self._sets]
         self._log = Path(self._stack.enter_context(tempfile.TemporaryDirectory())) / "log"
         self._box = subprocess.Popen([*command, "--set", f"serial.port={port}"], stderr=self._log.open("wb"))
         self._stack.callback(self._end)

@@ -1,0 +1,209 @@
+"""What readers of the feed cost the box: `python -m tests.campaigns.feed_load --minutes 5 --out docs/feed.json`. In: minutes for
+each kind of readers. Out: a table and JSON: share of a core, memory, latency and losses, with and without them; exit code 1
+if a target was missed.
+
+One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had the same machine. Box
+and listener run with real-time priority where `chrt` may be used: other programs of the machine then cost no latency.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appliance.core import storage
+from appliance.core.provenance import commit
+from appliance.sim import skin
+from appliance.tools.score import Answer
+from tests.campaigns.feed_readers import KINDS
+from tests.factories.paths import ROOT
+from tests.rig.soak_boxes import Script, ThisMachine
+
+SLOT_S, SETTLE_S = 20.0, 2.0
+WAIT_S = 0.1
+SHARE, MIB, LATE_MS = 0.01, 2.0, 1.0
+"""Targets: additional share of a core, additional memory, additional time to the sentence in the median."""
+LOST, DROPPED = 7, 10
+"""Fields of an STA sentence, counted from the talker."""
+REAL_TIME = ("chrt", "-f", "10")
+
+
+@dataclass
+class Kind:
+    """What was measured while there were readers of one kind."""
+
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    shares: list[float] = field(default_factory=list)
+    rss_kib: list[int] = field(default_factory=list)
+    late_s: list[float] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    lost: int = 0
+    dropped: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    seen: Counter[str] = field(default_factory=Counter)
+
+
+class Listener:
+    """The robot's end of the line: how late each answer is, and what the box counts as lost."""
+
+    def __init__(self, box: ThisMachine, sweeps: Script) -> None:
+        self._box, self._sweeps = box, sweeps
+        self._next, self._counts = 1, (0, 0)
+
+    def listen(self, seconds: float, kind: Kind) -> None:
+        """Note for `kind` what comes in so long."""
+        end_s = time.monotonic() + seconds
+        before = self._counts
+        while (left_s := end_s - time.monotonic()) > 0:
+            for at_s, line in self._box.heard(min(left_s, WAIT_S)):
+                self._note(at_s, line, kind)
+        kind.lost += self._counts[0] - before[0]
+        kind.dropped += self._counts[1] - before[1]
+
+    def _note(self, at_s: float, line: str, kind: Kind) -> None:
+        fields = line.split("*")[0].split(",")
+        if fields[:2] == ["$PPLP", "STA"]:
+            self._counts = int(fields[LOST]), int(fields[DROPPED])
+            kind.faults["skin away"] += fields[3] != "streaming"
+        if answer := Answer.read(line):
+            fact = self._sweeps[answer.sweep]
+            kind.faults["sweeps without an answer"] += answer.sweep - self._next
+            said = answer.label if answer.status == "ok" else answer.status
+            kind.faults["not as the network by itself"] += said != fact.alone
+            self._next = answer.sweep + 1
+            kind.late_s.append(at_s - fact.stop / skin.FORMAT.rate_hz)
+            kind.latency_ms.append(answer.latency_ms)
+
+
+def measure(
+    minutes: float, seed: int, before: Sequence[str], report: Any
+) -> tuple[dict[str, Kind], int, dict[str, Any]]:
+    """All kinds in turns; resident memory in KiB before there was any reader; what was measured."""
+    kinds = {name: Kind() for name in KINDS}
+    with ExitStack() as stack:
+        path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
+        box, sweeps = ThisMachine(before, [f"feed.socket={path}"]), Script(seed)
+        stack.callback(box.close)
+        box.start(seed, sweeps)
+        listener = Listener(box, sweeps)
+        listener.listen(30.0, Kind())  # the start, and the first sweeps
+        rss_kib = box.process()[0]
+        for turn in range(max(1, round(minutes * 60 / SLOT_S))):
+            for name, kind in kinds.items():
+                _slot(name, path, box, listener, kind)
+                report(f"{turn + 1}  {name:<10} {100 * kind.shares[-1]:5.2f} % of a core, {kind.rss_kib[-1]} KiB")
+        box.stop()
+    return kinds, rss_kib, dict(box.about())
+
+
+def _slot(name: str, path: Path, box: ThisMachine, listener: Listener, kind: Kind) -> None:
+    """One turn of a kind: readers come, the box is watched, they go."""
+    command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(path), name]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as readers:
+        listener.listen(SETTLE_S, Kind())
+        begin_s, cpu_s = time.monotonic(), box.process()[2]
+        listener.listen(SLOT_S, kind)
+        wall_s, cpu_s = time.monotonic() - begin_s, box.process()[2] - cpu_s
+        kind.rss_kib.append(box.process()[0])
+        kind.wall_s, kind.cpu_s = kind.wall_s + wall_s, kind.cpu_s + cpu_s
+        kind.shares.append(cpu_s / wall_s)
+        said, _ = readers.communicate(b"\n", timeout=30)
+        kind.seen.update(json.loads(said))
+    listener.listen(SETTLE_S, Kind())
+
+
+def result(kinds: dict[str, Kind], rss_kib: int) -> dict[str, Any]:
+    """Figures by kind. late_ms: from the stop edge to the sentence at the robot, less that of the quickest answer of all;
+    half of it is the wait for the rest of a packet. share_more: difference to no reader, mean of the turns with a 95 %
+    interval. memory_mib: resident, more than before the first reader, the most of all turns."""
+    quickest = min(min(kind.late_s) for kind in kinds.values())
+    figures = {}
+    for name, kind in kinds.items():
+        late_ms = 1e3 * (np.array(kind.late_s) - quickest)
+        more = np.array(kind.shares) - np.array(kinds["0"].shares)
+        width = 1.96 * more.std(ddof=1) / np.sqrt(len(more)) if len(more) > 1 else float("nan")
+        figures[name] = {
+            "seconds": round(kind.wall_s), "answers": len(kind.late_s),
+            "share": round(kind.cpu_s / kind.wall_s, 5),
+            "share_more": [round(float(v), 5) for v in (more.mean(), more.mean() - width, more.mean() + width)],
+            "memory_mib": round((max(kind.rss_kib) - rss_kib) / 1024, 2),
+            "late_ms": {f"p{q}": round(float(np.percentile(late_ms, q)), 2) for q in (50, 99)},
+            "latency_ms": {f"p{q}": round(float(np.percentile(kind.latency_ms, q)), 2) for q in (50, 99)},
+            "frames_lost": kind.lost, "sentences_dropped": kind.dropped,
+            "faults": {k: n for k, n in kind.faults.items() if n}, "lines": dict(kind.seen),
+        }  # fmt: skip
+    return figures
+
+
+def missed(figures: dict[str, Any]) -> list[str]:
+    """Targets that were not reached, in words."""
+    found = []
+    for name, one in figures.items():
+        more_ms = one["late_ms"]["p50"] - figures["0"]["late_ms"]["p50"]
+        checks = {
+            f"{100 * one['share_more'][0]:.2f} % of a core": one["share_more"][0] > SHARE,
+            f"{one['memory_mib']} MiB more": one["memory_mib"] > MIB,
+            f"{more_ms:.2f} ms later in the median": more_ms > LATE_MS,
+            f"{one['frames_lost']} frames lost": one["frames_lost"] > 0,
+            f"{one['sentences_dropped']} sentences dropped": one["sentences_dropped"] > 0,
+            f"{one['faults']}": bool(one["faults"]),
+        }
+        found += [f"{name}: {text}" for text, bad in checks.items() if bad]
+    return found
+
+
+NAMES = {"0": "none", "1": "1 reader", "8": "8, one never reads", "64": "64, one never reads", "attacked": "attacked"}
+
+
+def table(figures: dict[str, Any]) -> str:
+    """The figures in Markdown."""
+    rows = [
+        "| readers | share of a core | more than without | memory, more | stop edge to sentence, p50 / p99 | in the box, p50 / p99 | answers | frames lost |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, one in figures.items():
+        more = "" if name == "0" else "{:+.2f} % [{:+.2f}, {:+.2f}]".format(*(100 * v for v in one["share_more"]))
+        late, latency = one["late_ms"], one["latency_ms"]
+        rows.append(
+            f"| {NAMES[name]} | {100 * one['share']:.2f} % | {more} | {one['memory_mib']:.2f} MiB | "
+            f"{late['p50']:.1f} / {late['p99']:.1f} ms | {latency['p50']:.2f} / {latency['p99']:.2f} ms | "
+            f"{one['answers']} | {one['frames_lost']} |"
+        )
+    return "\n".join(rows)
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=5.0, help="for each kind of readers (%(default)s)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("build/feed.json"))
+    args = parser.parse_args()
+    real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    kinds, rss_kib, about = measure(
+        args.minutes, args.seed, REAL_TIME if real_time else (), lambda line: print(line, flush=True)
+    )
+    figures = result(kinds, rss_kib)
+    content = {"commit": commit(), "seed": args.seed, **about, "real_time": real_time, "readers": figures}
+    storage.put(args.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
+    print(table(figures))
+    for text in (bad := missed(figures)):
+        print(f"FAIL {text}")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

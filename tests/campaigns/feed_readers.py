@@ -1,0 +1,178 @@
+"""Programs at the box's feed, good and bad: `python -m tests.campaigns.feed_readers PATH KIND` until its input ends. In: the
+socket, one of KINDS. Out: one line of JSON, what they got.
+
+All are in one process of low priority, which pauses between its rounds, so that it takes less than a core.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import select
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+
+from appliance.client.feed import parse
+from appliance.core.errors import FormatError
+
+ALL = b'{"frames": 20, "sweeps": true}\n'
+PAUSE_S = 0.002
+STORM = 1000
+"""Connections that are open at once while the feed is attacked, most of which the box has not taken up or has refused."""
+KINDS = ("0", "1", "8", "64", "attacked")
+
+Act = Callable[[], None]
+
+
+def connected(path: str) -> socket.socket | None:
+    """A connection that does not wait, None where the box has no room for it now."""
+    one = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+    try:
+        one.connect(path)
+    except OSError:
+        one.close()
+        return None
+    return one
+
+
+def send(one: socket.socket, data: bytes) -> bool:
+    """Send what goes; False where the connection has ended."""
+    try:
+        one.send(data)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return True
+
+
+def reader(path: str, seen: Counter[str]) -> Act:
+    """One that asks for all and reads all; what it got is counted by type."""
+    one: socket.socket | None = None
+    rest = b""
+
+    def act() -> None:
+        nonlocal one, rest
+        if one is None:
+            one, rest = connected(path), b""
+            if one:
+                send(one, ALL)
+            return
+        try:
+            while data := one.recv(1 << 16):
+                lines, rest = parse(data, rest)
+                seen.update(line["type"] for line in lines)
+                seen["lines lost"] += sum(line["lines"] for line in lines if line["type"] == "lost")
+            one = None
+        except BlockingIOError:
+            pass
+        except (OSError, FormatError):
+            seen["broken"] += 1
+            one = None
+
+    return act
+
+
+def silent(path: str, seen: Counter[str]) -> Act:
+    """One that asks for all and never reads."""
+    held: list[socket.socket] = []
+
+    def act() -> None:
+        if not held and (one := connected(path)):
+            send(one, ALL)
+            held.append(one)
+
+    return act
+
+
+def sluggish(path: str, seen: Counter[str]) -> Act:
+    """One that asks for all and takes some bytes now and then."""
+    held: list[socket.socket] = []
+
+    def act() -> None:
+        if not held:
+            silent_one = connected(path)
+            held.extend([silent_one] if silent_one else [])
+            if held:
+                send(held[0], ALL)
+        elif random.random() < 0.002:
+            with suppress(OSError):
+                if not held[0].recv(10):
+                    held.clear()
+
+    return act
+
+
+def talker(path: str, seen: Counter[str], said: Callable[[], bytes]) -> Act:
+    """One that sends without end, and comes again when it is closed."""
+    held: list[socket.socket] = []
+
+    def act() -> None:
+        if not held:
+            one = connected(path)
+            held.extend([one] if one else [])
+            seen["attempts"] += len(held)
+        elif not send(held[0], said()):
+            held.pop().close()
+
+    return act
+
+
+def storm(path: str, seen: Counter[str]) -> Act:
+    """Connections by the hundred: as many as the box lets wait, held until there are STORM; the oldest then go."""
+    held: list[socket.socket] = []
+
+    def act() -> None:
+        for _ in range(20):
+            one = connected(path)
+            if one is None:
+                break
+            seen["attempts"] += 1
+            if random.random() < 0.3:
+                send(one, b'{"fra')
+            held.append(one)
+            if len(held) > STORM:
+                held.pop(0).close()
+        if held and random.random() < 0.5:
+            held.pop(random.randrange(len(held))).close()
+
+    return act
+
+
+def acts(kind: str, path: str, seen: Counter[str]) -> list[Act]:
+    """Those of a kind. Of 8 and 64 readers one never reads; attacked: eight good ones, and all that is bad."""
+    if kind != "attacked":
+        n = int(kind)
+        return [reader(path, seen) for _ in range(n - (n > 1))] + [silent(path, seen)] * (n > 1)
+    bad: Counter[str] = Counter()
+    floods = [talker(path, bad, lambda: b'{"frames": 20}\n{"sweeps": false}\n' * 200) for _ in range(10)]
+    garbage = [talker(path, bad, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(10)]
+    endless = [talker(path, bad, lambda: b"x" * 300) for _ in range(5)]
+    good = [reader(path, seen) for _ in range(8)]
+    slow = [sluggish(path, bad) for _ in range(10)] + [silent(path, bad) for _ in range(10)]
+
+    def note() -> None:
+        seen["attempts"] = bad["attempts"]
+
+    return [*good, *slow, *floods, *garbage, *endless, storm(path, bad), note]
+
+
+def main(path: str, kind: str) -> None:
+    """Until standard input ends."""
+    os.nice(19)
+    seen: Counter[str] = Counter()
+    all_acts = acts(kind, path, seen)
+    while not select.select([sys.stdin], [], [], 0)[0]:
+        for act in all_acts:
+            act()
+        time.sleep(PAUSE_S if all_acts else 0.1)
+    print(json.dumps(seen))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
