@@ -138,7 +138,7 @@ def _packed(new: Bundle, warnings: tuple[str, ...], disagreement: str) -> Enrolm
     assert new.classes
     files = {
         bundle.MODEL: new.model,
-        bundle.GOLDEN: _npz(samples=new.golden, logits=new.golden_logits),
+        bundle.GOLDEN: bundle.golden_file(new.golden, new.golden_logits),
         bundle.MEANS: _npz(**new.classes.arrays()),
     }
     manifest: Manifest = replace(new.manifest, files={k: bundle.file_entry(v) for k, v in files.items()})

@@ -23,6 +23,9 @@ from tests.fuzz.mutators import MUTATORS
 MEMORY = 1 << 30
 """Bytes that a process may ask for; an input that makes the box ask for more ends in a MemoryError, which is a crash."""
 
+SLOW_S = 10
+"""An input that takes longer, in processor time, is a crash, too."""
+
 
 def main(name: str, seconds: float, *options: str) -> None:
     """Fuzz a target for so much CPU time; libFuzzer prints what it does on standard error."""
@@ -35,8 +38,11 @@ def main(name: str, seconds: float, *options: str) -> None:
             return mutate(data, Random(seed), lambda part: atheris.Mutate(part, most))[:most]
 
         def once(data: bytes) -> None:
+            begin = time.process_time()  # not the clock: a busy machine takes nothing away
             target(data, place)
-            if 0 < seconds < time.process_time():  # not by the clock: a busy machine takes nothing away
+            end = time.process_time()
+            assert end - begin < SLOW_S, f"this input took {end - begin:.0f} s of processor time"
+            if 0 < seconds < end:
                 os.kill(os.getpid(), signal.SIGUSR1)  # libFuzzer's clean end
 
         again = f"{sys.executable} -m tests.fuzz.engine {name} {seconds}"  # how libFuzzer starts itself to merge

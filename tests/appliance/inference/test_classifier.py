@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle, Early
 from appliance.bundle.manifest import SCHEMA
 from appliance.core.errors import BundleError
-from appliance.core.types import Frames, Status, Sweep
+from appliance.core.types import Frames, Status, Sweep, SweepFormat
 from appliance.inference import session
 from appliance.inference.classifier import Classifier, fuse, softmax
 from appliance.sim.rig import VirtualClock
@@ -225,6 +227,45 @@ def test_golden_sweeps_of_another_format(tmp_path: Path):
     edit(folder, format=manifest["format"] | {"rows": 2})
     with pytest.raises(BundleError, match="does not fit the format"):
         bundle.load(folder)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
+@pytest.mark.parametrize("axes", [1, 3])
+def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
+    """Every number of every type comes back as it was, also where changes wrap; smooth sweeps take less room."""
+    fmt = SweepFormat(2, 3, 100.0, 50, dtype, axes)
+    rng = np.random.default_rng(1)
+    any_bits = rng.integers(0, 256, (2, 50, *fmt.shape, fmt.numpy_type.itemsize), np.uint8)
+    samples = any_bits.view(fmt.numpy_type)[..., 0]
+    samples[0] = np.cumsum(rng.integers(-2, 3, samples[0].shape), axis=0).astype(fmt.numpy_type)
+    logits = rng.normal(size=(2, 4)).astype(np.float32)
+    manifest = SimpleNamespace(format=fmt, labels=("a", "b", "c", "d"))
+    got, answers = bundle._golden(bundle.golden_file(samples, logits), manifest)
+    assert got.tobytes() == samples.tobytes()
+    assert got.dtype == fmt.numpy_type
+    assert answers.tolist() == logits.tolist()
+    smooth = np.repeat(samples[:1], 2, axis=0)
+    plain = io.BytesIO()
+    np.savez_compressed(plain, samples=smooth, logits=logits)
+    assert len(bundle.golden_file(smooth, logits)) < len(plain.getvalue())
+
+
+@pytest.mark.parametrize("shape", [(1, 2, 20, 2, 2), (2, 2, 19, 2, 2), (2, 2), ()])
+def test_golden_changes_of_another_form(shape: tuple[int, ...]):
+    """Changes with too few bytes or frames, or without either, are refused in one line."""
+    manifest = SimpleNamespace(format=SweepFormat(2, 2, 100.0, 20, "int16"), labels=("a", "b"))
+    packed = io.BytesIO()
+    np.savez_compressed(packed, changes=np.zeros(shape, np.uint8), logits=np.zeros((2, 2)))
+    with pytest.raises(BundleError, match="do not fit the format"):
+        bundle._golden(packed.getvalue(), manifest)
+
+
+def test_a_golden_file_without_sweeps():
+    """Logits alone are no golden sweeps."""
+    packed = io.BytesIO()
+    np.savez_compressed(packed, logits=np.zeros((2, 2)))
+    with pytest.raises(BundleError, match="holds no sweeps; export the bundle again"):
+        bundle._golden(packed.getvalue(), SimpleNamespace(format=SweepFormat(2, 2, 100.0, 20, "int16"), labels=("a",)))
 
 
 def test_pickles_are_not_opened(tmp_path: Path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,6 +61,26 @@ def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.Cap
     chosen = ["--sim", "skin", "--virtual", "--set", f"classifier.bundle={folder}"]
     assert palpate(["check", *chosen]) == 0
     assert palpate(["demo", *chosen, "--sweeps", "2"]) == 0
+
+
+def test_golden_sweeps_of_float32_are_rounded():
+    """They keep what is more than half of a usual change, take less room, and their logits are those of the rounded sweeps."""
+    content = pack.trained(METHODS["L-gauss"], tones(), 1)
+    rng = np.random.default_rng(1)
+    noisy = content.train.samples + rng.normal(0, 0.3, content.train.samples.shape)
+    train = replace(content.train, samples=noisy.astype(np.float32))
+    content = replace(content, train=train)
+    logits = pack.run(content.model, pack.model_inputs(content.input, train))
+    golden = pack.golden_sweeps(train, logits, logits)
+    data = pack.golden_file(content, golden)
+    assert len(data) < 0.6 * len(bundle.golden_file(golden.samples, logits[:2]))
+    arrays = SimpleNamespace(format=train.format, labels=train.materials)
+    samples, stored = bundle._golden(data, arrays)
+    usual = np.median(np.abs(np.diff(golden.samples, axis=1)))
+    assert 0 < np.abs(samples - golden.samples).max() <= usual / 4
+    again = pack.run(content.model, pack.model_inputs(content.input, replace(golden, samples=samples)))
+    assert np.array_equal(stored, again.astype(np.float32))
+    assert stored.argmax(1).tolist() == golden.labels.tolist()
 
 
 def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
