@@ -106,7 +106,8 @@ def _add_certainty(add: Add) -> None:
     command.add_argument(
         "--protocol", default="leave:position", help="what is tested on where --test is not given (leave:position)"
     )
-    command.add_argument("--method", default="compact", metavar="NAME", help="compact or one of its family (compact)")
+    command.add_argument("--method", default=methods.SHIPPED, metavar="NAME",
+                         help=f"{methods.SHIPPED}, compact or one of its family ({methods.SHIPPED})")  # fmt: skip
     command.add_argument("--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)")
     command.add_argument(
         "--out", type=Path, default=Path("docs/certainty"), metavar="DIR", help="where it goes (docs/certainty)"

@@ -147,7 +147,12 @@ class Development:
 
 def _points(case: DevelopmentCase) -> list[tuple[int, str]]:
     """Training sweeps of each material (0 for all) and name of what is evaluated of a case: it, and points of its curve."""
-    return [(0, case.name), *((each, f"{case.name}, {each} each") for each in EACH if case.curve)]
+    return [(each, _name(case.name, each)) for each in (0, *(EACH if case.curve else ()))]
+
+
+def _name(case: str, each: int) -> str:
+    """Of a case, or of a point of its curve."""
+    return f"{case}, {each} each" if each else case
 
 
 def join(run: Json, earlier: Sequence[Json]) -> Json:
@@ -167,7 +172,11 @@ def join(run: Json, earlier: Sequence[Json]) -> Json:
         }  # fmt: skip
         if one.get("times"):
             made.setdefault("times", one["times"])
-        done = {f"{entry['method']}, {entry['case']}" for entry in made["results"]}
+        done = {
+            name
+            for entry in made["results"]
+            for name in (f"{entry['method']}, {entry['case']}", _name(entry["case"], entry["each"]))
+        }
         made["left_out"] = {k: why for k, why in (one["left_out"] | made["left_out"]).items() if k not in done}
     return made
 

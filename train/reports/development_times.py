@@ -37,7 +37,7 @@ def measured(
     names: Sequence[str], sweeps: Dataset, seed: int, cache: Path | None, log: Log,
     effort: Effort = FULL_EFFORT, rounds: int = ROUNDS,
 ) -> Json:  # fmt: skip
-    """`entries` with `method`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep, and what was `left_out`.
+    """`entries` with `method`, `form`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep, and what was `left_out`.
 
     Bundles are kept in `cache`, as those of the chart are.
     """
@@ -62,17 +62,17 @@ def measured(
 
 
 def _callable(method: Method, sweeps: Dataset, seed: int, cache: Path) -> list[tuple[Json, measure.Call]]:
-    """The method as the box runs it, and as its own library does; other precisions are left to the chart."""
+    """The method as the box runs it, in int8 too where it has such a form, and as its own library does."""
     if method.library:
         some = sweeps.take(np.arange(0, len(sweeps), EVERY))
         model = method.train(some, model_inputs(method.input, some), seed)
-        entry = {"method": method.name, "precision": "float", "runtime": method.library, "runs_on_box": False}
-        return [(entry, partial(_alone, model))]
+        entry = {"method": method.name, "form": "", "precision": "float", "runtime": method.library}
+        return [(entry | {"runs_on_box": False}, partial(_alone, model))]
     made = model_forms.packed(method, sweeps, seed, kept_folder(method, sweeps, seed, cache))
     return [
-        ({"method": one.method, "precision": one.precision, "runtime": one.runtime,
+        ({"method": one.method, "form": one.form, "precision": one.precision, "runtime": one.runtime,
           "runs_on_box": one.runtime == "onnx"}, measure.load(one.folder))
-        for one in made if not one.form
+        for one in made if not one.form or one.precision == "int8"
     ]  # fmt: skip
 
 

@@ -27,13 +27,25 @@ def test_the_page_shows_every_figure():
     """Accuracies with intervals, differences to the best peer of each line, the mean of what all have, what was left out."""
     page, pictures = development_report.render(figures())
     read = PageReader(page)
-    facts = ("one 85.0 % quant 90.0 % +5.0",
-             "one +5.0 90.0 % 85.0 – 95.0 % 80.0 % 75.0 – 85.0 % 85.0 % 80.0 – 90.0 %", "two −5.5 70.0 % 65.0 – 75.0 % –",
-             "mean of 1: real and published 85.0 % quant 90.0 % +5.0", "mean of 2: all, the simulated ones too −0.2 80.0 % – 80.2 %",
-             "below the best peer in 1 of 2 lines, and +5.0 points from quant", "quick <b>, two: a window of 8 frames",
-             "time of a sweep of 1500x4x4, MiniRocket’s = 1 2.2 quant 1/100", "quick <b>: two",
-             "one default 50.0 % 45.0 – 55.0 % – – 90.0 %", "one.npz, force<=180 leave:force 100 4 digest of one",
-             "default, quick <b>, quant: seeds 1, 2; commit 0123abcd; x86_64, 2 cores", "quant 1.50", "quant float onnx 22.0 44.0")  # fmt: skip
+    facts = (
+        "lines in which it is no more than one point below the best peer 2 of 2 1 of 2 not reached",
+        "ahead of quant, the best peer on the mean of 1 real and published lines ≥ 1.0 +5.0 reached",
+        "points that int8 loses of its own float, on the mean ≤ 0.5 1.0 not reached",
+        "time of a sweep, MiniRocket’s = 1 ≤ 1/100 1/100 reached",
+        "one 85.0 % quant 90.0 % +5.0",
+        "one +5.0 90.0 % 85.0 – 95.0 %, 2 seeds 80.0 % 75.0 – 85.0 %, 2 seeds 85.0 % 80.0 – 90.0 %, 2 seeds",
+        "two −5.5 70.0 % 65.0 – 75.0 %, 2 seeds –",
+        "mean of 1: real and published 85.0 % quant 90.0 % +5.0",
+        "mean of 2: all, the simulated ones too −0.2 80.0 % – 80.2 %",
+        "default 90.0 % 91.0 % 1.0 1",
+        "quick <b>, two: a window of 8 frames",
+        "time of a sweep of 1500x4x4, MiniRocket’s = 1 2.2 quant 1/100",
+        "one default 50.0 % 45.0 – 55.0 %, 2 seeds – – 90.0 %",
+        "one.npz, force<=180 leave:force 100 4 digest of one",
+        "default, quick <b>, quant: seeds 1, 2; commit 0123abcd; x86_64, 2 cores",
+        "quant 1.50",
+        "quant float onnx 22.0 44.0",
+    )
     for fact in facts:
         assert fact in read.text, fact
     assert set(pictures) == {"front", "accuracy", "curves"}
@@ -147,12 +159,12 @@ def test_a_run_is_joined_by_what_it_lacks_of_another():
     del run["times"]
     others = [entry("one", "default", 0.1), entry("one", "quant", 0.8), entry("two", "minirocket", 0.7)]
     earlier = figures(methods=["quant", "minirocket", "default"], results=others,
-                      left_out={"default, one": "was too slow", "quant, two": "too short"})  # fmt: skip
+                      left_out={"default, one": "was too slow", "quant, two": "too short", "one": "not wanted", "one, 5 each": "no"})  # fmt: skip
     made = development_experiment.join(run, [earlier])
     assert made["methods"] == ["default", "minirocket", "quant"]
     assert [(e["case"], e["method"], e["mean"]) for e in made["results"]] == [
         ("one", "default", 0.9), ("one", "quant", 0.8), ("two", "minirocket", 0.7)]  # fmt: skip
-    assert made["left_out"] == {"quant, two": "too short"}
+    assert made["left_out"] == {"quant, two": "too short", "one, 5 each": "no"}
     assert made["runs"] == [*run["runs"], *earlier["runs"]]
     assert made["times"] == earlier["times"]
     assert run["methods"] == ["default"]  # as it was
@@ -183,6 +195,44 @@ def test_the_shipped_method_is_named_even_behind_the_front():
     assert "--accent" in shipped
 
 
+def test_the_int8_form_of_a_peer_has_a_dot_of_its_own():
+    """With its own time and its own accuracy; without an accuracy there is none."""
+    table = development_report.by_case([entry("one", "default", 0.8)])
+    table["one"]["ds-cnn"] = entry("one", "ds-cnn", 0.7) | {"forms": {"int8": entry("one", "ds-cnn", 0.6)}}
+    table["one"]["lite"] = entry("one", "lite", 0.7)
+    times = [{"method": name, "form": form, "ms_p50": 1.0} for name in ("ds-cnn", "lite") for form in ("", "int8")]
+    found = [(dot["method"], dot["form"], dot["accuracy"]["development"]["mean"]) for dot in
+             development_report.dots(times, table, ["one"])]  # fmt: skip
+    assert found == [("ds-cnn", "", 0.7), ("ds-cnn", "int8", 0.6), ("lite", "", 0.7)]
+
+
+def test_the_means_that_all_peers_share_stand_beside_the_larger_table():
+    """Three lines of two peers are a larger table than one line of three; both means are shown."""
+    lines = ("one", "two", "three")
+    results = [entry(c, m, a) for c in lines for m, a in (("default", 0.8), ("quant", 0.9), ("minirocket", 0.7))]
+    cases = [case | {"case": name, "simulated": False} for case in figures()["cases"][:1] for name in lines]
+    names = ["default", "minirocket", "quant", "ds-cnn"]
+    page, _ = development_report.render(figures(
+        cases=cases, results=[*results, entry("one", "ds-cnn", 0.95)], methods=names, times=None))  # fmt: skip
+    text = PageReader(page).text
+    assert "mean of 3: real and published 90.0 % quant 80.0 % −10.0" in text
+    assert "mean of 1: real and published that every method has 95.0 % ds-cnn 80.0 % −15.0" in text
+    assert "ds-cnn: two; three" in text
+
+
+@pytest.mark.parametrize(("mean", "word"), [(0.9, "reached"), (0.8999, "not reached")])
+def test_what_was_wanted_of_a_case_is_reached_or_not(mean: float, word: str):
+    """With the interval beside it."""
+    (case,) = list(development_report.WANTED)[:1]
+    table = development_report.by_case([entry(case, "default", mean)])
+    shared = development_report.mean_row(table, [case], "default", ["default"], [])
+    rows = {row["what"]: row for row in development_report.targets(table, [case], "default", [], shared, [])}
+    assert rows[case]["met"] == (word == "reached")
+    assert rows[case]["target"] == "≥ 90 %"
+    assert rows[case]["here"].startswith("90.0 % [85.0, 95.0]")
+    assert set(development_report.WANTED) <= {one.name for one in development_experiment.CASES}
+
+
 def test_a_peer_that_lacks_a_line_has_no_mean_and_costs_none_a_line():
     """The mean is over the lines of the peers that lack the fewest."""
     table = development_report.by_case(
@@ -207,12 +257,19 @@ def test_times_are_told_in_those_of_minirocket():
 
 @pytest.mark.slow
 def test_all_methods_are_timed_in_one_run(tmp_path: Path):
-    """A bundle by the box's classifier, a method of aeon in aeon; one that cannot take the sweeps is left out, with why."""
+    """A bundle by the box's classifier, in int8 too, a method of aeon in aeon; one that cannot take the sweeps is left out, with why."""
     found = development_times.measured(
-        ["L-gauss", "quant", "spectrogram-svm"], tones(), 1, tmp_path, lambda line: None, rounds=2
+        ["L-gauss", "ds-cnn", "quant", "spectrogram-svm"],
+        tones(),
+        1,
+        tmp_path,
+        lambda line: None,
+        methods.Effort(0.1),
+        2,
     )
-    assert [(one["method"], one["runtime"], one["runs_on_box"]) for one in found["entries"]] == [
-        ("L-gauss", "onnx", True), ("quant", "aeon", False)]  # fmt: skip
+    assert [(one["method"], one["form"], one["precision"], one["runtime"], one["runs_on_box"]) for one in found["entries"]] == [
+        ("L-gauss", "", "float", "onnx", True), ("ds-cnn", "", "float", "onnx", True), ("ds-cnn", "int8", "int8", "onnx", True),
+        ("quant", "", "float", "aeon", False)]  # fmt: skip
     assert all(0 < one["ms_p50"] <= one["ms_p99"] for one in found["entries"])
     assert list(found["left_out"]) == ["spectrogram-svm"]
     assert found["format"] == str(tones().format)
