@@ -32,6 +32,7 @@ HEAT = (236, 23, 30, 37, 79, 158)
 
 class LiveScreen(ABC, Generic[Shown]):
     """Shows one thing after another on `out`; `address`: of the page, where there is one. Restores the terminal at the end.
+    live: `out` is a terminal on which pictures can be drawn.
 
     A subclass says what it looks like: `_picture` and `_line`.
     """
@@ -39,21 +40,21 @@ class LiveScreen(ABC, Generic[Shown]):
     def __init__(self, out: TextIO, clock: Clock, address: str = "") -> None:
         self._out, self._clock, self._address = out, clock, address
         kind = os.environ.get("TERM", "dumb")
-        self._live = out.isatty() and kind != "dumb"
+        self.live = out.isatty() and kind != "dumb"
         self._colours = "256" in kind
         self._signs = BLOCKS if (out.encoding or "").lower().replace("-", "") == "utf8" else ASCII
         self._next_ns = 0
 
     def __enter__(self) -> Self:
-        self._write(ENTER if self._live else f"page: {self._address}\n" if self._address else "")
+        self._write(ENTER if self.live else f"page: {self._address}\n" if self._address else "")
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._write(LEAVE if self._live else "")
+        self._write(LEAVE if self.live else "")
 
     def show(self, view: Shown) -> None:
         """Draw `view` over the one before, in one write so that nothing flickers; or print a line, once a second."""
-        if self._live:
+        if self.live:
             width, height = os.get_terminal_size(self._out.fileno())
             lines = self._picture(view, width or 80, height or 24)
             self._write("\033[H" + "".join(f"{line}\033[K\n" for line in lines[:-1]) + f"{lines[-1]}\033[J")

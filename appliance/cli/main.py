@@ -16,7 +16,7 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from appliance.cli import bundle_commands, commands, skin_commands
+from appliance.cli import bundle_commands, commands, skin_commands, watch_commands
 from appliance.cli.commands import OpenDevices, load_bundle, load_settings, stop_flag
 from appliance.cli.parser import parser
 from appliance.core.clock import SystemClock
@@ -139,5 +139,6 @@ def _on_lines(settings: Config) -> Config:
 
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
     "demo": run_demo, "bench": run_bench, **commands.RUNS, **bundle_commands.RUNS, **skin_commands.RUNS,
+    **watch_commands.RUNS,
     **{name: partial(_with_devices, run) for name, run in {**commands.WITH_DEVICES, **skin_commands.WITH_DEVICES}.items()},
 }  # fmt: skip

@@ -144,6 +144,8 @@ def _local_commands(
     align.set_defaults(sweeps=None)
     add("check", "self-test: bundle, golden sweeps, devices", devices, answers)
     add("status", "state of the service, and its last verdicts").add_argument("--json", action="store_true")
+    watch = add("watch", "the running box live: skin, verdicts, latency and loss, over its feed")
+    watch.add_argument("--json", action="store_true", help="the feed's lines as they are (PROTOCOL.md, part 4)")
     add("replay", "judge a capture, a kept sweep or a folder of them again").add_argument("file", type=Path)
     add("config", "print each value with its source")
     bench = add("bench", "measure latency, memory, start and processor share on this machine")

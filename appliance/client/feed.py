@@ -121,6 +121,12 @@ class Feed:
             self._connection = None
         self._rest = b""
 
+    def lose(self, why: str) -> None:
+        """Close, and connect again after a while. why: `trouble` until then; what the box said last is the better reason."""
+        self.close()
+        self.trouble = self.trouble or why
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
+
     def _connect(self) -> bool:
         """Connect where it is time to try, and ask again for what was asked for."""
         now_ns = self._clock.now_ns()
@@ -145,7 +151,7 @@ class Feed:
         try:
             self._connection.sendall(json.dumps(self._asked).encode() + b"\n")
         except OSError as e:
-            self._lose(_why(e))
+            self.lose(_why(e))
 
     def _receive(self) -> None:
         if not self._connection:
@@ -156,20 +162,14 @@ class Feed:
                 raise FeedError(ENDED)
             lines, self._rest = parse(data, self._rest)
         except OSError as e:
-            self._lose(_why(e))
+            self.lose(_why(e))
         except (FeedError, FormatError) as e:
-            self._lose(str(e))
+            self.lose(str(e))
         else:
             for line in lines:
                 if line["type"] == "closed":  # what the box says before it closes
                     self.trouble = str(line.get("why"))
             self._lines += lines
-
-    def _lose(self, why: str) -> None:
-        """Close, and connect again after a while; what the box said last is the better reason."""
-        self.close()
-        self.trouble = self.trouble or why
-        self._retry_ns = self._clock.now_ns() + RETRY_NS
 
 
 def _why(e: OSError) -> str:

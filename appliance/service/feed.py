@@ -41,9 +41,9 @@ MOST_HZ = 20.0
 """Frames a second that a reader may ask for."""
 MOST_VALUES_S = 10_000
 """Raw counts a second that are written as text: of a large skin fewer frames a second are offered."""
-PERIOD_NS = 25_000_000
+PERIOD_NS = 30_000_000
 """Time between two looks at the sockets; system calls in every turn of the loop would cost more than all that is sent."""
-SERVED, HEARD, HEARD_BYTES = 16, 2, 128
+SERVED, HEARD, HEARD_BYTES = 16, 2, 64
 """Readers that are written to, and sockets and bytes that are read, at one look."""
 KERNEL_BYTES = 16 * 1024
 """What the kernel may hold for a reader; it doubles this. Its default would come to 13 MB with 64 readers."""

@@ -148,7 +148,7 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
     shown = {"version", "why", *Health.__slots__}
     facts |= {name: text for name, text in report.items() if name not in shown and isinstance(text, str) and text}
     rows += [f"{name:<8} {text}" for name, text in facts.items()]
-    rows += [_line(v, now_ns) for v in reversed(report["verdicts"])]
+    rows += [verdict_line(v, now_ns) for v in reversed(report["verdicts"])]
     return ["".join(c if c.isprintable() else "?" for c in line) for line in rows]
 
 
@@ -177,8 +177,8 @@ def _trigger(report: Mapping[str, Any]) -> str:
     return f"{', '.join(found)}; check the trigger lines" if found else ""
 
 
-def _line(v: Mapping[str, Any], now_ns: int) -> str:
-    """One verdict as a row."""
+def verdict_line(v: Mapping[str, Any], now_ns: int) -> str:
+    """One verdict as a row. v: as in the file, with its Status."""
     what = REASONS.get(v["status"], "")
     if v["status"].classified:
         what = f"{v['label']:<24}  {100 * v['probability']:5.1f} %  {v['latency_ns'] / 1e6:6.1f} ms"

@@ -7,18 +7,13 @@ Where the output is no terminal, or a dumb one, it gets one line a second.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import zip_longest
 
-from appliance.alignment.terminal import BLOCKS, BOLD, HEAT, PLAIN, LiveScreen
+from appliance.alignment.heat_map import side_by_side, uncoloured
+from appliance.alignment.terminal import BLOCKS, BOLD, PLAIN, LiveScreen
 from appliance.tools.skin_monitor import LiveView
 
-WIDEST = 6
-"""Characters of a taxel at most; from five on its count fits in."""
-GAP = "   "
 MOST_NAMED = 8
 """So many faulty taxels are named; of more, only the number is told."""
-
-Map = Sequence[Sequence[float]]
 
 
 class SkinScreen(LiveScreen[LiveView]):
@@ -65,36 +60,7 @@ def picture(view: LiveView, width: int, colours: bool, signs: str = BLOCKS, addr
     yield f" {BOLD}{view.state}{PLAIN}  {view.trouble or figures(view)}"[: width + len(BOLD + PLAIN)]
     yield f" {faults(view) or ('no fault seen' if view.load else '')}"[:width]
     yield ""
-    for maps in _side_by_side(view, width, signs):
-        yield from maps if colours else (_uncoloured(text) for text in maps)
+    for maps in side_by_side(view.load, view.full, width, signs):
+        yield from maps if colours else map(uncoloured, maps)
         yield ""
     yield f" Ctrl-C ends   {address}"
-
-
-def _side_by_side(view: LiveView, width: int, signs: str) -> Iterator[list[str]]:
-    """The maps of the axes, as many beside one another as there is room for."""
-    _, cols, axes = view.shape
-    cell = max(1, min(WIDEST, (width - 4) // cols if axes == 1 else (width // axes - len(GAP)) // cols))
-    beside = max(1, (width + len(GAP)) // (cols * cell + len(GAP) + 1))
-    for at in range(0, len(view.load), beside):
-        drawn = [_map(axis, at + i, view, cell, signs) for i, axis in enumerate(view.load[at : at + beside])]
-        yield [" " + GAP.join(parts) for parts in zip_longest(*drawn, fillvalue="")]
-
-
-def _map(values: Map, axis: int, view: LiveView, cell: int, signs: str) -> list[str]:
-    """One axis: a shaded field for each taxel, with its count where it fits in."""
-    several = view.shape[2] > 1
-    head = [f"axis {axis + 1}{' (normal)' * (axis + 1 == view.shape[2])}".ljust(cell * view.shape[1])] * several
-    return head + ["".join(_field(value, view.full, cell, signs) for value in row) + PLAIN for row in values]
-
-
-def _field(value: float, full: float, cell: int, signs: str) -> str:
-    share = max(0.0, min(1.0, value / full))
-    text = f"{value:.0f}".center(cell) if cell >= 5 else signs[round(4 * share)] * cell
-    return f"\033[38;5;{HEAT[round(5 * share)]}m{text[:cell]}"
-
-
-def _uncoloured(text: str) -> str:
-    for shade in HEAT:
-        text = text.replace(f"\033[38;5;{shade}m", "")
-    return text.replace(PLAIN, "")

@@ -95,10 +95,10 @@ def test_frames_come_at_the_rate_that_was_asked_for(offered: Offered, hz: float)
     last = frames(first=6 * round(found[-1]["time_ns"] / 6000 - 5 / 6))
     assert (found[-1]["time_ns"], found[-1]["taxels"]) == (int(last.t_ns[-1]), last.taxels[-1].tolist())
     peer.ask('{"frames": 0}')
-    offered.turns(40)
+    offered.turns(20)
     peer.lines()
     offered.feed.frames(frames())
-    offered.turns(40)
+    offered.turns(20)
     assert "frame" not in kinds(peer.lines() + other.lines())
 
 

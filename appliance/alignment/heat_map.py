@@ -1,0 +1,53 @@
+"""Heat maps of a skin as lines of a terminal, for `palpate skin show` and `palpate watch`. In: loads. Out: lines with the
+control sequences of 256 colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
+
+from appliance.alignment.terminal import BLOCKS, HEAT, PLAIN
+
+WIDEST = 6
+"""Characters of a taxel at most; from five on its count fits in."""
+GAP = "   "
+
+Map = Sequence[Sequence[float]]
+"""Load of one axis, [rows][columns]."""
+
+
+def side_by_side(load: Sequence[Map], full: float, width: int, signs: str = BLOCKS) -> Iterator[list[str]]:
+    """The maps of the axes, as many beside one another as there is room for in `width`; each time the lines of one row of
+    maps. full: load that is shown as the strongest. signs: see alignment.terminal."""
+    axes, cols = len(load), len(load[0][0]) if load else 0
+    if not load:
+        return
+    cell = max(1, min(WIDEST, (width - 4) // cols if axes == 1 else (width // axes - len(GAP)) // cols))
+    beside = max(1, (width + len(GAP)) // (cols * cell + len(GAP) + 1))
+    for at in range(0, axes, beside):
+        drawn = [_map(axis, _head(at + i, axes), full, cell, signs) for i, axis in enumerate(load[at : at + beside])]
+        yield [" " + GAP.join(parts) for parts in zip_longest(*drawn, fillvalue="")]
+
+
+def uncoloured(text: str) -> str:
+    """A line for a terminal without colours."""
+    for shade in HEAT:
+        text = text.replace(f"\033[38;5;{shade}m", "")
+    return text.replace(PLAIN, "")
+
+
+def _head(axis: int, axes: int) -> str:
+    return f"axis {axis + 1}{' (normal)' * (axis + 1 == axes)}" if axes > 1 else ""
+
+
+def _map(values: Map, head: str, full: float, cell: int, signs: str) -> list[str]:
+    """One axis: a shaded field for each taxel, with its count where it fits in."""
+    rows = ["".join(_field(value, full, cell, signs) for value in row) + PLAIN for row in values]
+    return [head.ljust(cell * len(values[0])), *rows] if head else rows
+
+
+def _field(value: float, full: float, cell: int, signs: str) -> str:
+    share = max(0.0, min(1.0, value / full))
+    text = f"{value:.0f}".center(cell) if cell >= 5 else signs[round(4 * share)] * cell
+    return f"\033[38;5;{HEAT[round(5 * share)]}m{text[:cell]}"

@@ -1,0 +1,250 @@
+"""Shows the running box in a terminal, for `palpate watch`. In: lines of its feed. Out: a picture that is drawn again and
+again; where the output is no terminal, a line for each event; or the feed's lines as they are.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import zip_longest
+from textwrap import wrap
+from typing import Any, TextIO
+
+import numpy as np
+
+from appliance.alignment.heat_map import Map, side_by_side, uncoloured
+from appliance.alignment.terminal import ASCII, BLOCKS, BOLD, PLAIN, LiveScreen
+from appliance.client.feed import Feed
+from appliance.core.clock import Clock
+from appliance.core.errors import FormatError
+from appliance.core.schema import typed
+from appliance.core.types import Status, SweepFormat
+from appliance.service import status
+
+FRAMES_HZ = 10.0
+DRAW_NS = 100_000_000
+"""Time between two pictures."""
+READ_S = 0.5
+"""Longest wait for a line; the ages of the verdicts go on then."""
+LATENCIES = 100
+"""Latest answers whose latency is summed up."""
+LABELS, BAR, NAME = 8, 12, 16
+"""Labels whose probabilities are shown; characters of a bar, and of a label."""
+_SEQUENCE = re.compile("\033\\[[0-9;]*m")
+
+
+class BoxState:
+    """What the feed has said so far. trouble: why there is no feed, "" where there is."""
+
+    def __init__(self) -> None:
+        self.trouble = ""
+        self.hello: dict[str, Any] = {}
+        self.health: dict[str, Any] = {}
+        self.verdicts: deque[dict[str, Any]] = deque(maxlen=status.VERDICTS)
+        self.load: tuple[Map, ...] = ()
+        self.full = 1.0
+        self.missed = 0
+        self._latencies_ms: deque[float] = deque(maxlen=LATENCIES)
+        self._lowest: Any = None
+
+    def take(self, line: Mapping[str, Any]) -> None:
+        """Take one line; one of an unknown type is for a later version. Raises FormatError for one that is not as
+        PROTOCOL.md has it."""
+        take = _TAKERS.get(line["type"])
+        if not take:
+            return
+        try:
+            take(self, line)
+        except (KeyError, TypeError, ValueError, AttributeError, FormatError) as e:
+            raise FormatError(f"the feed's line {line['type']} is not as it must be ({e!r}); update palpate") from e
+
+    def report(self) -> dict[str, Any]:
+        """The state as `status.lines` shows it."""
+        facts: dict[str, str] = {}
+        if self._latencies_ms:
+            values = sorted(self._latencies_ms)
+            facts["latency"] = (
+                f"{self._latencies_ms[-1]:.1f} ms; median {values[len(values) // 2]:.1f} ms, most {values[-1]:.1f} ms "
+                f"of {len(values)}"
+            )
+        if self.missed:
+            facts["feed"] = f"{self.missed:,} lines missed, since they were not read in time"
+        return {**self.health, **facts, "running": True, "verdicts": list(self.verdicts)}
+
+    @property
+    def headline(self) -> str:
+        """The state in a few words."""
+        if self.trouble or not self.health:
+            return f"NO FEED: {self.trouble or 'waiting for the box'}"
+        if self.health["sweeping"]:
+            return "SWEEPING"
+        return "READY" if self.health["ready"] else f"NOT READY: skin {self.health['skin']} {self.health['trouble']}"
+
+    def _take_hello(self, line: Mapping[str, Any]) -> None:
+        form = typed(SweepFormat, dict(line["format"]))
+        self.hello = {**line, "form": str(form), "labels": [str(label) for label in line["labels"]]}
+        self.load, self.full, self._lowest = (), 1.0, None
+
+    def _take_health(self, line: Mapping[str, Any]) -> None:
+        health = {name: value for name, value in line.items() if name != "type"}
+        status.lines({**health, "running": True, "verdicts": []}, 0)  # what cannot be shown is noticed here
+        self.health = health
+
+    def _take_state(self, line: Mapping[str, Any]) -> None:
+        self.health |= {name: line[name] for name in ("skin", "trouble", "sweeping", "ready")}
+
+    def _take_verdict(self, line: Mapping[str, Any]) -> None:
+        verdict = {**line, "status": Status(line["status"]), "scores": [float(p) for p in line["scores"]]}
+        status.verdict_line(verdict, 0)
+        self.verdicts.append(verdict)
+        if verdict["status"].classified:
+            self._latencies_ms.append(line["latency_ns"] / 1e6)
+
+    def _take_frame(self, line: Mapping[str, Any]) -> None:
+        counts = np.array(line["taxels"], np.float64)  # None becomes NaN
+        if counts.ndim not in (2, 3) or not counts.size:
+            raise ValueError(f"taxels of shape {counts.shape}")
+        counts = counts.reshape(*counts.shape[:2], -1)
+        self._lowest = counts if self._lowest is None else np.fmin(self._lowest, counts)
+        load = np.nan_to_num(counts - self._lowest)
+        self.full = max(self.full, float(load.max()))
+        self.load = tuple(np.moveaxis(load, -1, 0).tolist())
+
+    def _take_lost(self, line: Mapping[str, Any]) -> None:
+        self.missed += int(line["lines"])
+
+
+_TAKERS: Mapping[str, Callable[[BoxState, Mapping[str, Any]], None]] = {
+    "hello": BoxState._take_hello, "health": BoxState._take_health, "state": BoxState._take_state,
+    "verdict": BoxState._take_verdict, "frame": BoxState._take_frame, "lost": BoxState._take_lost,
+}  # fmt: skip
+
+
+class WatchScreen(LiveScreen[BoxState]):
+    """Shows the box."""
+
+    def _picture(self, view: BoxState, width: int, height: int) -> list[str]:
+        return picture(view, self._clock.now_ns(), width, height, colours=self._colours, signs=self._signs)
+
+    def _line(self, view: BoxState) -> str:
+        return view.headline
+
+
+def picture(
+    state: BoxState, now_ns: int, width: int, height: int, *, colours: bool, signs: str = BLOCKS
+) -> list[str]:  # fmt: skip
+    """The box as at most `height` lines of at most `width` characters. now_ns: of the clock that the box has."""
+    says = wrap(_plain(state.headline), max(10, width - 2))
+    head = [f" palpate watch   {_what(state)}"[:width], *(f" {BOLD}{text}{PLAIN}" for text in says), ""]
+    maps = [line for row in side_by_side(state.load, state.full, width // 2, signs) for line in row]
+    wide = max((len(_SEQUENCE.sub("", line)) for line in maps), default=0)
+    beside = list(probabilities(state, signs))
+    body = [
+        left + " " * (wide - len(_SEQUENCE.sub("", left))) + ("   " + right if right else "")
+        for left, right in zip_longest(maps, beside if wide + BAR + NAME + 15 <= width else [], fillvalue="")
+    ]
+    body = [line if colours else uncoloured(line) for line in body]
+    if not state.health:
+        return [*head, " Ctrl-C ends"]
+    words = [f" {line}"[:width] for line in status.lines(state.report(), now_ns)]
+    facts, verdicts = words[: len(words) - len(state.verdicts)], words[len(words) - len(state.verdicts) :]
+    body = body[: height - len(head) - 4]  # of a large skin the first rows, and below it skin and last answer
+    room = height - len(head) - len(body) - 2 * bool(body) - 1
+    most = room - min(len(verdicts), 3)
+    few = facts[:most] if most > 1 else facts[1:2]  # the skin, where there is room for one
+    return [*head, *body, *[""] * bool(body), *few, *verdicts[: room - len(few)], " Ctrl-C ends"]
+
+
+def _what(state: BoxState) -> str:
+    """Which box this is."""
+    if not state.hello:
+        return ""
+    simulated = {"usb": "", "replay": "REPLAYED   "}.get(state.hello["source"], "SIMULATED   ")
+    return _plain(f"{simulated}{state.hello['skin']} {state.hello['form']}   bundle {state.hello['bundle'] or 'none'}")
+
+
+def probabilities(state: BoxState, signs: str) -> Iterator[str]:
+    """The last classified verdict: its label, then all labels with their probabilities, the most probable first."""
+    last = next((v for v in reversed(state.verdicts) if v["status"].classified), None)
+    labels = state.hello.get("labels", [])
+    if last is None or len(last["scores"]) != len(labels):
+        return
+    ranked = sorted(zip(last["scores"], labels, strict=True), reverse=True)
+    full, empty = (signs[4], signs[1]) if signs != ASCII else ("#", ".")
+    for p, label in ranked[:LABELS]:
+        filled = round(BAR * max(0.0, min(1.0, p)))
+        yield f"{_plain(label)[:NAME]:<{NAME}} {full * filled}{empty * (BAR - filled)} {100 * p:5.1f} %"
+
+
+def events(state: BoxState, line: Mapping[str, Any], now_ns: int) -> Iterable[str]:
+    """What is printed for a line of the feed where there is no terminal: connections, verdicts, changes of the state."""
+    if line["type"] == "hello":
+        return [f"box {line['pid']}: {_what(state)}"]
+    if line["type"] == "verdict":
+        return [_plain(status.verdict_line(state.verdicts[-1], now_ns))]
+    if line["type"] == "state":
+        return [_plain(state.headline)]
+    if line["type"] == "lost":
+        return [f"{line['lines']} lines missed"]
+    return []
+
+
+def _plain(text: str) -> str:
+    """Text of a device or a file without what steers a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+class TerminalWatch:
+    """`palpate watch` in a terminal: reads the feed at `path` until it is told to stop, also over restarts of the box."""
+
+    def __init__(self, path: str, out: TextIO, clock: Clock) -> None:
+        self._screen = WatchScreen(out, clock)
+        self._feed = Feed(path, frames_hz=FRAMES_HZ if self._screen.live else 0, clock=clock)
+        self._out, self._clock, self._state = out, clock, BoxState()
+        self._next_ns = clock.now_ns()
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Show the box until `stopped()`."""
+        with self._feed, self._screen:
+            while not stopped():
+                self.step()
+
+    def step(self) -> None:
+        """Take the next line, and show what is new."""
+        line = self._feed.read(READ_S)
+        if line:
+            try:
+                self._state.take(line)
+            except FormatError as e:
+                self._feed.lose(str(e))
+                line = None
+        self._put_trouble("" if self._feed.connected else self._feed.trouble)
+        if not self._screen.live:
+            self._print(events(self._state, line, self._clock.now_ns()) if line else [])
+        elif (now_ns := self._clock.now_ns()) >= self._next_ns:
+            self._next_ns = now_ns + DRAW_NS
+            self._screen.show(self._state)
+
+    def _put_trouble(self, trouble: str) -> None:
+        if trouble == self._state.trouble:
+            return
+        self._state.trouble = trouble
+        if trouble and not self._screen.live:
+            self._print([_plain(self._state.headline)])
+
+    def _print(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self._out.write(line + "\n")
+            self._out.flush()
+
+
+def pass_on(path: str, out: TextIO, clock: Clock, stopped: Callable[[], bool], report: Callable[[str], None]) -> None:
+    """Write the feed's lines as they are, with frames at FRAMES_HZ, until `stopped()`. report: gets why there is none."""
+    with Feed(path, frames_hz=FRAMES_HZ, clock=clock) as feed:
+        while not stopped():
+            if line := feed.read(READ_S):
+                out.write(json.dumps(line) + "\n")
+                out.flush()
+            report("" if feed.connected else feed.trouble)
