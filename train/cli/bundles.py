@@ -203,6 +203,8 @@ def run_export(args: argparse.Namespace) -> None:
     what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"
     command = shlex.join(["palpate-train", "score", str(args.out), "--set", rest or "SET"])
     print(f"what it names of {what}: {command}")
+    page = shlex.join(["palpate-train", "report", str(args.out), "--set", rest or "SET", "--out", "report.html"])
+    print(f"a page about it, with what breaks it: {page}")
 
 
 def run_pack(args: argparse.Namespace) -> None:

@@ -18,7 +18,7 @@ GROUPS = {
     "bundles": ("fit", "export", "pack", "references", "score", "parity"),
     "signing": ("sign",),
     "choose": ("choose",),
-    "reports": ("paper", "chart", "development", "matrix", "overview", "bench-table"),
+    "reports": ("paper", "chart", "development", "matrix", "overview", "bench-table", "report"),
 }
 """The modules of this package and their commands: only the one that is wanted is imported, since that takes seconds."""
 

@@ -1,10 +1,12 @@
-"""The commands that write pages and plots: paper, chart, development, matrix, overview, bench-table."""
+"""The commands that write pages and plots: paper, chart, development, matrix, overview, bench-table, report."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from train.cli.options import Add
 from train.data import sets
 from train.reports import (
     bench_table,
+    bundle_experiment,
+    bundle_report,
     chart_report,
     development_experiment,
     development_report,
@@ -26,7 +30,7 @@ from train.reports import (
 
 
 def register(add: Add) -> None:
-    """paper, chart, development, matrix, overview, bench-table."""
+    """paper, chart, development, matrix, overview, bench-table, report."""
     paper = add("paper", run_paper, "run the paper's experiment on the simulated skin and write a page about it")
     paper.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
     paper.add_argument(
@@ -46,6 +50,13 @@ def register(add: Add) -> None:
     chart.add_argument("--draw", action="store_true", help="run nothing: draw the page of chart.json in --out again")
     chart.add_argument("--certainty", type=Path, action="append", default=[], metavar="FILE",
                      help="results.json of palpate-train certainty, for the touch time of its method")  # fmt: skip
+    report = add(
+        "report", run_report, "write a page about a bundle: what it answers to a set, what breaks it, what it costs"
+    )
+    report.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    options.add_set(report)
+    report.add_argument("--out", type=Path, required=True, metavar="FILE.html")
+    report.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     development = _add_development(add)
     for command in (paper, chart, development):
         options.add_effort(command)
@@ -91,6 +102,20 @@ def run_paper(args: argparse.Namespace) -> None:
         print(paper_experiment.draw(args.out))
         return
     print(paper_experiment.run(args.out, args.quick, options.where(args), options.Log(), options.effort(args)))
+
+
+def run_report(args: argparse.Namespace) -> None:
+    """Measure, write the page and print its path."""
+    for option in ("out", "json"):
+        if path := getattr(args, option):
+            options.writable_file(path, f"--{option}")
+    sweeps = options.load(args)
+    figures = bundle_experiment.run(args.bundle, sweeps, options.Log())
+    figures["command"] = shlex.join(["palpate-train", *sys.argv[1:]])
+    put(args.out, bundle_report.page(figures, sweeps).encode(), parents=True)
+    if args.json:
+        put(args.json, (json.dumps(figures, allow_nan=False) + "\n").encode())
+    print(args.out)
 
 
 def run_matrix(args: argparse.Namespace) -> None:

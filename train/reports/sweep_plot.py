@@ -96,7 +96,7 @@ def load(what: str, number: int | None = None) -> ShownSweep:
     if number is None or not 0 <= number < len(found):
         wanted = "" if number is None else f" and none of number {number}"
         raise FormatError(f"{what} holds {len(found)} sweeps{wanted}; choose one with --number, from 0 on")
-    return _recorded(found[number]) if isinstance(found, list) else _of_set(found, number)
+    return _recorded(found[number]) if isinstance(found, list) else of_set(found, number)
 
 
 def _recorded(one: RecordedSweep) -> ShownSweep:
@@ -126,7 +126,7 @@ def _recorded(one: RecordedSweep) -> ShownSweep:
     )  # fmt: skip
 
 
-def _of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
+def of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
     """A sweep of a set with its groups."""
     named = [
         labelled.materials[labelled.labels[number]],
@@ -158,8 +158,8 @@ def _plain(value: Any) -> str:
     return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def draw(sweep: ShownSweep) -> str:
-    """The picture."""
+def draw(sweep: ShownSweep, plain: bool = True) -> str:
+    """The picture. plain: with colours of its own, not those of a page."""
     figure = Figure((WIDE, HIGH))
     page = add_axes(figure, 0, 1, 1, 0)
     page.set(xlim=(0, WIDE), ylim=(HIGH, 0))
@@ -184,7 +184,7 @@ def draw(sweep: ShownSweep) -> str:
         if still := taxels.shape[1] - moving.shape[1]:
             text += f"; without {still} that stand still"
     _caption(page, SPECTRUM[0] - 0.13, text)
-    return to_svg(figure, f"one sweep: {_printable(sweep.title)}", plain=True)
+    return to_svg(figure, f"one sweep: {_printable(sweep.title)}", plain=plain)
 
 
 def _ends(inches: tuple[float, float]) -> tuple[float, float]:

@@ -1,0 +1,125 @@
+"""The report on a bundle: its figures are the box's answers, and the page holds all of them."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle
+from appliance.core.clock import SystemClock
+from appliance.inference.classifier import Classifier
+from tests.factories.page_reader import PageReader
+from train.cli.main import main
+from train.data import sets
+from train.data.sets import Dataset
+from train.evaluation.corruptions import EvaluationSweeps
+from train.export import bundle_score
+from train.reports import bundle_experiment, bundle_report
+
+NOTHING = lambda line: None  # noqa: E731
+
+
+@pytest.fixture(scope="module")
+def sweeps() -> Dataset:
+    """A few sweeps of each material that the packaged bundle has never seen."""
+    return sets.load("sim:T-REAL:1021:1", 1).select(["position<=3"])
+
+
+@pytest.fixture(scope="module")
+def figures(sweeps: Dataset) -> dict:
+    """Of the packaged bundle."""
+    return bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING) | {"command": "palpate-train report"}
+
+
+def test_the_figures_are_those_of_score(figures: dict, sweeps: Dataset, default_bundle: Bundle):
+    """Materials add up to what the box's classifier answers, and precision counts the sweeps of others."""
+    found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
+    assert figures["named_rightly"]["right"] == found.right.sum()
+    assert sum(row["sweeps"] for row in figures["materials"]) == len(sweeps)
+    assert round(sum(row["recall"][0] * row["sweeps"] for row in figures["materials"])) == found.right.sum()
+    assert figures["calibration"]["n"] == found.statuses["ok"] + found.statuses["unsure"]
+
+
+def test_a_material_that_others_are_taken_for_loses_precision(figures: dict, sweeps: Dataset, default_bundle: Bundle):
+    """Three sweeps of wood as metal, one refused: each stands where it belongs."""
+    found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
+    answered = {
+        "wood": Counter({"wood": 5, "metal": 3, "(unsure)": 1, "(unknown)": 1, "(dead-taxel)": 2}),
+        "metal": Counter({"metal": 9}),
+    }
+    mixed = replace(found, answered=answered, foreign={"felt": Counter({"metal": 6})})
+    wood, metal = (bundle_experiment.material(name, mixed) for name in ("wood", "metal"))
+    assert [wood[k] for k in ("sweeps", "unsure", "unknown", "refused", "taken_for")] == [12, 1, 1, 2, ["metal", 3]]
+    assert wood["recall"][0] == 5 / 12
+    assert wood["precision"][0] == 1
+    assert metal["precision"][0] == 9 / 18
+    assert (
+        bundle_experiment.material("metal", replace(mixed, answered={"metal": Counter({"(gap)": 2})}, foreign={}))[
+            "precision"
+        ]
+        == []
+    )
+
+
+def test_what_breaks_it_first_stands_on_top(figures: dict):
+    """The share of its range at which five points are lost rises; clean sweeps are the first of each."""
+    rows = figures["corruptions"]
+    reach = [np.inf if row["falls"] is None else row["falls"] / row["severities"][-1] for row in rows]
+    assert reach == sorted(reach)
+    assert len({row["right"][0] for row in rows}) == 1
+    assert all(r + w <= row["total"] for row in rows for r, w in zip(row["right"], row["wrong"], strict=True))
+    assert {"noise", "dead", "lost", "hum"} <= {row["name"] for row in rows}
+
+
+def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
+    """Headline, a row for each material and corruption; whole tags, no raw braces, nothing from elsewhere."""
+    reader = PageReader(bundle_report.page(figures, sweeps))
+    assert (reader.open, reader.wrong) == ([], [])
+    assert all(link.startswith(("#", "data:")) for link in reader.links)
+    assert f"Of {figures['named_rightly']['total']} sweeps of 6 materials" in reader.text
+    assert "All sweeps are simulated" in reader.text
+    assert not re.search(r"\{\{|\}\}|\{%", reader.text)
+    for row in (*figures["materials"], *figures["corruptions"]):
+        assert row["name"] in reader.text
+
+
+def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Dataset):
+    """The foreign one has its table; with more than twelve labels the matrix is left out."""
+    many = figures | {
+        "labels": [f"m{i}" for i in range(13)], "not_in_the_bundle": {"felt": {"(unknown)": 7, "wood": 1}},
+        "set": "mine.npz", "recordings": {"right": 3, "total": 4},
+    }  # fmt: skip
+    plain = PageReader(bundle_report.page(many, sweeps)).text
+    assert "felt 8 7" in plain
+    assert "materials by the labels that they get" not in plain
+    assert "Sweeps of one recording fused: 3 of 4 right" in plain
+    assert "simulated" not in plain.split("How it was made")[0]
+
+
+def test_windows_too_short_for_a_spectrogram_have_none(figures: dict, sweeps: Dataset):
+    """A skin of 28 Hz has 56 frames; its signals are shown all the same."""
+    short = replace(sweeps, samples=sweeps.samples[:, :40])
+    text = bundle_report.page(figures, short)
+    assert "Power of a sweep" not in text
+    assert text.count("raw counts over") == len(np.unique(sweeps.labels))
+
+
+@pytest.mark.slow
+def test_the_command_writes_page_and_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Both files; the target is checked before anything is measured."""
+    monkeypatch.setattr(EvaluationSweeps.of.__func__, "__defaults__", (12, 0))
+    named = ["report", str(bundle.DEFAULT), "--set", "sim:T-REAL:1021:1", "--only", "position<=2"]
+    assert main([*named, "--out", "/proc/none/report.html"]) != 0
+    assert "cannot be written" in capsys.readouterr().err
+    assert main([*named, "--out", str(tmp_path / "report.html"), "--json", str(tmp_path / "f.json")]) == 0
+    assert "<h2>What breaks it first</h2>" in (tmp_path / "report.html").read_text()
+    assert json.loads((tmp_path / "f.json").read_text())["bundle"]["name"] == "default"

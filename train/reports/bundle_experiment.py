@@ -1,0 +1,128 @@
+"""What a bundle answers to a set, and what it costs: the figures of the command `report`. In: a bundle's folder, labelled
+sweeps. Out: the figures as JSON.
+
+All of it comes from the box's classifier, so `unsure`, `unknown` and refused sweeps count as they do on the box.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.bundle import bundle
+from appliance.core.clock import SystemClock
+from appliance.core.types import Status
+from appliance.inference.classifier import Classifier
+from train.data.sets import Dataset
+from train.evaluation import uncertainty
+from train.evaluation.corruptions import EvaluationSweeps, applicable
+from train.evaluation.robustness import falls
+from train.export import bundle_score, measure
+from train.metrics.score import interval
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+Log = Callable[[str], None]
+NOT_NAMED = (f"({Status.UNSURE})", f"({Status.UNKNOWN})")
+"""Answers without a label that are no refusal, as BundleScore has them."""
+
+
+def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
+    """The figures. seed: of the corruptions. Raises FormatError where the set is not of the bundle's format or has none of
+    its materials, BundleError where the bundle does not load."""
+    loaded = bundle.load(folder)
+    classifier = Classifier(loaded, SystemClock())
+    m = loaded.manifest
+    found = bundle_score.score(classifier, sweeps)
+    log(f"{len(sweeps)} sweeps answered")
+    cost = measure.measure_all([folder], sweeps.samples)[0]
+    known = sweeps.take(np.isin(np.array(sweeps.materials)[sweeps.labels], m.labels))
+    return found.json() | {
+        "format": str(m.format), "labels": list(m.labels), "made": dict(m.made), "figures": dict(m.figures),
+        "fitted_to_this": m.made.get("set") == sweeps.source,
+        "materials": [material(name, found) for name in found.answered],
+        "calibration": calibration(classifier, known),
+        "cost": {"ms": cost.ms_p50, "ms_p99": cost.ms_p99, "kb": cost.bundle_kb, "mib": cost.rss_mib},
+        "corruptions": corruptions(classifier, EvaluationSweeps.of(known, seed=seed), log, seed),
+    }  # fmt: skip
+
+
+def material(name: str, found: bundle_score.BundleScore) -> Json:
+    """One material: its sweeps, how many of them are named rightly, not named or refused, and how many of those that get
+    its name are of it."""
+    given = found.answered[name]
+    others = sum(answers[name] for of, answers in (found.answered | found.foreign).items() if of != name)
+    unsure, unknown = (given[answer] for answer in NOT_NAMED)
+    refused = sum(n for answer, n in given.items() if answer.startswith("(")) - unsure - unknown
+    return {
+        "name": name, "sweeps": given.total(), "recall": _share(given[name], given.total()),
+        "precision": _share(given[name], given[name] + others), "unsure": unsure, "unknown": unknown, "refused": refused,
+        "taken_for": _commonest(given, name),
+    }  # fmt: skip
+
+
+def _commonest(given: Mapping[str, int], name: str) -> list[Any]:
+    """The wrong label that it gets most often and how often; empty where it gets none."""
+    wrong = Counter({answer: n for answer, n in given.items() if answer != name and not answer.startswith("(")})
+    return [*wrong.most_common(1)[0]] if wrong else []
+
+
+def _share(right: int, n: int) -> list[float]:
+    """A share with its 95 % interval; empty where there is nothing to count."""
+    return [right / n, *interval(np.arange(n) < right)] if n else []
+
+
+def calibration(classifier: Classifier, sweeps: Dataset) -> Json:
+    """How often the most probable label is right, by its probability; of answers with a label, `unsure` among them."""
+    said, right = [], []
+    for i, verdict in bundle_score.answers(classifier, sweeps):
+        if verdict.status.classified:
+            said.append(verdict.probability)
+            right.append(verdict.label == sweeps.materials[sweeps.labels[i]])
+    confidence, hit = np.array(said), np.array(right, bool)
+    return {
+        "n": len(said), "error": uncertainty.error(confidence, hit), "bins": uncertainty.reliability(confidence, hit)
+    }  # fmt: skip
+
+
+def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: int) -> list[Json]:
+    """How many of the sweeps the box names rightly and wrongly when one thing goes wrong, what breaks it first on top.
+
+    falls: the severity at which five points are lost; None where none is.
+    """
+    clean, rows = _named(classifier, test.sweeps), []
+    for corruption in applicable(test):
+        named = [clean]
+        for severity in corruption.severities[1:]:
+            samples = corruption.apply(test, severity, seed)
+            named.append(_named(classifier, replace(test.sweeps, samples=samples)))
+        right, wrong = zip(*named, strict=True)
+        accuracy = [n / len(test.sweeps) for n in right]
+        rows.append({
+            "name": corruption.name, "about": corruption.about, "unit": corruption.unit, "right": list(right),
+            "severities": list(corruption.severities), "wrong": list(wrong), "total": len(test.sweeps),
+            "falls": falls({"severities": corruption.severities, "accuracy": accuracy}),
+        })  # fmt: skip
+        log(f"{corruption.name}: {right[-1]} of {len(test.sweeps)} at {corruption.severities[-1]:g} {corruption.unit}")
+    return sorted(rows, key=lambda row: (_reach(row), row["right"][-1]))
+
+
+def _reach(row: Json) -> float:
+    """How far a corruption can grow until five points are lost, as a share of its largest severity."""
+    return float("inf") if row["falls"] is None else float(row["falls"] / row["severities"][-1])
+
+
+def _named(classifier: Classifier, sweeps: Dataset) -> tuple[int, int]:
+    """How many sweeps the box names rightly, and how many wrongly."""
+    right = wrong = 0
+    for i, verdict in bundle_score.answers(classifier, sweeps):
+        if verdict.status is Status.OK:
+            hit = verdict.label == sweeps.materials[sweeps.labels[i]]
+            right, wrong = right + hit, wrong + (not hit)
+    return right, wrong
