@@ -50,13 +50,7 @@ def register(add: Add) -> None:
     chart.add_argument("--draw", action="store_true", help="run nothing: draw the page of chart.json in --out again")
     chart.add_argument("--certainty", type=Path, action="append", default=[], metavar="FILE",
                      help="results.json of palpate-train certainty, for the touch time of its method")  # fmt: skip
-    report = add(
-        "report", run_report, "write a page about a bundle: what it answers to a set, what breaks it, what it costs"
-    )
-    report.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
-    options.add_set(report)
-    report.add_argument("--out", type=Path, required=True, metavar="FILE.html")
-    report.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    _add_report(add)
     development = _add_development(add)
     for command in (paper, chart, development):
         options.add_effort(command)
@@ -73,6 +67,16 @@ def register(add: Add) -> None:
     table = add("bench-table", run_bench_table, "write the figures of make bench into the tables of documents")
     table.add_argument("figures", type=Path, metavar="FILE", help="of palpate bench --json")
     table.add_argument("documents", type=Path, nargs="+", metavar="FILE.md", help="each with <!-- bench --> markers")
+
+
+def _add_report(add: Add) -> None:
+    report = add(
+        "report", run_report, "write a page about a bundle: what it answers to a set, what breaks it, what it costs"
+    )
+    report.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    options.add_set(report)
+    report.add_argument("--out", type=Path, required=True, metavar="FILE.html")
+    report.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
 
 
 def _add_development(add: Add) -> argparse.ArgumentParser:

@@ -250,7 +250,8 @@ def _rounded(samples: Array) -> Array:
     if not change:
         return samples
     step = 2.0 ** np.floor(np.log2(change / 2))
-    return (np.rint(samples / step) * step).astype(samples.dtype)
+    rounded: Array = (np.rint(samples / step) * step).astype(samples.dtype)
+    return rounded
 
 
 def _why(sweeps: Dataset, label: int) -> str:
