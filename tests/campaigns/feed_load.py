@@ -59,7 +59,7 @@ class Kind:
     seen: Counter[str] = field(default_factory=Counter)
 
 
-class Listener:
+class LatencyListener:
     """The robot's end of the line: how late each answer is, and what the box counts as lost."""
 
     def __init__(self, box: ThisMachine, sweeps: Script) -> None:
@@ -101,7 +101,7 @@ def measure(
         box, sweeps = ThisMachine(before, [f"feed.socket={path}"]), Script(seed)
         stack.callback(box.close)
         box.start(seed, sweeps)
-        listener = Listener(box, sweeps)
+        listener = LatencyListener(box, sweeps)
         listener.listen(30.0, Kind())  # the start, and the first sweeps
         rss_kib = box.process()[0]
         for turn in range(max(1, round(minutes * 60 / SLOT_S))):
@@ -112,7 +112,7 @@ def measure(
     return kinds, rss_kib, dict(box.about())
 
 
-def _slot(name: str, path: Path, box: ThisMachine, listener: Listener, kind: Kind) -> None:
+def _slot(name: str, path: Path, box: ThisMachine, listener: LatencyListener, kind: Kind) -> None:
     """One turn of a kind: readers come, the box is watched, they go."""
     command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(path), name]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as readers:
