@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from train.export import measure, model_forms
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
 from train.reports.chart_report import kept_folder
+from train.reports.development_experiment import OURS
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -29,8 +31,9 @@ SET = "sim:T-REAL:1"
 """What all methods are trained on to be timed: sweeps of the packaged bundle's format."""
 ROUNDS = 10
 """Of timing: the slowest methods take a hundred times as long as those of the chart."""
-EVERY = 5
-"""What runs in a library is trained on every fifth sweep: what it has learnt makes it neither slower nor quicker."""
+EVERY, SHARE = 5, 0.25
+"""A peer of a library is trained on every fifth sweep, a network of a peer for a quarter of its iterations: what it has learnt
+makes it neither slower nor quicker. Ours choose their size, so they are trained as always."""
 
 
 def measured(
@@ -45,7 +48,7 @@ def measured(
     calls: dict[str, measure.Call] = {}
     left_out: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as work:
-        for method in methods.find(names, effort):
+        for method in [_briefly(name, effort) for name in names]:
             log(f"{method.name} is trained for its time")
             try:
                 for entry, call in _callable(method, sweeps, seed, cache or Path(work)):
@@ -59,6 +62,11 @@ def measured(
     for entry, times in zip(entries, took.values(), strict=True):
         entry |= {f"ms_p{q}": round(float(np.percentile(times, q)), 4) for q in (50, 99)}
     return {"set": sweeps.source, "format": str(sweeps.format), "entries": entries, "left_out": left_out}
+
+
+def _briefly(name: str, effort: Effort) -> Method:
+    """The method, with SHARE of the iterations where it is a peer."""
+    return methods.find([name], effort if name in OURS else replace(effort, share=SHARE * effort.share))[0]
 
 
 def _callable(method: Method, sweeps: Dataset, seed: int, cache: Path) -> list[tuple[Json, measure.Call]]:

@@ -255,6 +255,12 @@ def test_times_are_told_in_those_of_minirocket():
     assert development_report.relative_times(times[2:], names) == {}
 
 
+def test_networks_of_peers_are_trained_briefly_for_their_time():
+    """Ours are not: what they choose decides how fast they are."""
+    brief, whole = (development_times._briefly(name, methods.FULL_EFFORT).effort for name in ("ds-cnn", "compact-50k"))
+    assert (brief, whole) == ("200 iterations", methods.every()["compact-50k"].effort)
+
+
 @pytest.mark.slow
 def test_all_methods_are_timed_in_one_run(tmp_path: Path):
     """A bundle by the box's classifier, in int8 too, a method of aeon in aeon; one that cannot take the sweeps is left out, with why."""
@@ -264,7 +270,7 @@ def test_all_methods_are_timed_in_one_run(tmp_path: Path):
         1,
         tmp_path,
         lambda line: None,
-        methods.Effort(0.1),
+        methods.Effort(0.4),
         2,
     )
     assert [(one["method"], one["form"], one["precision"], one["runtime"], one["runs_on_box"]) for one in found["entries"]] == [
