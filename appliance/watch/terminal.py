@@ -35,7 +35,7 @@ LABELS, BAR, NAME = 8, 12, 16
 _SEQUENCE = re.compile("\033\\[[0-9;]*m")
 
 
-class BoxState:
+class WatchedBox:
     """What the feed has said so far. trouble: why there is no feed, "" where there is."""
 
     def __init__(self) -> None:
@@ -116,24 +116,24 @@ class BoxState:
         self.missed += int(line["lines"])
 
 
-_TAKERS: Mapping[str, Callable[[BoxState, Mapping[str, Any]], None]] = {
-    "hello": BoxState._take_hello, "health": BoxState._take_health, "state": BoxState._take_state,
-    "verdict": BoxState._take_verdict, "frame": BoxState._take_frame, "lost": BoxState._take_lost,
+_TAKERS: Mapping[str, Callable[[WatchedBox, Mapping[str, Any]], None]] = {
+    "hello": WatchedBox._take_hello, "health": WatchedBox._take_health, "state": WatchedBox._take_state,
+    "verdict": WatchedBox._take_verdict, "frame": WatchedBox._take_frame, "lost": WatchedBox._take_lost,
 }  # fmt: skip
 
 
-class WatchScreen(LiveScreen[BoxState]):
+class WatchScreen(LiveScreen[WatchedBox]):
     """Shows the box."""
 
-    def _picture(self, view: BoxState, width: int, height: int) -> list[str]:
+    def _picture(self, view: WatchedBox, width: int, height: int) -> list[str]:
         return picture(view, self._clock.now_ns(), width, height, colours=self._colours, signs=self._signs)
 
-    def _line(self, view: BoxState) -> str:
+    def _line(self, view: WatchedBox) -> str:
         return view.headline
 
 
 def picture(
-    state: BoxState, now_ns: int, width: int, height: int, *, colours: bool, signs: str = BLOCKS
+    state: WatchedBox, now_ns: int, width: int, height: int, *, colours: bool, signs: str = BLOCKS
 ) -> list[str]:  # fmt: skip
     """The box as at most `height` lines of at most `width` characters. now_ns: of the clock that the box has."""
     says = wrap(_plain(state.headline), max(10, width - 2))
@@ -157,7 +157,7 @@ def picture(
     return [*head, *body, *[""] * bool(body), *few, *verdicts[: room - len(few)], " Ctrl-C ends"]
 
 
-def _what(state: BoxState) -> str:
+def _what(state: WatchedBox) -> str:
     """Which box this is."""
     if not state.hello:
         return ""
@@ -165,7 +165,7 @@ def _what(state: BoxState) -> str:
     return _plain(f"{simulated}{state.hello['skin']} {state.hello['form']}   bundle {state.hello['bundle'] or 'none'}")
 
 
-def probabilities(state: BoxState, signs: str) -> Iterator[str]:
+def probabilities(state: WatchedBox, signs: str) -> Iterator[str]:
     """The last classified verdict: its label, then all labels with their probabilities, the most probable first."""
     last = next((v for v in reversed(state.verdicts) if v["status"].classified), None)
     labels = state.hello.get("labels", [])
@@ -178,7 +178,7 @@ def probabilities(state: BoxState, signs: str) -> Iterator[str]:
         yield f"{_plain(label)[:NAME]:<{NAME}} {full * filled}{empty * (BAR - filled)} {100 * p:5.1f} %"
 
 
-def events(state: BoxState, line: Mapping[str, Any], now_ns: int) -> Iterable[str]:
+def events(state: WatchedBox, line: Mapping[str, Any], now_ns: int) -> Iterable[str]:
     """What is printed for a line of the feed where there is no terminal: connections, verdicts, changes of the state."""
     if line["type"] == "hello":
         return [f"box {line['pid']}: {_what(state)}"]
@@ -202,7 +202,7 @@ class TerminalWatch:
     def __init__(self, path: str, out: TextIO, clock: Clock) -> None:
         self._screen = WatchScreen(out, clock)
         self._feed = Feed(path, frames_hz=FRAMES_HZ if self._screen.live else 0, clock=clock)
-        self._out, self._clock, self._state = out, clock, BoxState()
+        self._out, self._clock, self._state = out, clock, WatchedBox()
         self._next_ns = clock.now_ns()
 
     def run(self, stopped: Callable[[], bool]) -> None:
