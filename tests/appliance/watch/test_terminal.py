@@ -21,7 +21,7 @@ from appliance.core.types import Status, SweepFormat
 from appliance.service.feed import encode
 from appliance.sim import skin
 from appliance.watch import terminal
-from appliance.watch.terminal import BoxState, TerminalWatch, events, pass_on, picture
+from appliance.watch.terminal import WatchedBox, TerminalWatch, events, pass_on, picture
 from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, frames
 from tests.factories.simulated_box import SECOND
 
@@ -42,9 +42,9 @@ def lines_of(folder: Path, fmt: SweepFormat = skin.FORMAT, **facts: str) -> list
     return lines
 
 
-def state_of(lines: list[dict[str, Any]]) -> BoxState:
+def state_of(lines: list[dict[str, Any]]) -> WatchedBox:
     """The state after these lines."""
-    state = BoxState()
+    state = WatchedBox()
     for line in lines:
         state.take(line)
     return state
@@ -55,7 +55,7 @@ def plain(text: str) -> str:
     return re.sub(r"\033\[[0-9;]*m", "", text)
 
 
-def drawn(state: BoxState, width: int = 80, height: int = 24, **more: Any) -> list[str]:
+def drawn(state: WatchedBox, width: int = 80, height: int = 24, **more: Any) -> list[str]:
     """The picture of a state, without control sequences."""
     return [plain(line) for line in picture(state, 5 * SECOND, width, height, colours=True, **more)]
 
