@@ -21,7 +21,7 @@ from appliance.core.types import Status, SweepFormat
 from appliance.service.feed import encode
 from appliance.sim import skin
 from appliance.watch import terminal
-from appliance.watch.terminal import WatchedBox, TerminalWatch, events, pass_on, picture
+from appliance.watch.terminal import TerminalWatch, WatchedBox, events, pass_on, picture
 from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, frames
 from tests.factories.simulated_box import SECOND
 
