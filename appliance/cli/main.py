@@ -16,6 +16,7 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from appliance.bridges import options as bridges
 from appliance.cli import bundle_commands, commands, skin_commands, watch_commands
 from appliance.cli.commands import OpenDevices, load_bundle, load_settings, stop_flag
 from appliance.cli.parser import parser
@@ -132,13 +133,20 @@ def run_bench(args: argparse.Namespace) -> int:
     return 0
 
 
+def _run_bridge(name: str, args: argparse.Namespace) -> int:
+    """`palpate bridge NAME`: see appliance/bridges."""
+    from appliance.bridges import command
+
+    return command.RUNS[name](args)
+
+
 def _on_lines(settings: Config) -> Config:
     """The settings with the trigger on lines, which the simulated robot drives."""
     return replace(settings, trigger=replace(settings.trigger, mode="two-lines"))
 
 
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
-    "demo": run_demo, "bench": run_bench, **commands.RUNS, **bundle_commands.RUNS, **skin_commands.RUNS,
-    **watch_commands.RUNS,
+    "demo": run_demo, "bench": run_bench, **{f"bridge {name}": partial(_run_bridge, name) for name in bridges.TEXTS},
+    **commands.RUNS, **bundle_commands.RUNS, **skin_commands.RUNS, **watch_commands.RUNS,
     **{name: partial(_with_devices, run) for name, run in {**commands.WITH_DEVICES, **skin_commands.WITH_DEVICES}.items()},
 }  # fmt: skip

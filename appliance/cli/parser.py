@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from appliance import __version__
+from appliance.bridges import options as bridges
 from appliance.core.config import TriggerConfig
 
 EXIT_CODES = """exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong arguments; 65 a file of
@@ -85,6 +86,17 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
     about = "the skin by itself, without a bundle"
     skin = commands.add_parser("skin", help=about, description=about).add_subparsers(required=True, metavar="COMMAND")
     _skin_commands(partial(add, group=skin), devices)
+    about = "what other machines in the cell speak, beside the service"
+    bridge = commands.add_parser("bridge", help=about, description=about).add_subparsers(
+        required=True, metavar="BRIDGE"
+    )
+
+    def add_bridge(name: str, text: str) -> argparse.ArgumentParser:
+        command = bridge.add_parser(name, help=text, description=text, epilog=EXIT_CODES)
+        command.set_defaults(run=runs[f"bridge {name}"])
+        return command
+
+    bridges.add_arguments(add_bridge)
     return parser
 
 

@@ -100,7 +100,7 @@ class Palpate:
                     self.forget()
                     return state
                 why = f"a sweep is open (skin {state.skin})" if state.sweeping else f"the skin is {state.skin}"
-            except (LinkLost, NoAnswer) as e:
+            except (LinkLost, NoAnswer, CommandRefused) as e:  # a bridge refuses while its own line is gone
                 why = str(e)
             with self._news:
                 self._news.wait(min(POLL_S, max(0.0, self._left_s(end_ns))))

@@ -21,9 +21,9 @@ IDENTITY = ("mine", "2", "9f3c2a1b", "4x4 uint8 at 750 Hz  window 1500", "skin-4
 Script = Callable[[Sentence], Iterable[bytes]]
 
 
-def state(skin: str = "streaming", answered: int = 0, *, sweeping: int = 0) -> bytes:
+def state(skin: str = "streaming", answered: int = 0, *, sweeping: int = 0, bundle: str = "9f3c2a1b") -> bytes:
     """An STA sentence."""
-    return sentence("STA", "9.000", skin, sweeping, answered, *STREAMING[4:])
+    return sentence("STA", "9.000", skin, sweeping, answered, *STREAMING[4:9], bundle, "sim")
 
 
 def result(sweep: int, status: str = "ok", label: str = "wood", share: str = "1.00", detail: str = "") -> bytes:

@@ -1,0 +1,116 @@
+"""`palpate bridge tcp|modbus|ros`: options, and what each starts. In: arguments. Out: an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from ipaddress import ip_address
+from typing import Any
+
+from appliance.bridges.options import add_arguments
+from appliance.bridges.server import Server, address, stop_event, until
+from appliance.bridges.source import FeedSource, LineSource, LinkPort, Source
+from appliance.client.line import open_port
+from appliance.core.clock import SystemClock
+from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.log import log, to_stderr
+
+EVERY_S = 1.0
+
+
+def _source(args: argparse.Namespace) -> Source:
+    if getattr(args, "feed", None):
+        return FeedSource(args.feed)
+    return LineSource(*_port(args), baud=args.baud)
+
+
+def _port(args: argparse.Namespace) -> tuple[str, Callable[[], Any]]:
+    """Name and opener of the box's line."""
+    if args.link:
+        link = LinkPort(args.link)  # at once, so that a path that cannot be is told at once
+        return str(args.link), lambda: link
+    return args.port, partial(open_port, args.port, args.baud)
+
+
+def run_modbus(args: argparse.Namespace) -> int:
+    """`palpate bridge modbus`, until SIGTERM."""
+    from appliance.bridges.modbus import ModbusBridge
+
+    host, port = address(args.listen)
+
+    async def serve() -> None:
+        stop = stop_event()
+        source = _source(args)
+        try:
+            server = Server(ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most)
+            await server.open(host, port)
+            _say("modbus", server, source.name, args)
+            await until(stop, EVERY_S, partial(asyncio.to_thread, source.refresh))
+        finally:
+            source.close()
+
+    asyncio.run(serve())
+    return 0
+
+
+def run_tcp(args: argparse.Namespace) -> int:
+    """`palpate bridge tcp`, until SIGTERM."""
+    from appliance.bridges.tcp import TcpBridge
+
+    host, port = address(args.listen)
+
+    async def serve() -> None:
+        stop = stop_event()
+        name, opener = _port(args)
+        bridge = TcpBridge(name, opener, writes=args.allow_writes, most=args.most, loop=asyncio.get_running_loop())
+        try:
+            await bridge.server.open(host, port)
+            _say("tcp", bridge.server, name, args)
+            await until(stop, EVERY_S, partial(asyncio.sleep, 0))
+        finally:
+            bridge.close()
+
+    asyncio.run(serve())
+    return 0
+
+
+def run_ros(args: argparse.Namespace) -> int:
+    """`palpate bridge ros`, until SIGTERM. Raises ConfigError where ROS 2 is not installed."""
+    try:
+        from appliance.bridges import ros
+    except ImportError as e:
+        raise ConfigError(
+            f"ROS 2 is not there ({e}); source its setup.bash, or install the wheels: pip install 'palpate[ros]'"
+        ) from e
+    ros.run(args.ros_args)
+    return 0
+
+
+RUNS = {"tcp": run_tcp, "modbus": run_modbus, "ros": run_ros}
+
+
+def _say(kind: str, server: Server, box: str, args: argparse.Namespace) -> None:
+    host, port = server.address
+    commands = "commands are passed on" if args.allow_writes else "commands are refused (--allow-writes)"
+    log.info(f"{kind}: listening on {host}:{port}, box at {box}; {commands}")
+    if args.allow_writes and not ip_address(host).is_loopback:
+        log.warning(f"{kind}: whoever reaches {host}:{port} can command the box: keep it in the network of the cell")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """`python -m appliance.bridges`."""
+    parser = argparse.ArgumentParser("python -m appliance.bridges", description="Bridges from a Palpate box.")
+    commands = parser.add_subparsers(required=True, metavar="BRIDGE", dest="bridge")
+    add_arguments(lambda name, text: commands.add_parser(name, help=text, description=text))
+    args = parser.parse_args(argv)
+    to_stderr()
+    try:
+        return RUNS[args.bridge](args)
+    except ApplianceError as e:
+        print(f"palpate: {e}", file=sys.stderr)
+        return e.exit_code
+    except KeyboardInterrupt:
+        return 130

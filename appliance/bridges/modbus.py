@@ -1,0 +1,171 @@
+"""The box as a Modbus TCP server. In: a Source. Out: registers, inputs and coils (docs/robots/modbus.md).
+
+All registers that one request reads are of one moment. A coil is a command: it acts when it rises.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from appliance.bridges import modbus_pdu as pdu
+from appliance.bridges.modbus_pdu import Fault, Reading, Refused, Request, Writing
+from appliance.bridges.server import Peer
+from appliance.bridges.source import Source, View
+from appliance.core.clock import Clock
+from appliance.core.errors import ApplianceError, FormatError
+from appliance.core.log import log
+from appliance.core.status import Status
+
+VERSION = 1
+"""Of the map: it grows at the end; what is there keeps its meaning."""
+STATES = ("streaming", "absent", "busy", "denied", "mismatch", "silent", "lost")
+"""States of the skin; the code is the place, counted from 1. 0: the box is not heard."""
+STATUS_CODES: Mapping[Status, int] = {status: code for code, status in enumerate(Status, 1)}
+STALE = 99
+"""In place of a status while the box is not heard."""
+COILS = ("START", "STOP", "NEW", "TARE", "ABORT")
+INPUTS = ("alive", "ready", "sweeping", "fault", "known", "early")
+LABEL_WORDS = 16
+IDLE_S = 60.0
+"""A connection without a request for this long is closed."""
+REQUEST_S = 5.0
+"""Longest time for the rest of a request, and for a peer to take a reply."""
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """An entry of the map. words: registers that it takes, the highest first. get: its value."""
+
+    name: str
+    get: Callable[[View], int]
+    words: int = 1
+
+
+def _of_answer(get: Callable[[View], float]) -> Callable[[View], int]:
+    return lambda view: round(get(view)) if view.answer else 0
+
+
+def _of_state(name: str) -> Callable[[View], int]:
+    return lambda view: getattr(view.state, name) if view.state else 0
+
+
+def _state_code(view: View) -> int:
+    skin = view.state.skin if view.state else ""
+    return STATES.index(skin) + 1 if skin in STATES else 0
+
+
+REGISTERS = (
+    Register("map version", lambda view: VERSION),
+    Register("heartbeat", lambda view: view.beats),
+    Register("state of the skin", _state_code),
+    Register("answers", lambda view: view.answers),
+    Register("status", lambda view: STATUS_CODES[view.answer.status] if view.answer else 0),
+    Register("label code", lambda view: view.code(view.answer.label) if view.answer and view.answer.known else 0),
+    Register("likeliest label code", lambda view: view.code(view.answer.label) if view.answer else 0),
+    Register("probability", _of_answer(lambda view: 1000 * view.answer.probability)),  # type: ignore[union-attr]
+    Register("margin", _of_answer(lambda view: 1000 * view.answer.margin)),  # type: ignore[union-attr]
+    Register("latency", _of_answer(lambda view: 100 * view.answer.latency_ms)),  # type: ignore[union-attr]
+    Register("early", _of_answer(lambda view: view.answer.early)),  # type: ignore[union-attr]
+    Register("fused", _of_answer(lambda view: view.answer.fused)),  # type: ignore[union-attr]
+    Register("lost in the window", _of_answer(lambda view: view.answer.lost)),  # type: ignore[union-attr]
+    Register("sweep", _of_answer(lambda view: view.answer.sweep), 2),  # type: ignore[union-attr]
+    Register("answered", _of_state("answered"), 2),
+    Register("frames", _of_state("frames"), 2),
+    Register("lost frames", _of_state("lost_frames"), 2),
+    Register("missed answers", lambda view: view.missed),
+    Register("damaged sentences", lambda view: view.damaged),
+    Register("labels", lambda view: len(view.labels)),
+)
+ADDRESSES: Mapping[str, int] = {
+    register.name: sum(before.words for before in REGISTERS[:i]) for i, register in enumerate(REGISTERS)
+} | {"label": sum(register.words for register in REGISTERS)}
+"""Address of the first word of each entry; the label's text comes last."""
+COUNTERS = {"heartbeat", "answers", "sweep", "answered", "frames", "lost frames", "missed answers", "damaged sentences"}
+"""These wrap; anything else stays at the largest number that fits."""
+
+
+def registers(view: View, *, alive: bool) -> list[int]:
+    """The words of all registers. alive: the box was heard lately."""
+    words: list[int] = []
+    for register in REGISTERS:
+        value, top = register.get(view), 1 << 16 * register.words
+        value = value % top if register.name in COUNTERS else min(value, top - 1)
+        words += [value >> 16 * i & 0xFFFF for i in reversed(range(register.words))]
+    if not alive:
+        words[ADDRESSES["state of the skin"]] = 0
+        words[ADDRESSES["status"]] = STALE
+        words[ADDRESSES["label code"]] = 0
+    text = (view.answer.label if view.answer else "").encode("ascii", "replace")[: 2 * LABEL_WORDS]
+    text = text.ljust(2 * LABEL_WORDS, b"\0")
+    return words + [text[i] << 8 | text[i + 1] for i in range(0, len(text), 2)]
+
+
+def inputs(view: View, *, alive: bool) -> list[bool]:
+    """The discrete inputs, in the order of INPUTS."""
+    state, answer = view.state, view.answer
+    if not (alive and state):
+        return [False, False, False, True, False, False]
+    known, early = (answer.known, answer.early) if answer else (False, False)
+    return [True, state.ready, state.sweeping, state.skin != "streaming", known, early]
+
+
+class ModbusBridge:
+    """Serves connections. writes: whether coils may be written. One command is under way at a time."""
+
+    def __init__(self, source: Source, clock: Clock, *, writes: bool) -> None:
+        self._source, self._clock, self._writes = source, clock, writes
+        self._commanding = asyncio.Lock()
+
+    async def serve(self, peer: Peer) -> None:
+        """Answer the requests of one connection until it ends, hangs, or sends something else."""
+        coils = [False] * len(COILS)
+        rest = b""
+        while data := await peer.read(REQUEST_S if rest else IDLE_S):
+            try:
+                found, rest = pdu.requests(data, rest)
+            except FormatError:
+                return
+            for request in found:
+                peer.write(pdu.reply(request, await self.answer(request, coils)))
+            await peer.flush(REQUEST_S)
+
+    async def answer(self, request: Request, coils: list[bool]) -> bytes:
+        """The reply's function and data. coils: as this connection has left them."""
+        try:
+            wanted = pdu.parse(request.pdu)
+            if isinstance(wanted, Reading):
+                return pdu.read(wanted, self._values(wanted.function, coils))
+            await self._write(wanted, coils)
+            return pdu.written(request.pdu)
+        except Refused as e:
+            return pdu.refusal(request.pdu, e.fault)
+
+    def _values(self, function: int, coils: Sequence[bool]) -> Sequence[int]:
+        if function == pdu.READ_COILS:
+            return coils
+        view = self._source.view()
+        alive = view.alive(self._clock.now_ns())
+        return inputs(view, alive=alive) if function == pdu.READ_INPUTS else registers(view, alive=alive)
+
+    async def _write(self, wanted: Writing, coils: list[bool]) -> None:
+        if not self._writes:
+            raise Refused(Fault.FUNCTION)
+        end = wanted.address + len(wanted.values)
+        if end > len(coils):
+            raise Refused(Fault.ADDRESS)
+        for at, value in zip(range(wanted.address, end), wanted.values, strict=True):
+            rises, coils[at] = value and not coils[at], value
+            if rises:
+                await self._command(COILS[at])
+
+    async def _command(self, name: str) -> None:
+        if self._commanding.locked():
+            raise Refused(Fault.BUSY)
+        async with self._commanding:
+            try:
+                await asyncio.to_thread(self._source.send, name)
+            except ApplianceError as e:
+                log.warning(f"modbus: {name}: {e}")
+                raise Refused(Fault.DEVICE) from e

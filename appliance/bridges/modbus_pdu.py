@@ -1,0 +1,140 @@
+"""Modbus TCP as bytes (Modbus Application Protocol V1.1b3; Modbus Messaging on TCP/IP V1.0b). Pure functions.
+
+In: bytes of a connection. Out: requests, and replies to them.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from appliance.core.errors import FormatError
+
+HEADER = struct.Struct(">HHHB")
+"""Transaction, protocol (0), bytes that follow, unit."""
+MOST_PDU = 253
+READ_COILS, READ_INPUTS, READ_HOLDING, READ_REGISTERS, WRITE_COIL, WRITE_COILS = 1, 2, 3, 4, 5, 15
+MOST_BITS, MOST_REGISTERS, MOST_COILS = 2000, 125, 1968
+ON, OFF = 0xFF00, 0x0000
+
+
+class Fault(IntEnum):
+    """Exception codes."""
+
+    FUNCTION = 1
+    ADDRESS = 2
+    VALUE = 3
+    DEVICE = 4
+    BUSY = 6
+
+
+class Refused(Exception):
+    """A request is answered with an exception code; no error of the program."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__(fault.name)
+        self.fault = fault
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One request. pdu: function code and data."""
+
+    transaction: int
+    unit: int
+    pdu: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Bits or registers that are asked for."""
+
+    function: int
+    address: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Writing:
+    """Coils that are written, from `address` on."""
+
+    function: int
+    address: int
+    values: tuple[bool, ...]
+
+
+def requests(data: bytes, rest: bytes = b"") -> tuple[list[Request], bytes]:
+    """The requests in `data`, which continues `rest`, and the new unfinished rest.
+
+    Raises FormatError for what is not Modbus TCP: where the next request would begin is then unknown.
+    """
+    data, found = rest + data, []
+    while len(data) >= HEADER.size:
+        transaction, protocol, length, unit = HEADER.unpack_from(data)
+        if protocol or not 2 <= length <= MOST_PDU + 1:
+            raise FormatError(f"{data[: HEADER.size].hex()} is no header of Modbus TCP")
+        end = HEADER.size + length - 1
+        if len(data) < end:
+            break
+        found.append(Request(transaction, unit, data[HEADER.size : end]))
+        data = data[end:]
+    return found, data
+
+
+def reply(request: Request, pdu: bytes) -> bytes:
+    """The bytes that answer a request."""
+    return HEADER.pack(request.transaction, 0, len(pdu) + 1, request.unit) + pdu
+
+
+def refusal(pdu: bytes, fault: Fault) -> bytes:
+    """The reply with an exception code."""
+    return bytes([pdu[0] | 0x80, fault])
+
+
+def parse(pdu: bytes) -> Reading | Writing:
+    """What a request wants. Raises Refused: FUNCTION for one that is not served, VALUE for a wrong length or number."""
+    function, data = pdu[0], pdu[1:]
+    if function in (READ_COILS, READ_INPUTS, READ_HOLDING, READ_REGISTERS):
+        address, count = _pair(data)
+        if len(data) != 4 or not 1 <= count <= (MOST_BITS if function <= READ_INPUTS else MOST_REGISTERS):
+            raise Refused(Fault.VALUE)
+        return Reading(function, address, count)
+    if function == WRITE_COIL:
+        address, value = _pair(data)
+        if len(data) != 4 or value not in (ON, OFF):
+            raise Refused(Fault.VALUE)
+        return Writing(function, address, (value == ON,))
+    if function == WRITE_COILS:
+        address, count = _pair(data)
+        packed = data[5:]
+        if not 1 <= count <= MOST_COILS or data[4:5] != bytes([len(packed)]) or len(packed) != -(-count // 8):
+            raise Refused(Fault.VALUE)
+        return Writing(function, address, tuple(bool(packed[i // 8] >> i % 8 & 1) for i in range(count)))
+    raise Refused(Fault.FUNCTION)
+
+
+def _pair(data: bytes) -> tuple[int, int]:
+    if len(data) < 4:
+        raise Refused(Fault.VALUE)
+    first, second = struct.unpack_from(">HH", data)
+    return first, second
+
+
+def read(wanted: Reading, values: Sequence[int]) -> bytes:
+    """The reply to a reading of these bits or registers. Raises Refused where it reaches beyond them."""
+    chosen = values[wanted.address : wanted.address + wanted.count]
+    if len(chosen) < wanted.count:
+        raise Refused(Fault.ADDRESS)
+    if wanted.function <= READ_INPUTS:
+        packed = bytearray(-(-wanted.count // 8))
+        for i, value in enumerate(chosen):
+            packed[i // 8] |= bool(value) << i % 8
+        return bytes([wanted.function, len(packed)]) + packed
+    return bytes([wanted.function, 2 * wanted.count]) + struct.pack(f">{wanted.count}H", *chosen)
+
+
+def written(pdu: bytes) -> bytes:
+    """The reply to a writing that was carried out: function, address, and value or count."""
+    return pdu[:5]

@@ -1,0 +1,244 @@
+"""The box as a ROS 2 node, with a lifecycle. In: its serial line or its feed, parameters. Out: verdicts, state, frames,
+diagnostics and services (docs/robots/ros2.md), in messages that every ROS 2 has.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from struct import pack
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
+
+from appliance.bridges.source import FeedSource, LineSource, Source, View
+from appliance.client.answers import Answer
+from appliance.client.box import BAUD, Heard
+from appliance.core.clock import SystemClock
+from appliance.core.errors import ApplianceError
+
+SERVICES = {"start": "START", "stop": "STOP", "new_object": "NEW", "tare": "TARE", "abort": "ABORT"}
+ENCODINGS = {
+    "uint8": ("8UC", "B", 1),
+    "int16": ("16SC", "h", 2),
+    "uint16": ("16UC", "H", 2),
+    "float32": ("32FC", "f", 4),
+}
+"""Of sensor_msgs/Image: encoding, type of struct and bytes of a raw count, by data type."""
+PARAMETERS: Mapping[str, Any] = {
+    "port": "", "feed": "", "baud": BAUD, "frame_id": "palpate", "frames_hz": 0.0, "autostart": True,
+}  # fmt: skip
+RELIABLE = QoSProfile(depth=50)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""A subscriber that comes later gets the last state, too."""
+
+
+def values(fields: Mapping[str, Any]) -> list[KeyValue]:
+    """Fields as texts: true and false in lower case, numbers as Python writes them."""
+    return [KeyValue(key=name, value=str(v).lower() if isinstance(v, bool) else str(v)) for name, v in fields.items()]
+
+
+def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
+    """An answer: OK with the label, WARN if the label cannot be used, ERROR if nothing was learned of the object."""
+    level = DiagnosticStatus.ERROR if answer.faulty else DiagnosticStatus.WARN
+    fields = asdict(answer) | {"early": answer.early, "known": answer.known, "unsure": answer.unsure, "code": code}
+    return DiagnosticStatus(
+        level=DiagnosticStatus.OK if answer.known else level, name="palpate: verdict", hardware_id=answer.bundle,
+        message=answer.label if answer.known else f"{answer.status}: {answer.what_to_do}", values=values(fields),
+    )  # fmt: skip
+
+
+def box_status(view: View, before: View, *, alive: bool) -> DiagnosticStatus:
+    """The state of the box: STALE if it is not heard, ERROR if its skin does not stream, WARN if something was lost since
+    `before`."""
+    state = view.state
+    hurt = [
+        f"{count} {what}"
+        for count, what in (
+            (view.missed - before.missed, "answers did not arrive"),
+            (view.damaged - before.damaged, "sentences were damaged"),
+            (state.lost_frames - before.state.lost_frames if state and before.state else 0, "frames were lost"),
+        )
+        if count > 0
+    ]
+    if not alive or state is None:
+        level, text = DiagnosticStatus.STALE, view.trouble or "nothing is heard of the box"
+    elif state.skin != "streaming":
+        level, text = DiagnosticStatus.ERROR, f"the skin is {state.skin}"
+    else:
+        level, text = (DiagnosticStatus.WARN, ", ".join(hurt)) if hurt else (DiagnosticStatus.OK, "streaming")
+    fields = (asdict(state) | {"ready": state.ready}) if state else {}
+    fields |= {"missed": view.missed, "damaged": view.damaged, "trouble": view.trouble}
+    return DiagnosticStatus(
+        level=level, name="palpate: box", message=text, hardware_id=state.bundle if state else "", values=values(fields)
+    )
+
+
+def image(taxels: Sequence[Any], dtype: str) -> Image:
+    """A frame of raw counts, rows along the sliding; one channel an axis. A count that is no number becomes nan."""
+    kind, letter, size = ENCODINGS[dtype]
+    rows = [[cell if isinstance(cell, list) else [cell] for cell in row] for row in taxels]
+    counts = [float("nan") if count is None else count for row in rows for cell in row for count in cell]
+    channels = len(rows[0][0])
+    step = len(rows[0]) * channels * size
+    return Image(
+        height=len(rows), width=len(rows[0]), encoding=f"{kind}{channels}", step=step,
+        data=pack(f"<{len(counts)}{letter}", *counts),
+    )  # fmt: skip
+
+
+class PalpateNode(LifecycleNode):  # type: ignore[misc]
+    """The node `palpate`. What the box says arrives in another thread and is published by the executor."""
+
+    def __init__(self) -> None:
+        super().__init__("palpate")
+        for name, default in PARAMETERS.items():
+            self.declare_parameter(name, default)
+        self._monotonic = SystemClock()
+        self._source: Source | None = None
+        self._news: deque[Heard | Mapping[str, Any]] = deque(maxlen=256)
+        self._before = View()
+        self._shown: tuple[Any, ...] = ()
+        self._made: list[tuple[Callable[[Any], object], Any]] = []
+        if self.setting("autostart"):
+            self.trigger_configure()
+            self.trigger_activate()
+
+    def setting(self, name: str) -> Any:
+        """A parameter."""
+        return self.get_parameter(name).value
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the line or the feed, and offer diagnostics and services."""
+        if bool(self.setting("port")) == bool(self.setting("feed")):
+            self.get_logger().error("name the box with one of the parameters port and feed")
+            return TransitionCallbackReturn.FAILURE
+        guard = self.create_guard_condition(self._publish_news)
+
+        def heard(news: Heard | Mapping[str, Any]) -> None:
+            self._news.append(news)
+            guard.trigger()
+
+        if self.setting("feed"):
+            frames_hz = float(self.setting("frames_hz"))
+            self._source = FeedSource(self.setting("feed"), heard=heard, frame=heard, frames_hz=frames_hz)
+        else:
+            self._source = LineSource(self.setting("port"), baud=self.setting("baud"), heard=heard)
+        self._verdicts = self.create_lifecycle_publisher(DiagnosticArray, "~/verdict", RELIABLE)
+        self._states = self.create_lifecycle_publisher(DiagnosticArray, "~/state", LATCHED)
+        self._frames = self.create_lifecycle_publisher(Image, "~/frames", qos_profile_sensor_data)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        asking = MutuallyExclusiveCallbackGroup()  # a command may take seconds, verdicts do not wait for it
+        self._made = [(self.destroy_guard_condition, guard), (self.destroy_publisher, self._diagnostics)]
+        self._made += [
+            (self.destroy_timer, self.create_timer(1.0, self._report)),
+            (self.destroy_timer, self.create_timer(1.0, self._refresh, callback_group=asking)),
+        ]
+        for name, command in SERVICES.items():
+            service = self.create_service(Trigger, f"~/{name}", self._service(command), callback_group=asking)
+            self._made.append((self.destroy_service, service))
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of the box."""
+        return self.let_go()
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of the box."""
+        return self.let_go()
+
+    def let_go(self) -> TransitionCallbackReturn:
+        """Close the box's line or feed, and end what `on_configure` has begun."""
+        if self._source:
+            self._source.close()
+            self._source = None
+        for destroy, thing in self._made:
+            destroy(thing)
+        for publisher in (self._verdicts, self._states, self._frames) if self._made else ():
+            self.destroy_lifecycle_publisher(publisher)
+        self._made, self._shown = [], ()
+        self._news.clear()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _service(self, command: str) -> Callable[[Any, Any], Any]:
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                if self._source is None:
+                    raise ApplianceError("the node is not configured")
+                response.success, response.message = True, self._source.send(command)
+            except ApplianceError as e:
+                response.success, response.message = False, str(e)
+            return response
+
+        return answer
+
+    def _array(self, status: DiagnosticStatus) -> DiagnosticArray:
+        """A status with time and frame."""
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        array.header.frame_id = self.setting("frame_id")
+        return array
+
+    def _publish_news(self) -> None:
+        while self._news and self._source:
+            news = self._news.popleft()
+            if isinstance(news, Answer):
+                code = self._source.view().code(news.label)
+                self._verdicts.publish(self._array(verdict_status(news, code)))
+            elif isinstance(news, Mapping):
+                self._publish_frame(news)
+            else:
+                self._show(self._source.view())
+
+    def _publish_frame(self, line: Mapping[str, Any]) -> None:
+        message = image(line["taxels"], self._source.format["dtype"])  # type: ignore[union-attr]
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.frame_id = self.setting("frame_id")
+        self._frames.publish(message)
+
+    def _show(self, view: View) -> None:
+        """Publish the state if it is another."""
+        alive = view.alive(self._monotonic.now_ns())
+        state = view.state
+        now = (alive, state.skin, state.sweeping, state.bundle) if state else (alive,)
+        if now != self._shown and self._states.is_activated:
+            self._shown = now
+            self._states.publish(self._array(box_status(view, view, alive=alive)))
+
+    def _report(self) -> None:
+        """Diagnostics, once a second, and the state of a box that has fallen silent."""
+        if self._source:
+            view = self._source.view()
+            alive = view.alive(self._monotonic.now_ns())
+            self._diagnostics.publish(self._array(box_status(view, self._before, alive=alive)))
+            self._before = view
+            self._show(view)
+
+    def _refresh(self) -> None:
+        if self._source:
+            self._source.refresh()
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Serve until SIGINT or SIGTERM. arguments: those of ROS."""
+    rclpy.init(args=["palpate", "--ros-args", *arguments] if arguments else ["palpate"])
+    node = PalpateNode()
+    executor = MultiThreadedExecutor(num_threads=2)
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.let_go()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()

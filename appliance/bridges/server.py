@@ -1,0 +1,131 @@
+"""A TCP server with limits, for the bridges. In: how one connection is served. Out: at most `most` at a time.
+
+A connection that has been silent is given up for a new one, so that idle or dead peers never keep a controller out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import socket
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+
+from appliance.core.errors import ConfigError
+from appliance.core.log import log
+
+QUIET_S = 5.0
+"""A connection that has sent nothing for this long makes room where the server is full."""
+BUFFER = 64 * 1024
+"""Bytes that wait for one peer; one that does not read them is given up."""
+
+Serve = Callable[["Peer"], Awaitable[None]]
+
+
+class Peer:
+    """One connection."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, now_s: Callable[[], float]) -> None:
+        self.heard_s = now_s()
+        self._reader, self._writer, self._now_s = reader, writer, now_s
+
+    async def read(self, timeout_s: float | None) -> bytes:
+        """What has come, b"" at the end. Raises TimeoutError, ConnectionError."""
+        data = await asyncio.wait_for(self._reader.read(4096), timeout_s)
+        self.heard_s = self._now_s()
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send without waiting; a peer that does not read is given up."""
+        if self._writer.transport.get_write_buffer_size() + len(data) > BUFFER:
+            self.drop()
+        elif not self._writer.is_closing():
+            self._writer.write(data)
+
+    async def flush(self, timeout_s: float) -> None:
+        """Wait until the peer has taken what was sent. Raises TimeoutError, ConnectionError."""
+        await asyncio.wait_for(self._writer.drain(), timeout_s)
+
+    def drop(self) -> None:
+        """End the connection at once."""
+        self._writer.transport.abort()
+
+    async def close(self) -> None:
+        """End the connection."""
+        with suppress(OSError):
+            self._writer.close()
+            await self._writer.wait_closed()
+
+
+class Server:
+    """Serves connections to `address`. peers: those that are open. refused: how many found it full."""
+
+    def __init__(self, serve: Serve, most: int) -> None:
+        self.peers: set[Peer] = set()
+        self.refused = 0
+        self.address = ("", 0)
+        self._serve, self._most = serve, most
+
+    async def open(self, host: str, port: int) -> None:
+        """Listen. Raises ConfigError where that is not possible."""
+        try:
+            server = await asyncio.start_server(self._connected, host, port, limit=8192, backlog=64)
+        except (OSError, OverflowError) as e:
+            why = str(getattr(e, "strerror", None) or e).lower()
+            raise ConfigError(f"--listen {host}:{port}: {why}; name an address of this machine and a free port") from e
+        self.address = server.sockets[0].getsockname()[:2]
+
+    def _make_room(self, now_s: float) -> bool:
+        """Whether one more may come; gives up the one that has been silent longest if there is no room."""
+        if len(self.peers) < self._most:
+            return True
+        quietest = min(self.peers, key=lambda peer: peer.heard_s)
+        if now_s - quietest.heard_s < QUIET_S:
+            return False
+        self.peers.discard(quietest)
+        quietest.drop()
+        return True
+
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        now_s = asyncio.get_running_loop().time
+        if not self._make_room(now_s()):
+            self.refused += 1
+            writer.transport.abort()
+            return
+        connection = writer.get_extra_info("socket")
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)  # else the kernel holds some megabytes
+        peer = Peer(reader, writer, now_s)
+        self.peers.add(peer)
+        try:
+            await self._serve(peer)
+        except (OSError, TimeoutError):
+            pass  # a peer that is gone or hangs; the others do not notice
+        finally:
+            self.peers.discard(peer)
+            await peer.close()
+
+
+def stop_event() -> asyncio.Event:
+    """Set by SIGTERM or SIGINT from now on."""
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    return stop
+
+
+async def until(stop: asyncio.Event, every_s: float, work: Callable[[], Awaitable[None]]) -> None:
+    """Do the work every `every_s` until `stop` is set."""
+    while not stop.is_set():
+        await work()
+        with suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), every_s)
+    log.info("stopped")
+
+
+def address(text: str) -> tuple[str, int]:
+    """HOST:PORT. Raises ConfigError."""
+    host, colon, port = text.rpartition(":")
+    if not colon or not host or not port.isdecimal() or int(port) > 65535:
+        raise ConfigError(f"--listen {text}: not an address; use HOST:PORT, for example 127.0.0.1:1502")
+    return host.strip("[]"), int(port)

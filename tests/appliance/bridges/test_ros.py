@@ -1,0 +1,186 @@
+"""The bridge to ROS 2 as a process, and another node as a second one, over loopback."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.cli.main import main
+from appliance.core.sentences import sentence
+from tests.factories import ros
+from tests.factories.bridges import LONG_S, eventually
+from tests.factories.paths import ROOT
+from tests.factories.ros import RosPeer
+from tests.factories.speaking_box import SpeakingBox, result, state
+
+OK, WARN, ERROR, STALE = range(4)
+PARAMETERS = ROOT / "docs" / "robots" / "palpate.yaml"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _installed() -> None:
+    """These tests need ROS 2."""
+    ros.required()
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Iterator[SpeakingBox]:
+    """A box that obeys."""
+    with SpeakingBox(tmp_path / "line") as one:
+        yield one
+
+
+@pytest.fixture
+def node(box: SpeakingBox) -> Iterator[RosPeer]:
+    """A node that hears the box through the bridge; its parameters come from the page's file."""
+    with ros.peer() as peer, ros.bridge("--params-file", str(PARAMETERS), "-p", f"port:={box.path}"):
+        eventually(lambda: said(box, lambda: peer.on("state") != []))
+        yield peer
+
+
+def said(box: SpeakingBox, there: Callable[[], bool], line: bytes = b"") -> bool:
+    """Say a state once more, and see."""
+    box.say(line or state())
+    return there()
+
+
+def verdict(box: SpeakingBox, node: RosPeer, line: bytes) -> dict:
+    """The message that an answer becomes."""
+    before = len(node.on("verdict"))
+    box.say(line)
+    eventually(lambda: len(node.on("verdict")) > before)
+    return node.on("verdict")[-1]
+
+
+def test_an_answer_becomes_a_message(box: SpeakingBox, node: RosPeer):
+    """OK with the label; WARN where it cannot be used; ERROR where nothing was learned; stamped, with its frame; early
+    answers say so."""
+    eventually(lambda: [s.kind for s in box.heard].count("LABEL") == 3)
+    heard = verdict(box, node, result(1, label="paper"))
+    assert (heard["level"], heard["message"], heard["frame_id"]) == (OK, "paper", "fingertip")
+    assert (heard["values"]["code"], heard["values"]["probability"], heard["values"]["early"]) == ("2", "0.9", "false")
+    assert heard["stamp"] > 0
+    assert verdict(box, node, result(2, "unsure"))["level"] == WARN
+    assert verdict(box, node, result(3, "unknown", ""))["level"] == WARN
+    fault = verdict(box, node, result(4, "stuck-taxel", "", detail="taxel 2.3"))
+    assert fault["level"] == ERROR
+    assert fault["message"] == "stuck-taxel: a loaded taxel does not move; look at the skin (taxel 2.3)"
+    assert verdict(box, node, result(5, share="0.40"))["values"]["early"] == "true"
+
+
+def test_the_box_is_unplugged_dead_and_back(box: SpeakingBox, node: RosPeer):
+    """Diagnostics: OK, WARN once where something was lost, ERROR without a skin, STALE without a box, and OK again; the
+    state follows."""
+
+    def level() -> int:
+        return node.last("diagnostics")["level"]
+
+    eventually(lambda: said(box, lambda: level() == OK))
+    box.say(result(1), result(5), state(answered=5))
+    eventually(
+        lambda: any(d["level"] == WARN and "3 answers did not arrive" in d["message"] for d in node.on("diagnostics"))
+    )
+    eventually(
+        lambda: said(box, lambda: level() == ERROR and node.last("state")["level"] == ERROR, state("mismatch", 5))
+    )
+    box.unplug()
+    eventually(lambda: level() == STALE and node.last("state")["level"] == STALE)
+    assert not node.call("tare")["success"]
+    box.plug_in()
+    eventually(lambda: said(box, lambda: level() == OK and node.last("state")["level"] == OK, state(answered=5)))
+    assert verdict(box, node, result(6))["message"] == "wood"
+
+
+def test_services(box: SpeakingBox, node: RosPeer):
+    """Each is its command; what the box says is the message; a refusal is no success."""
+    assert node.call("tare") == {"service": "tare", "success": True, "message": "16 taxels"}
+    for name in ("new_object", "start", "stop", "abort"):
+        assert node.call(name)["success"]
+    assert [s.kind for s in box.heard if s.kind != "LABEL"] == ["TARE", "NEW", "START", "STOP", "ABORT"]
+    box.script = lambda s: [sentence("ANS", s.kind, "error", "set trigger.mode to serial")]
+    assert node.call("start") == {"service": "start", "success": False, "message": "START: set trigger.mode to serial"}
+
+
+def test_the_lifecycle(box: SpeakingBox, node: RosPeer):
+    """Inactive, it publishes no verdict but diagnostics; cleaned up, it has let go of the line; configured and activated
+    again, it works."""
+    assert node.call("deactivate")["success"]
+    before = len(node.on("verdict"))
+    box.say(result(1), state(answered=1))
+    seen = len(node.on("diagnostics"))
+    eventually(lambda: len(node.on("diagnostics")) > seen + 1)
+    assert len(node.on("verdict")) == before
+    assert node.call("cleanup")["success"]
+    for transition in ("configure", "activate"):
+        assert node.call(transition)["success"]
+    eventually(lambda: said(box, lambda: len(node.on("verdict")) > before, result(2)))
+
+
+def test_the_bridge_dies_and_comes_back(box: SpeakingBox):
+    """Killed, not ended: the other node stays, and hears the next bridge."""
+    with ros.peer() as node:
+        for _ in range(2):
+            seen = len(node.on("verdict"))
+            with ros.bridge("-p", f"port:={box.path}") as process:
+                eventually(lambda seen=seen: said(box, lambda: len(node.on("verdict")) > seen, result(1)))
+                process.kill()
+                process.wait(LONG_S)
+
+
+def test_a_late_node_gets_the_state(box: SpeakingBox, node: RosPeer):
+    """The last state is kept for who comes later; the first node stands for the cell, the second for a screen."""
+    with ros.peer() as late:
+        assert late.last("state")["values"]["skin"] == "streaming"
+
+
+def test_frames_from_the_feed(tmp_path: Path):
+    """On the box: frames as images with one channel an axis, little-endian; nan where a skin gave no number."""
+    form = {"rows": 2, "cols": 1, "axes": 3, "dtype": "float32", "rate_hz": 100, "window": 200}
+    hello = {"type": "hello", "schema": 1, "labels": ["wood"], "bundle": "b1", "format": form}
+    frame = {"type": "frame", "time_ns": 1, "taxels": [[[1, 2, 3]], [[4, None, 6]]]}
+    path = tmp_path / "feed.sock"
+    with socket.socket(socket.AF_UNIX) as listener, ros.peer() as node:
+        listener.bind(str(path))
+        listener.listen()
+        with ros.bridge("-p", f"feed:={path}", "-p", "frames_hz:=10.0"):
+            connection, _ = listener.accept()
+            assert json.loads(connection.recv(1000))["frames"] == 10
+            connection.sendall(json.dumps(hello).encode() + b"\n")
+
+            def sent() -> bool:
+                connection.sendall(json.dumps(frame).encode() + b"\n")
+                return node.on("frames") != []
+
+            eventually(sent)
+            heard = node.on("frames")[0]
+            assert (heard["shape"], heard["encoding"], heard["step"]) == ([2, 1], "32FC3", 12)
+            assert bytes(heard["data"][:8]) == b"\0\0\x80\x3f\0\0\0\x40"
+            assert bytes(heard["data"][16:20]) == b"\0\0\xc0\x7f"
+            assert not node.call("start")["success"]
+            connection.close()
+
+
+def test_no_box_is_named():
+    """Neither port nor feed: the node stays unconfigured, and can be told another time."""
+    with ros.peer() as node, ros.bridge():
+        assert not node.call("configure")["success"]
+
+
+def test_without_ros_the_command_says_what_to_do(capsys: pytest.CaptureFixture[str]):
+    """This environment has no rclpy: exit code 78, one line with the remedy."""
+    assert main(["bridge", "ros"]) == 78
+    assert "source its setup.bash, or install the wheels: pip install 'palpate[ros]'" in capsys.readouterr().err
+
+
+def test_the_launch_file_is_python():
+    """It compiles, and names the parameters' file beside it; `launch` itself is no wheel, so it was not run."""
+    launch = ROOT / "docs" / "robots" / "palpate.launch.py"
+    done = subprocess.run([sys.executable, "-m", "py_compile", launch], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert PARAMETERS.name in launch.read_text()

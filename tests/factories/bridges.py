@@ -1,0 +1,98 @@
+"""Bridges as processes of their own, as they run beside a box, and what talks to them."""
+
+from __future__ import annotations
+
+import re
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.factories.paths import ROOT
+
+LONG_S = 30.0
+
+
+def page_block(page: str, language: str) -> str:
+    """The one block in this language of a page in docs/robots."""
+    (block,) = re.findall(rf"```{language}\n(.*?)```", (ROOT / "docs" / "robots" / page).read_text(), re.S)
+    return block
+
+
+def eventually(there: Callable[[], bool], limit_s: float = LONG_S) -> None:
+    """Wait for something that another process does; fails where it never comes."""
+    for _ in range(round(limit_s / 0.02)):
+        if there():
+            return
+        threading.Event().wait(0.02)
+    pytest.fail("it did not come")
+
+
+@contextmanager
+def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
+    """A running bridge; where it listens."""
+    command = [sys.executable, "-m", "appliance.bridges", kind, "--listen", "127.0.0.1:0", *map(str, options)]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            said = []
+            for line in process.stderr:
+                said.append(line)
+                found = re.search(r"listening on ([\d.]+):(\d+)", line)
+                if found:
+                    break
+            else:
+                pytest.fail("".join(said))
+            threading.Thread(target=process.stderr.read, daemon=True).start()
+            yield found[1], int(found[2])
+            assert process.poll() is None, "the bridge has ended by itself"
+        finally:
+            process.terminate()
+            process.wait(LONG_S)
+
+
+class RawModbus:
+    """A Modbus TCP client of bytes that are put together here, from the specification alone."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        self.socket = socket.create_connection(address, timeout=LONG_S)
+
+    def __enter__(self) -> RawModbus:
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self.socket.close()
+
+    def send(self, pdu: bytes, transaction: int = 1, unit: int = 255) -> None:
+        """Send a request."""
+        self.socket.sendall(struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu)
+
+    def receive(self) -> bytes:
+        """The next reply, as it came."""
+        head = self._exactly(6)
+        return head + self._exactly(int.from_bytes(head[4:], "big"))
+
+    def ask(self, pdu: bytes) -> bytes:
+        """Send a request; the reply's function and data."""
+        self.send(pdu)
+        return self.receive()[7:]
+
+    def registers(self, address: int, count: int, function: int = 4) -> list[int]:
+        """Read registers."""
+        data = self.ask(struct.pack(">BHH", function, address, count))
+        assert data[:2] == bytes([function, 2 * count]), data.hex()
+        return list(struct.unpack(f">{count}H", data[2:]))
+
+    def _exactly(self, n: int) -> bytes:
+        data = b""
+        while len(data) < n:
+            more = self.socket.recv(n - len(data))
+            if not more:
+                raise ConnectionError("the bridge has closed")
+            data += more
+        return data

@@ -1,0 +1,97 @@
+"""The bridge to ROS 2 and another node, two processes over loopback, with the Python that has ROS 2."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from tests.factories.bridges import LONG_S, eventually
+from tests.factories.paths import ROOT
+
+PYTHON = ROOT / os.environ.get("PALPATE_ROS", "build/ros") / "bin" / "python"
+"""Of `make ros`; PALPATE_ROS names another virtual environment, and says that it has to be there."""
+
+
+def required() -> None:
+    """Skip where ROS 2 is not installed, unless it was asked for."""
+    if not PYTHON.exists():
+        if "PALPATE_ROS" in os.environ:
+            pytest.fail(f"{PYTHON} is not there; make ros installs it in build/ros")
+        pytest.skip("no ROS 2 here; make ros installs it (255 MB)")
+
+
+def environment() -> dict[str, str]:
+    """Loopback alone, a domain of this test process."""
+    domain = str(1 + os.getpid() % 100)
+    return {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": domain,
+    }
+
+
+class RosPeer:
+    """The other node: what it has heard, by topic, and what its calls gave."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.heard: list[dict[str, Any]] = []
+        self._process = process
+        threading.Thread(target=self._listen, daemon=True).start()
+        eventually(lambda: self.on("ready") != [])
+
+    def on(self, topic: str) -> list[dict[str, Any]]:
+        """What came on a topic."""
+        return [line for line in [*self.heard] if line.get("topic") == topic]
+
+    def last(self, topic: str) -> Mapping[str, Any]:
+        """What came last on a topic; waits for it."""
+        eventually(lambda: self.on(topic) != [])
+        return self.on(topic)[-1]
+
+    def call(self, name: str) -> dict[str, Any]:
+        """Call a service or a transition; its answer."""
+        before = self._answers(name)
+        self._process.stdin.write(f"{name}\n")
+        self._process.stdin.flush()
+        eventually(lambda: len(self._answers(name)) > len(before))
+        return self._answers(name)[-1]
+
+    def _answers(self, name: str) -> list[dict[str, Any]]:
+        return [line for line in [*self.heard] if line.get("service") == name]
+
+    def _listen(self) -> None:
+        for line in self._process.stdout:
+            self.heard.append(json.loads(line))
+
+
+@contextmanager
+def peer() -> Iterator[RosPeer]:
+    """Another node."""
+    script = ROOT / "tests" / "factories" / "ros_peer.py"
+    command = [PYTHON, str(script)]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, env=environment(), text=True, **pipes) as process:
+        try:
+            yield RosPeer(process)
+        finally:
+            process.kill()
+
+
+@contextmanager
+def bridge(*parameters: str) -> Iterator[subprocess.Popen[bytes]]:
+    """The bridge as a node."""
+    command = [PYTHON, "-m", "appliance.bridges", "ros", "--ros-args", *parameters]
+    with subprocess.Popen(command, cwd=ROOT, env=environment(), stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+            process.wait(LONG_S)
