@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import time
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -36,7 +37,7 @@ def status(topic: str, array: DiagnosticArray) -> None:
     stamp = array.header.stamp.sec + array.header.stamp.nanosec / 1e9
     tell(
         topic=topic, level=one.level[0], name=one.name, message=one.message, values=values, stamp=stamp,
-        frame_id=array.header.frame_id,
+        frame_id=array.header.frame_id, monotonic_ns=time.monotonic_ns(),
     )  # fmt: skip
 
 

@@ -125,8 +125,9 @@ def test_the_lifecycle(box: SpeakingBox, node: RosPeer):
 def test_the_bridge_dies_and_comes_back(box: SpeakingBox):
     """Killed, not ended: the other node stays, and hears the next bridge."""
     with ros.peer() as node:
-        for _ in range(2):
+        for number in range(2):
             seen = len(node.on("verdict"))
+            assert bool(seen) == bool(number)
             with ros.bridge("-p", f"port:={box.path}") as process:
                 eventually(lambda seen=seen: said(box, lambda: len(node.on("verdict")) > seen, result(1)))
                 process.kill()

@@ -1,0 +1,189 @@
+"""`python -m tests.robots`: from a verdict in the box to the robot's program, by each connection, side by side in one run.
+
+Two boxes sweep simulated tubes in real time: one with a serial line and the bridges on its feed, one behind `bridge tcp`.
+Needs ROS 2 (make ros). On a machine with other work: chrt -f 10 python -m tests.robots.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from statistics import median
+
+from pymodbus.client import ModbusTcpClient
+
+from appliance.bridges.modbus import ADDRESSES
+from appliance.bridges.source import LinkPort
+from appliance.bundle import bundle
+from appliance.client.answers import Answer, BoxState
+from appliance.client.box import Palpate
+from appliance.client.feed import Feed
+from appliance.core import config
+from appliance.core.clock import SystemClock
+from appliance.core.provenance import commit
+from appliance.runtime import assembly
+from appliance.sim import devices, script
+from tests.factories import ros
+from tests.factories.bridges import bridge
+from tests.factories.paths import NO_SITE, ROOT
+from tests.robots import page
+
+RESULTS = ROOT / "docs" / "robots" / "latency.json"
+POLL_S = 0.01
+Seen = Callable[[int], None]
+"""Takes the number of a sweep whose answer is there now."""
+
+
+class Times:
+    """When each sweep was judged, and when each connection had the answer, in ns of the one monotonic clock."""
+
+    def __init__(self) -> None:
+        self._judged: dict[tuple[str, int], int] = {}
+        self._there: defaultdict[tuple[str, str], dict[int, int]] = defaultdict(dict)
+
+    def judged(self, box: str, line: dict) -> None:
+        """A verdict line of the box's feed."""
+        self._judged[box, line["sweep"]] = line["time_ns"]
+
+    def seen(self, connection: str, box: str) -> Seen:
+        """For a connection to note what it has."""
+        self._there[connection, box] = {}
+        return lambda sweep: self.note(connection, box, sweep, time.monotonic_ns())
+
+    def note(self, connection: str, box: str, sweep: int, at_ns: int) -> None:
+        """A connection had the answer to a sweep at this time."""
+        self._there[connection, box].setdefault(sweep, at_ns)
+
+    def done(self, sweeps: int) -> bool:
+        """Whether each connection has so many answers."""
+        there = {*self._there} >= {("serial", "A"), ("tcp", "B"), ("feed", "A"), ("modbus", "A"), ("ros", "A")}
+        return there and min(map(len, self._there.values())) >= sweeps
+
+    def latencies_ms(self) -> dict[str, list[float]]:
+        """By connection."""
+        return {
+            connection: [
+                (at - self._judged[box, sweep]) / 1e6 for sweep, at in there.items() if (box, sweep) in self._judged
+            ]
+            for (connection, box), there in self._there.items()
+        }
+
+
+@contextmanager
+def box(port: str, feed: Path) -> Iterator[None]:
+    """A box that sweeps simulated tubes in real time."""
+    command = [
+        sys.executable, "-m", "appliance", "run", "--sim", "skin", "--set", f"serial.port={port}", "--set", f"feed.socket={feed}",
+        "--set", "store.status=", "--set", "store.folder=/nonexistent",
+    ]  # fmt: skip
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(30)
+
+
+def follow(path: Path, name: str, times: Times, ending: threading.Event) -> None:
+    """Read the feed of a box: when it judged, and when the feed had it."""
+    seen = times.seen("feed", name) if name == "A" else lambda sweep: None
+    with Feed(path) as feed:
+        while not ending.is_set():
+            line = feed.read(0.2)
+            if line and line["type"] == "verdict":
+                seen(line["sweep"])
+                times.judged(name, line)
+
+
+def poll(address: tuple[str, int], seen: Seen, ending: threading.Event) -> None:
+    """Read the registers every POLL_S, as a PLC does."""
+    with ModbusTcpClient(address[0], port=address[1]) as client:
+        before = 0
+        while not ending.wait(POLL_S):
+            words = client.read_input_registers(0, count=40).registers
+            if words[ADDRESSES["answers"]] != before:
+                before = words[ADDRESSES["answers"]]
+                seen(words[ADDRESSES["sweep"]] << 16 | words[ADDRESSES["sweep"] + 1])
+
+
+def noting(seen: Seen) -> Callable[[Answer | BoxState], None]:
+    """A listener for the client."""
+    return lambda news: seen(news.sweep) if isinstance(news, Answer) else None
+
+
+def lines_ms(sweeps: int) -> list[float]:
+    """From a verdict to RESULT VALID, in this process, on simulated lines: what the program adds to a real line."""
+    current = bundle.load(bundle.DEFAULT)
+    simulated = devices.build(current.format, script.tubes(3, sweeps), SystemClock(), "sim")
+    settings = config.load(None, site=NO_SITE)
+    found: list[float] = []
+    with ExitStack() as stack:
+        one = assembly.box(settings, current, simulated, None, stack)
+        while len(found) < sweeps:
+            for verdict in one.step():
+                rises = [t for t, name, level in simulated.gpio.written if name == devices.RESULT_VALID and level]
+                found.append((rises[-1] - verdict.time_ns) / 1e6)
+    return found
+
+
+def run(sweeps: int) -> dict[str, list[float]]:
+    """Latencies in ms by connection."""
+    times, ending = Times(), threading.Event()
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        feeds = {"A": folder / "a.sock", "B": folder / "b.sock"}
+        line = LinkPort(folder / "line")
+        stack.enter_context(Palpate("line", opener=lambda: line, listener=noting(times.seen("serial", "A"))))
+        tcp = stack.enter_context(bridge("tcp", "--link", folder / "tcp"))
+        stack.enter_context(Palpate(f"socket://{tcp[0]}:{tcp[1]}", listener=noting(times.seen("tcp", "B"))))
+        for name, port in (("A", folder / "line"), ("B", folder / "tcp")):
+            stack.enter_context(box(str(port), feeds[name]))
+        modbus = stack.enter_context(bridge("modbus", "--feed", feeds["A"]))
+        stack.enter_context(ros.bridge("-p", f"feed:={feeds['A']}"))
+        peer = stack.enter_context(ros.peer())
+        stack.callback(ending.set)
+        for name, path in feeds.items():
+            threading.Thread(target=follow, args=(path, name, times, ending), daemon=True).start()
+        threading.Thread(target=poll, args=(modbus, times.seen("modbus", "A"), ending), daemon=True).start()
+        while not times.done(sweeps):
+            ending.wait(1)
+            for heard in peer.on("verdict"):
+                times.note("ros", "A", int(heard["values"]["sweep"]), heard["monotonic_ns"])
+    return times.latencies_ms()
+
+
+def main() -> int:
+    """Measure, write the results, and the table of the page."""
+    parser = argparse.ArgumentParser(prog="python -m tests.robots", description=__doc__)
+    parser.add_argument("--sweeps", type=int, default=30, help="of each connection (%(default)s)")
+    args = parser.parse_args()
+    ros.required()
+    found = {"lines": lines_ms(args.sweeps), **run(args.sweeps)}
+    figures = {
+        name: {"n": len(ms), "median_ms": round(median(ms), 2), "longest_ms": round(max(ms), 2)}
+        for name, ms in found.items()
+    }
+    policy = {os.SCHED_FIFO: "FIFO", os.SCHED_OTHER: "other"}.get(os.sched_getscheduler(0), "another")
+    about = {
+        "connections": figures, "poll_ms": 1000 * POLL_S, "scheduler": policy, "load": os.getloadavg()[0],
+        "cores": os.cpu_count(), "machine": platform.machine(), "commit": commit(),
+    }  # fmt: skip
+    RESULTS.write_text(json.dumps(about, indent=1) + "\n")
+    page.write(RESULTS.with_name("README.md"), about)
+    print(json.dumps(figures, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

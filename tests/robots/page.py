@@ -1,0 +1,45 @@
+"""The table of docs/robots/README.md. In: the figures of a run. Out: the lines between the markers, and no other."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+BEGIN, END = "<!-- latency -->", "<!-- /latency -->"
+SENTENCE = "$PPLP,RES,7,5021.384,ok,plastic rough,0.987,0.981,1,0,0.41,9f3c2a1b,usb,1.00,*hh\r\n"
+BAUD, BITS = 115200, 10
+NAMES = {
+    "lines": "lines: RESULT VALID, simulated lines in the box's process",
+    "serial": "serial line, Python client, without the time on the wire",
+    "tcp": "`bridge tcp` behind the serial line, Python client on loopback",
+    "feed": "feed, a program on the box",
+    "modbus": "`bridge modbus` on the feed, pymodbus's client that reads every {poll:g} ms",
+    "ros": "`bridge ros` on the feed, another node on loopback",
+}
+
+
+def table(found: Mapping[str, Any]) -> str:
+    """The table with what was measured, in Markdown."""
+    rows = ["| connection | median | longest | answers |", "|---|---|---|---|"]
+    for name, text in NAMES.items():
+        one = found["connections"][name]
+        rows.append(
+            f"| {text.format(poll=found['poll_ms'])} | {one['median_ms']} ms | {one['longest_ms']} ms | {one['n']} |"
+        )
+    wire = len(SENTENCE) * BITS / BAUD * 1000
+    return "\n".join(
+        [
+            f"Measured by `python -m tests.robots`, all but the first at the same time, on {found['cores']} cores ({found['machine']}), which",
+            f"other work shares: load average {found['load']:.1f}, scheduling class {found['scheduler']}; commit {found['commit'][:12]}. From the verdict to the robot's",
+            f"program. On a wire at {BAUD} baud a RES of {len(SENTENCE)} characters takes {wire:.1f} ms more; networks add their own time.",
+            "", *rows,
+        ]
+    )  # fmt: skip
+
+
+def write(path: Path, found: Mapping[str, Any]) -> None:
+    """Put the table between the markers of a page."""
+    text = path.read_text("utf-8")
+    path.write_text(re.sub(f"{BEGIN}.*{END}", lambda m: f"{BEGIN}\n{table(found)}\n{END}", text, flags=re.S), "utf-8")
