@@ -11,7 +11,7 @@ from ipaddress import ip_address
 from typing import Any
 
 from appliance.bridges.options import add_arguments
-from appliance.bridges.server import Server, address, stop_event, until
+from appliance.bridges.server import TcpServer, address, stop_event, until
 from appliance.bridges.source import FeedSource, LineSource, LinkPort, Source
 from appliance.client.line import open_port
 from appliance.core.clock import SystemClock
@@ -45,7 +45,7 @@ def run_modbus(args: argparse.Namespace) -> int:
         stop = stop_event()
         source = _source(args)
         try:
-            server = Server(ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most)
+            server = TcpServer(ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most)
             await server.open(host, port)
             _say("modbus", server, source.name, args)
             await until(stop, EVERY_S, partial(asyncio.to_thread, source.refresh))
@@ -92,7 +92,7 @@ def run_ros(args: argparse.Namespace) -> int:
 RUNS = {"tcp": run_tcp, "modbus": run_modbus, "ros": run_ros}
 
 
-def _say(kind: str, server: Server, box: str, args: argparse.Namespace) -> None:
+def _say(kind: str, server: TcpServer, box: str, args: argparse.Namespace) -> None:
     host, port = server.address
     commands = "commands are passed on" if args.allow_writes else "commands are refused (--allow-writes)"
     log.info(f"{kind}: listening on {host}:{port}, box at {box}; {commands}")

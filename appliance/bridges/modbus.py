@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.bridges import modbus_pdu as pdu
-from appliance.bridges.modbus_pdu import Fault, Reading, Refused, Request, Writing
-from appliance.bridges.server import Peer
-from appliance.bridges.source import Source, View
+from appliance.bridges.modbus_pdu import ExceptionCode, ModbusRequest, Reading, RequestRefused, Writing
+from appliance.bridges.server import TcpPeer
+from appliance.bridges.source import BoxView, Source
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.log import log
@@ -39,19 +39,19 @@ class Register:
     """An entry of the map. words: registers that it takes, the highest first. get: its value."""
 
     name: str
-    get: Callable[[View], int]
+    get: Callable[[BoxView], int]
     words: int = 1
 
 
-def _of_answer(get: Callable[[View], float]) -> Callable[[View], int]:
+def _of_answer(get: Callable[[BoxView], float]) -> Callable[[BoxView], int]:
     return lambda view: round(get(view)) if view.answer else 0
 
 
-def _of_state(name: str) -> Callable[[View], int]:
+def _of_state(name: str) -> Callable[[BoxView], int]:
     return lambda view: getattr(view.state, name) if view.state else 0
 
 
-def _state_code(view: View) -> int:
+def _state_code(view: BoxView) -> int:
     skin = view.state.skin if view.state else ""
     return STATES.index(skin) + 1 if skin in STATES else 0
 
@@ -86,7 +86,7 @@ COUNTERS = {"heartbeat", "answers", "sweep", "answered", "frames", "lost frames"
 """These wrap; anything else stays at the largest number that fits."""
 
 
-def registers(view: View, *, alive: bool) -> list[int]:
+def registers(view: BoxView, *, alive: bool) -> list[int]:
     """The words of all registers. alive: the box was heard lately."""
     words: list[int] = []
     for register in REGISTERS:
@@ -102,7 +102,7 @@ def registers(view: View, *, alive: bool) -> list[int]:
     return words + [text[i] << 8 | text[i + 1] for i in range(0, len(text), 2)]
 
 
-def inputs(view: View, *, alive: bool) -> list[bool]:
+def inputs(view: BoxView, *, alive: bool) -> list[bool]:
     """The discrete inputs, in the order of INPUTS."""
     state, answer = view.state, view.answer
     if not (alive and state):
@@ -118,7 +118,7 @@ class ModbusBridge:
         self._source, self._clock, self._writes = source, clock, writes
         self._commanding = asyncio.Lock()
 
-    async def serve(self, peer: Peer) -> None:
+    async def serve(self, peer: TcpPeer) -> None:
         """Answer the requests of one connection until it ends, hangs, or sends something else."""
         coils = [False] * len(COILS)
         rest = b""
@@ -131,7 +131,7 @@ class ModbusBridge:
                 peer.write(pdu.reply(request, await self.answer(request, coils)))
             await peer.flush(REQUEST_S)
 
-    async def answer(self, request: Request, coils: list[bool]) -> bytes:
+    async def answer(self, request: ModbusRequest, coils: list[bool]) -> bytes:
         """The reply's function and data. coils: as this connection has left them."""
         try:
             wanted = pdu.parse(request.pdu)
@@ -139,7 +139,7 @@ class ModbusBridge:
                 return pdu.read(wanted, self._values(wanted.function, coils))
             await self._write(wanted, coils)
             return pdu.written(request.pdu)
-        except Refused as e:
+        except RequestRefused as e:
             return pdu.refusal(request.pdu, e.fault)
 
     def _values(self, function: int, coils: Sequence[bool]) -> Sequence[int]:
@@ -151,10 +151,10 @@ class ModbusBridge:
 
     async def _write(self, wanted: Writing, coils: list[bool]) -> None:
         if not self._writes:
-            raise Refused(Fault.FUNCTION)
+            raise RequestRefused(ExceptionCode.FUNCTION)
         end = wanted.address + len(wanted.values)
         if end > len(coils):
-            raise Refused(Fault.ADDRESS)
+            raise RequestRefused(ExceptionCode.ADDRESS)
         for at, value in zip(range(wanted.address, end), wanted.values, strict=True):
             rises, coils[at] = value and not coils[at], value
             if rises:
@@ -162,10 +162,10 @@ class ModbusBridge:
 
     async def _command(self, name: str) -> None:
         if self._commanding.locked():
-            raise Refused(Fault.BUSY)
+            raise RequestRefused(ExceptionCode.BUSY)
         async with self._commanding:
             try:
                 await asyncio.to_thread(self._source.send, name)
             except ApplianceError as e:
                 log.warning(f"modbus: {name}: {e}")
-                raise Refused(Fault.DEVICE) from e
+                raise RequestRefused(ExceptionCode.DEVICE) from e

@@ -20,7 +20,7 @@ MOST_BITS, MOST_REGISTERS, MOST_COILS = 2000, 125, 1968
 ON, OFF = 0xFF00, 0x0000
 
 
-class Fault(IntEnum):
+class ExceptionCode(IntEnum):
     """Exception codes."""
 
     FUNCTION = 1
@@ -30,16 +30,16 @@ class Fault(IntEnum):
     BUSY = 6
 
 
-class Refused(Exception):
+class RequestRefused(Exception):
     """A request is answered with an exception code; no error of the program."""
 
-    def __init__(self, fault: Fault) -> None:
+    def __init__(self, fault: ExceptionCode) -> None:
         super().__init__(fault.name)
         self.fault = fault
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ModbusRequest:
     """One request. pdu: function code and data."""
 
     transaction: int
@@ -65,7 +65,7 @@ class Writing:
     values: tuple[bool, ...]
 
 
-def requests(data: bytes, rest: bytes = b"") -> tuple[list[Request], bytes]:
+def requests(data: bytes, rest: bytes = b"") -> tuple[list[ModbusRequest], bytes]:
     """The requests in `data`, which continues `rest`, and the new unfinished rest.
 
     Raises FormatError for what is not Modbus TCP: where the next request would begin is then unknown.
@@ -78,55 +78,55 @@ def requests(data: bytes, rest: bytes = b"") -> tuple[list[Request], bytes]:
         end = HEADER.size + length - 1
         if len(data) < end:
             break
-        found.append(Request(transaction, unit, data[HEADER.size : end]))
+        found.append(ModbusRequest(transaction, unit, data[HEADER.size : end]))
         data = data[end:]
     return found, data
 
 
-def reply(request: Request, pdu: bytes) -> bytes:
+def reply(request: ModbusRequest, pdu: bytes) -> bytes:
     """The bytes that answer a request."""
     return HEADER.pack(request.transaction, 0, len(pdu) + 1, request.unit) + pdu
 
 
-def refusal(pdu: bytes, fault: Fault) -> bytes:
+def refusal(pdu: bytes, fault: ExceptionCode) -> bytes:
     """The reply with an exception code."""
     return bytes([pdu[0] | 0x80, fault])
 
 
 def parse(pdu: bytes) -> Reading | Writing:
-    """What a request wants. Raises Refused: FUNCTION for one that is not served, VALUE for a wrong length or number."""
+    """What a request wants. Raises RequestRefused: FUNCTION for one that is not served, VALUE for a wrong length or number."""
     function, data = pdu[0], pdu[1:]
     if function in (READ_COILS, READ_INPUTS, READ_HOLDING, READ_REGISTERS):
         address, count = _pair(data)
         if len(data) != 4 or not 1 <= count <= (MOST_BITS if function <= READ_INPUTS else MOST_REGISTERS):
-            raise Refused(Fault.VALUE)
+            raise RequestRefused(ExceptionCode.VALUE)
         return Reading(function, address, count)
     if function == WRITE_COIL:
         address, value = _pair(data)
         if len(data) != 4 or value not in (ON, OFF):
-            raise Refused(Fault.VALUE)
+            raise RequestRefused(ExceptionCode.VALUE)
         return Writing(function, address, (value == ON,))
     if function == WRITE_COILS:
         address, count = _pair(data)
         packed = data[5:]
         if not 1 <= count <= MOST_COILS or data[4:5] != bytes([len(packed)]) or len(packed) != -(-count // 8):
-            raise Refused(Fault.VALUE)
+            raise RequestRefused(ExceptionCode.VALUE)
         return Writing(function, address, tuple(bool(packed[i // 8] >> i % 8 & 1) for i in range(count)))
-    raise Refused(Fault.FUNCTION)
+    raise RequestRefused(ExceptionCode.FUNCTION)
 
 
 def _pair(data: bytes) -> tuple[int, int]:
     if len(data) < 4:
-        raise Refused(Fault.VALUE)
+        raise RequestRefused(ExceptionCode.VALUE)
     first, second = struct.unpack_from(">HH", data)
     return first, second
 
 
 def read(wanted: Reading, values: Sequence[int]) -> bytes:
-    """The reply to a reading of these bits or registers. Raises Refused where it reaches beyond them."""
+    """The reply to a reading of these bits or registers. Raises RequestRefused where it reaches beyond them."""
     chosen = values[wanted.address : wanted.address + wanted.count]
     if len(chosen) < wanted.count:
-        raise Refused(Fault.ADDRESS)
+        raise RequestRefused(ExceptionCode.ADDRESS)
     if wanted.function <= READ_INPUTS:
         packed = bytearray(-(-wanted.count // 8))
         for i, value in enumerate(chosen):

@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
-from appliance.bridges.source import FeedSource, LineSource, Source, View
+from appliance.bridges.source import BoxView, FeedSource, LineSource, Source
 from appliance.client.answers import Answer
 from appliance.client.box import BAUD, Heard
 from appliance.core.clock import SystemClock
@@ -56,7 +56,7 @@ def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
     )  # fmt: skip
 
 
-def box_status(view: View, before: View, *, alive: bool) -> DiagnosticStatus:
+def box_status(view: BoxView, before: BoxView, *, alive: bool) -> DiagnosticStatus:
     """The state of the box: STALE if it is not heard, ERROR if its skin does not stream, WARN if something was lost since
     `before`."""
     state = view.state
@@ -105,7 +105,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._monotonic = SystemClock()
         self._source: Source | None = None
         self._news: deque[Heard | Mapping[str, Any]] = deque(maxlen=256)
-        self._before = View()
+        self._before = BoxView()
         self._shown: tuple[Any, ...] = ()
         self._made: list[tuple[Callable[[Any], object], Any]] = []
         if self.setting("autostart"):
@@ -204,7 +204,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         message.header.frame_id = self.setting("frame_id")
         self._frames.publish(message)
 
-    def _show(self, view: View) -> None:
+    def _show(self, view: BoxView) -> None:
         """Publish the state if it is another."""
         alive = view.alive(self._monotonic.now_ns())
         state = view.state

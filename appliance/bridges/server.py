@@ -19,10 +19,10 @@ QUIET_S = 5.0
 BUFFER = 64 * 1024
 """Bytes that wait for one peer; one that does not read them is given up."""
 
-Serve = Callable[["Peer"], Awaitable[None]]
+Serve = Callable[["TcpPeer"], Awaitable[None]]
 
 
-class Peer:
+class TcpPeer:
     """One connection."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, now_s: Callable[[], float]) -> None:
@@ -57,11 +57,11 @@ class Peer:
             await self._writer.wait_closed()
 
 
-class Server:
+class TcpServer:
     """Serves connections to `address`. peers: those that are open. refused: how many found it full."""
 
     def __init__(self, serve: Serve, most: int) -> None:
-        self.peers: set[Peer] = set()
+        self.peers: set[TcpPeer] = set()
         self.refused = 0
         self.address = ("", 0)
         self._serve, self._most = serve, most
@@ -95,7 +95,7 @@ class Server:
         connection = writer.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)  # else the kernel holds some megabytes
-        peer = Peer(reader, writer, now_s)
+        peer = TcpPeer(reader, writer, now_s)
         self.peers.add(peer)
         try:
             await self._serve(peer)

@@ -1,4 +1,4 @@
-"""What a bridge shows of the box. In: its serial line, a pseudo-terminal that the box opens, or its feed. Out: a View,
+"""What a bridge shows of the box. In: its serial line, a pseudo-terminal that the box opens, or its feed. Out: a BoxView,
 and commands where the line carries them.
 """
 
@@ -34,7 +34,7 @@ COMMANDS: Mapping[str, Callable[[Palpate], str | None]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class BoxView:
     """The box as it was last heard.
 
     answers: how many were heard. beats: how many states were heard. heard_ns: when the last of either came, 0 for never.
@@ -67,7 +67,7 @@ class Source(Protocol):
 
     name: str
 
-    def view(self) -> View:
+    def view(self) -> BoxView:
         """The box as it was last heard."""
         ...
 
@@ -93,10 +93,10 @@ class LineSource:
     ) -> None:  # fmt: skip
         self.name = name
         self._clock, self._also = clock or SystemClock(), heard
-        self._view = View()
+        self._view = BoxView()
         self._box = Palpate(name, baud=baud, listener=self._heard, opener=opener, clock=self._clock)
 
-    def view(self) -> View:
+    def view(self) -> BoxView:
         """The box as it was last heard."""
         return replace(self._view, missed=self._box.missed, damaged=self._box.damaged, trouble=self._box.trouble)
 
@@ -138,13 +138,13 @@ class FeedSource:
         self.name = path
         self.format: Mapping[str, Any] = {}
         self._clock, self._also, self._frame = clock or SystemClock(), heard, frame
-        self._view = View()
+        self._view = BoxView()
         self._feed = Feed(path, frames_hz=frames_hz, clock=self._clock)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="palpate-feed")
         self._thread.start()
 
-    def view(self) -> View:
+    def view(self) -> BoxView:
         """The box as it was last heard."""
         return replace(self._view, trouble=self._feed.trouble)
 
@@ -203,7 +203,7 @@ class FeedSource:
         )  # fmt: skip
 
 
-def noted(view: View, news: Heard, now_ns: int) -> View:
+def noted(view: BoxView, news: Heard, now_ns: int) -> BoxView:
     """The view with what was heard now."""
     if isinstance(news, Answer):
         return replace(view, answer=news, answers=view.answers + 1, heard_ns=now_ns)

@@ -8,7 +8,7 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
-from appliance.bridges.server import Peer, Server
+from appliance.bridges.server import TcpPeer, TcpServer
 from appliance.client.line import Line
 from appliance.core import sentences
 from appliance.core.errors import LinkLost
@@ -24,7 +24,7 @@ class TcpBridge:
     def __init__(
         self, name: str, opener: Callable[[], Any], *, writes: bool, most: int, loop: asyncio.AbstractEventLoop
     ) -> None:
-        self.server = Server(self.serve, most)
+        self.server = TcpServer(self.serve, most)
         self._writes, self._loop = writes, loop
         self._line = Line(opener, self._heard, lambda: None, name=name)
 
@@ -46,7 +46,7 @@ class TcpBridge:
         for peer in [*self.server.peers]:
             peer.write(line)
 
-    async def serve(self, peer: Peer) -> None:
+    async def serve(self, peer: TcpPeer) -> None:
         """Pass on the commands of one peer."""
         rest = b""
         while data := await peer.read(None):

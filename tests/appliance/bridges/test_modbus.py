@@ -20,7 +20,7 @@ from pymodbus.client import ModbusTcpClient
 from appliance.bridges import modbus, modbus_pdu
 from appliance.bridges.modbus import ADDRESSES, COILS, INPUTS, STALE, STATUS_CODES, inputs, registers
 from appliance.bridges.options import MOST
-from appliance.bridges.source import View, noted
+from appliance.bridges.source import BoxView, noted
 from appliance.cli.main import main
 from appliance.client.answers import Answer, BoxState
 from appliance.core.errors import FormatError
@@ -298,13 +298,13 @@ def test_requests_split_anywhere(data: bytes, cuts: list[int]):
     data = b"\0\1\0\0\0\6\1\4\0\0\0\1" + data
     edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
 
-    def whole() -> list[modbus_pdu.Request] | None:
+    def whole() -> list[modbus_pdu.ModbusRequest] | None:
         try:
             return modbus_pdu.requests(data)[0]
         except FormatError:
             return None
 
-    found: list[modbus_pdu.Request] | None = []
+    found: list[modbus_pdu.ModbusRequest] | None = []
     rest = b""
     try:
         for a, b in itertools.pairwise(edges):
@@ -320,16 +320,16 @@ def test_every_pdu_is_parsed_or_refused(pdu: bytes):
     """Nothing else is ever raised; what is parsed stays within the specification's limits."""
     try:
         wanted = modbus_pdu.parse(pdu)
-    except modbus_pdu.Refused:
+    except modbus_pdu.RequestRefused:
         return
     count = wanted.count if isinstance(wanted, modbus_pdu.Reading) else len(wanted.values)
     assert 1 <= count <= modbus_pdu.MOST_BITS
 
 
-def viewed(answer: Answer | None = None, **counts: int) -> View:
+def viewed(answer: Answer | None = None, **counts: int) -> BoxView:
     """A view of a box that streams."""
     said = BoxState.of(read(speaking_box.state()).fields)
-    view = noted(View(labels=LABELS), said, 1)
+    view = noted(BoxView(labels=LABELS), said, 1)
     return noted(view, answer, 1) if answer else view
 
 
@@ -346,9 +346,9 @@ def test_each_status_has_its_code(status: Status):
 
 def test_before_anything_was_heard():
     """All zero but the version and what says that nothing was heard."""
-    words = registers(View(), alive=False)
+    words = registers(BoxView(), alive=False)
     assert {i: w for i, w in enumerate(words) if w} == {0: 1, ADDRESSES["status"]: STALE}
-    assert inputs(View(), alive=False) == [False, False, False, True, False, False]
+    assert inputs(BoxView(), alive=False) == [False, False, False, True, False, False]
 
 
 def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: Address):

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from appliance.bridges.server import QUIET_S, Server
+from appliance.bridges.server import QUIET_S, TcpServer
 from appliance.bridges.source import LinkPort
 from appliance.client.box import Palpate
 from appliance.core.errors import CommandRefused, ConfigError
@@ -130,7 +130,7 @@ def test_a_peer_that_never_reads_is_given_up(box: SpeakingBox):
         deaf.connect(address)
         with socket.create_connection(address, timeout=LONG_S) as peer:
             peer.sendall(b"$PPLP,ID\r\n")
-            heard = b""
+            heard = peer.recv(4096)
             for number in range(1, 5_001):
                 box.say(result(number))
                 if number % 20 == 0:  # the pseudo-terminal holds 4 kB
@@ -145,7 +145,7 @@ def test_a_silent_peer_makes_room():
     """A full server gives up who has been silent longest, but nobody who has spoken lately."""
 
     async def run() -> None:
-        server = Server(lambda peer: asyncio.sleep(LONG_S), most=2)
+        server = TcpServer(lambda peer: asyncio.sleep(LONG_S), most=2)
         await server.open("127.0.0.1", 0)
         for _ in range(2):
             await asyncio.open_connection(*server.address)
@@ -166,6 +166,8 @@ def test_a_box_opens_what_the_bridge_makes(tmp_path: Path):
     path = tmp_path / "line"
     with bridge("tcp", "--link", path, "--allow-writes") as address:
         with socket.create_connection(address, timeout=LONG_S) as peer, serial.Serial(str(path)) as near:
+            peer.sendall(b"hello\r\n")
+            assert b"not a command" in peer.recv(4096)  # so it is served by now
             near.write(state())  # stands for the box
             assert peer.recv(4096) == state()
         assert path.is_symlink()
