@@ -30,6 +30,12 @@ HEAT = (236, 23, 30, 37, 79, 158)
 """Colours of loads in a terminal that knows 256, from none to the strongest."""
 
 
+def abilities(out: TextIO) -> tuple[bool, str]:
+    """Whether a terminal knows 256 colours, and the signs that it can show."""
+    signs = BLOCKS if (out.encoding or "").lower().replace("-", "") == "utf8" else ASCII
+    return "256" in os.environ.get("TERM", ""), signs
+
+
 class LiveScreen(ABC, Generic[Shown]):
     """Shows one thing after another on `out`; `address`: of the page, where there is one. Restores the terminal at the end.
     live: `out` is a terminal on which pictures can be drawn.
@@ -39,10 +45,8 @@ class LiveScreen(ABC, Generic[Shown]):
 
     def __init__(self, out: TextIO, clock: Clock, address: str = "") -> None:
         self._out, self._clock, self._address = out, clock, address
-        kind = os.environ.get("TERM", "dumb")
-        self.live = out.isatty() and kind != "dumb"
-        self._colours = "256" in kind
-        self._signs = BLOCKS if (out.encoding or "").lower().replace("-", "") == "utf8" else ASCII
+        self._colours, self._signs = abilities(out)
+        self.live = out.isatty() and os.environ.get("TERM", "dumb") != "dumb"
         self._next_ns = 0
 
     def __enter__(self) -> Self:

@@ -38,8 +38,11 @@ from appliance.service.systemd import Notifier, VerdictLog
 if TYPE_CHECKING:
     from appliance.alignment.live import Expected
     from appliance.deployment.shadow import Shadow
+    from appliance.recording.recording import RecordingSession
     from appliance.runtime.loop import Box
 
+Facts = Mapping[str, Callable[[], object]]
+"""Further facts of the status and the feed, by their names; a text is shown to a person."""
 OpenDevices = Callable[[Callable[[], SweepFormat] | None], Devices]
 """Opens the devices. Its argument gives the format that a simulated skin has to send; None for whatever its script has."""
 
@@ -122,14 +125,27 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:g} s")
         if slow := skin_profile.warning(fmt):
             log.warning(f"record: {slow}")
-        facts = {"model": lambda: "none: sweeps are recorded"}
+        facts: Facts = {
+            "model": lambda: "none: sweeps are recorded", "recorded": lambda: recording.about()["missing"],
+            "recording": recording.about,
+        }  # fmt: skip
         feed = _feed(settings, fmt, devices.source, {"bundle": "", "labels": []}, facts)
         box = assembly.recorder(
             settings, fmt, devices, port, stack, capture=_capture(args, settings, fmt, stack),
-            observers=[Notifier(SystemClock()), recording, *_status(settings, facts), *feed], commands=recording.commands,
+            observers=[Notifier(SystemClock()), recording, *_printer(fmt, recording), *_status(settings, facts), *feed],
+            commands=recording.commands,
         )  # fmt: skip
         box.run(_done(args, box, devices, stopped))
     return 0
+
+
+def _printer(fmt: SweepFormat, recording: RecordingSession) -> list[Observer]:
+    """What shows each sweep to a person at a terminal."""
+    if not sys.stdout.isatty():
+        return []
+    from appliance.watch.sweep_text import SweepPrinter
+
+    return [SweepPrinter(sys.stdout, fmt.rate_hz, recording.about)]
 
 
 def _announced(settings: Config, devices: Devices) -> SweepFormat:
@@ -167,9 +183,7 @@ def _done(args: argparse.Namespace, box: Box, devices: Devices, stopped: Callabl
     )
 
 
-def _reports(
-    settings: Config, current: Bundle, source: str, facts: Mapping[str, Callable[[], str]], stack: ExitStack
-) -> list[Observer]:
+def _reports(settings: Config, current: Bundle, source: str, facts: Facts, stack: ExitStack) -> list[Observer]:
     """What reports to a person and keeps sweeps, as the settings say: the log, the black box, status and feed with
     `facts`. source: where the frames come from."""
     observers: list[Observer] = [VerdictLog()] if in_journal() else []
@@ -186,17 +200,15 @@ def _reports(
     return [*observers, *_status(settings, facts), *_feed(settings, current.format, source, known, facts)]
 
 
-def _status(settings: Config, facts: Mapping[str, Callable[[], str]]) -> list[Observer]:
+def _status(settings: Config, facts: Facts) -> list[Observer]:
     """The file that `palpate status` reads, where the settings name one that can be written."""
     path = Path(settings.store.status)
     if not settings.store.status or not os.access(path.parent, os.W_OK):
         return []
-    return [StatusFile(path, SystemClock(), lambda: {name: text() for name, text in facts.items()})]
+    return [StatusFile(path, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
 
 
-def _feed(
-    settings: Config, fmt: SweepFormat, source: str, model: Mapping[str, Any], facts: Mapping[str, Callable[[], str]]
-) -> list[Observer]:
+def _feed(settings: Config, fmt: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts) -> list[Observer]:
     """What programs that watch the box read, where the settings name a socket; its default is for a service, whose
     folder is there. model: what the feed's first line says of it."""
     path = Path(settings.feed.socket)
@@ -206,7 +218,7 @@ def _feed(
     from appliance.service.feed import FeedServer
 
     known = {"source": source, "skin": settings.sensor.skin, **model}
-    return [FeedServer(path, fmt, known, SystemClock(), lambda: {name: text() for name, text in facts.items()})]
+    return [FeedServer(path, fmt, known, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
 
 
 def _shadow(settings: Config, current: Bundle, devices: Devices, named: str | None) -> Shadow | None:

@@ -17,7 +17,7 @@ class RecordingProgress:
     """
 
     def __init__(self, target: int) -> None:
-        self._target = target
+        self.target = target
         self._count: Counter[tuple[str, str]] = Counter()
 
     def add(self, material: str, position: str, sweeps: int = 1) -> None:
@@ -25,20 +25,25 @@ class RecordingProgress:
         if material:
             self._count[material, position] += sweeps
 
+    @property
+    def counts(self) -> list[tuple[str, str, int]]:
+        """Material, position and number of stored sweeps of each pair that has any, in order."""
+        return [(*pair, number) for pair, number in sorted((+self._count).items())]
+
     def line(self, material: str, position: str) -> str:
         """What there is of this pair, and what is missing of all: "wood at 2: 3 of 10; missing: wood at 2: 7"."""
         if not material:
             return "no material, so it cannot be trained on; name it with MATERIAL or --material"
-        return f"{_name(material, position)}: {self._count[material, position]} of {self._target}; {self.missing()}"
+        return f"{_name(material, position)}: {self._count[material, position]} of {self.target}; {self.missing()}"
 
     def missing(self) -> str:
         """What is still missing, as far as materials and positions are known."""
         held = +self._count
         materials, positions = (sorted(set(names)) for names in zip(*held, strict=True)) if held else ((), ())
         lacking = [
-            f"{_name(*pair)}: {self._target - held[pair]}"
+            f"{_name(*pair)}: {self.target - held[pair]}"
             for pair in product(materials, positions)
-            if held[pair] < self._target
+            if held[pair] < self.target
         ]
         more = len(lacking) - MOST_SHOWN
         if lacking:

@@ -153,6 +153,15 @@ class RecordingSession(Observer):
         """Number of sweeps of this run on the disk."""
         return len(self._stored)
 
+    def about(self) -> dict[str, Any]:
+        """How far the recording has got, for JSON: labels that hold now, sweeps of this run, what there is of each
+        material and position, how many are wanted of each, and what is missing in words."""
+        labels = self._labels[-1][1]
+        return {
+            "material": labels.material, "position": labels.position, "session": labels.session, "stored": self.stored,
+            "counts": self._progress.counts, "target": self._progress.target, "missing": self._progress.missing(),
+        }  # fmt: skip
+
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and report the outcome in a REC sentence."""
         self._answered = True

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+from binascii import a2b_base64
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import zip_longest
@@ -20,8 +21,9 @@ from appliance.client.feed import Feed
 from appliance.core.clock import Clock
 from appliance.core.errors import FormatError
 from appliance.core.schema import typed
-from appliance.core.types import Status, SweepFormat
+from appliance.core.types import DATA_TYPES, Status, SweepFormat
 from appliance.service import status
+from appliance.watch import sweep_text
 
 FRAMES_HZ = 10.0
 DRAW_NS = 100_000_000
@@ -46,6 +48,9 @@ class WatchedBox:
         self.load: tuple[Map, ...] = ()
         self.full = 1.0
         self.missed = 0
+        self.window: Any = None
+        """Raw counts of the last sweep, None before there is one."""
+        self.rate_hz = 1.0
         self._latencies_ms: deque[float] = deque(maxlen=LATENCIES)
         self._lowest: Any = None
 
@@ -86,6 +91,7 @@ class WatchedBox:
         form = typed(SweepFormat, dict(line["format"]))
         self.hello = {**line, "form": str(form), "labels": [str(label) for label in line["labels"]]}
         self.load, self.full, self._lowest = (), 1.0, None
+        self.window, self.rate_hz = None, form.rate_hz
 
     def _take_health(self, line: Mapping[str, Any]) -> None:
         health = {name: value for name, value in line.items() if name != "type"}
@@ -112,13 +118,21 @@ class WatchedBox:
         self.full = max(self.full, float(load.max()))
         self.load = tuple(np.moveaxis(load, -1, 0).tolist())
 
+    def _take_sweep(self, line: Mapping[str, Any]) -> None:
+        if line["dtype"] not in DATA_TYPES or len(line["shape"]) not in (3, 4):
+            raise ValueError(f"a window of {line['shape']} {line['dtype']}")
+        data = np.frombuffer(a2b_base64(line["data"]), np.dtype(line["dtype"]).newbyteorder("<"))
+        window = data.reshape(line["shape"])
+        sweep_text.picture(window, self.rate_hz, 80, colours=False)  # what cannot be shown is noticed here
+        self.window = window
+
     def _take_lost(self, line: Mapping[str, Any]) -> None:
         self.missed += int(line["lines"])
 
 
 _TAKERS: Mapping[str, Callable[[WatchedBox, Mapping[str, Any]], None]] = {
     "hello": WatchedBox._take_hello, "health": WatchedBox._take_health, "state": WatchedBox._take_state,
-    "verdict": WatchedBox._take_verdict, "frame": WatchedBox._take_frame, "lost": WatchedBox._take_lost,
+    "verdict": WatchedBox._take_verdict, "frame": WatchedBox._take_frame, "sweep": WatchedBox._take_sweep, "lost": WatchedBox._take_lost,
 }  # fmt: skip
 
 
@@ -140,10 +154,9 @@ def picture(
     head = [f" palpate watch   {_what(state)}"[:width], *(f" {BOLD}{text}{PLAIN}" for text in says), ""]
     maps = [line for row in side_by_side(state.load, state.full, width // 2, signs) for line in row]
     wide = max((len(_SEQUENCE.sub("", line)) for line in maps), default=0)
-    beside = list(probabilities(state, signs))
     body = [
         left + " " * (wide - len(_SEQUENCE.sub("", left))) + ("   " + right if right else "")
-        for left, right in zip_longest(maps, beside if wide + BAR + NAME + 15 <= width else [], fillvalue="")
+        for left, right in zip_longest(maps, _beside(state, width - wide - 3, signs), fillvalue="")
     ]
     body = [line if colours else uncoloured(line) for line in body]
     if not state.health:
@@ -163,6 +176,15 @@ def _what(state: WatchedBox) -> str:
         return ""
     simulated = {"usb": "", "replay": "REPLAYED   "}.get(state.hello["source"], "SIMULATED   ")
     return _plain(f"{simulated}{state.hello['skin']} {state.hello['form']}   bundle {state.hello['bundle'] or 'none'}")
+
+
+def _beside(state: WatchedBox, width: int, signs: str) -> list[str]:
+    """What stands beside the skin: probabilities; while sweeps are recorded, the picture of the last one."""
+    if state.hello.get("labels") and width >= NAME + BAR + 10:
+        return list(probabilities(state, signs))
+    if state.window is None or width < NAME + BAR:
+        return []
+    return sweep_text.picture(state.window, state.rate_hz, width, colours=True, signs=signs)
 
 
 def probabilities(state: WatchedBox, signs: str) -> Iterator[str]:
@@ -201,7 +223,8 @@ class TerminalWatch:
 
     def __init__(self, path: str, out: TextIO, clock: Clock) -> None:
         self._screen = WatchScreen(out, clock)
-        self._feed = Feed(path, frames_hz=FRAMES_HZ if self._screen.live else 0, clock=clock)
+        live = self._screen.live
+        self._feed = Feed(path, frames_hz=FRAMES_HZ if live else 0, sweeps=live, clock=clock)
         self._out, self._clock, self._state = out, clock, WatchedBox()
         self._next_ns = clock.now_ns()
 

@@ -22,7 +22,7 @@ from appliance.service.feed import encode
 from appliance.sim import skin
 from appliance.watch import terminal
 from appliance.watch.terminal import TerminalWatch, WatchedBox, events, pass_on, picture
-from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, frames
+from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, cut, frames
 from tests.factories.simulated_box import SECOND
 
 
@@ -30,14 +30,17 @@ def lines_of(folder: Path, fmt: SweepFormat = skin.FORMAT, **facts: str) -> list
     """What a reader gets of a box that streams, answers twice and is swept again."""
     offered = Offered(folder / "feed.sock", fmt, **facts)
     peer = offered.peer()
-    peer.ask('{"frames": 20}')
+    peer.ask('{"frames": 20, "sweeps": true}')
     offered.turns(2)
     for verdict in (OK, replace(OK, sweep=8, status=Status.SHORT, label="", scores=np.empty(0), moved="")):
         offered.feed.frames(frames(1, fmt, first=int(verdict.sweep) * 5))
         offered.feed.answered(verdict)
         offered.turns(4)
-    offered.turns(2, replace(HEALTH, sweeping=True, ready=False))
+    offered.feed.sweep(cut(fmt), OK, {})
+    offered.turns(4)
     lines = peer.lines()
+    offered.turns(2, replace(HEALTH, sweeping=True, ready=False))
+    lines += peer.lines()
     offered.feed.stopping()
     return lines
 
@@ -123,7 +126,8 @@ def test_text_from_outside_does_not_steer_the_terminal(tmp_path: Path) -> None:
         {"type": "hello", "format": {"rows": 0}}, {"type": "hello", "labels": 7}, {"type": "health", "lost_frames": "many"},
         {"type": "verdict", "status": "fine"}, {"type": "verdict", "latency_ns": None}, {"type": "verdict", "scores": ["a"]},
         {"type": "frame", "taxels": []}, {"type": "frame", "taxels": [[1, 2], [3]]}, {"type": "frame", "taxels": 5},
-        {"type": "frame", "taxels": [["x"]]}, {"type": "lost", "lines": "many"},
+        {"type": "frame", "taxels": [["x"]]}, {"type": "lost", "lines": "many"}, {"type": "sweep", "data": "AAAA"},
+        {"type": "sweep", "dtype": "object"}, {"type": "sweep", "shape": [6000, 4]}, {"type": "sweep", "shape": [0, 4, 4]},
     ],
     ids=str,
 )  # fmt: skip
@@ -142,6 +146,18 @@ def test_lines_of_a_later_version_are_passed_over(tmp_path: Path) -> None:
     """A type that is not known, and members that are not."""
     lines = [line | {"more": [1]} for line in lines_of(tmp_path)]
     assert drawn(state_of([{"type": "weather"}, *lines])) == drawn(state_of(lines))
+
+
+def test_while_sweeps_are_recorded_the_last_one_is_shown(tmp_path: Path) -> None:
+    """No labels: beside the skin stand the sweep's signal and spectrogram, and below what is missing."""
+    lines = lines_of(tmp_path, recorded="missing: wood at 1: 7")
+    lines[0] |= {"labels": [], "bundle": ""}
+    shown = drawn(state_of(lines))
+    text = "\n".join(shown)
+    assert "375 Hz" in text
+    assert "recorded missing: wood at 1: 7" in text
+    assert max(map(len, shown)) <= 80
+    assert len(shown) <= 24
 
 
 def test_missed_lines_are_counted(tmp_path: Path) -> None:
