@@ -64,6 +64,8 @@ class SerialSensor(LinkSensor):
     open_port: makes a port from path and baud rate. ports: the serial ports that there are.
     """
 
+    announced = False
+
     def __init__(
         self,
         config: SensorConfig,

@@ -25,6 +25,10 @@ STAMPS_NS = 5_000_000
 """Largest jitter of a board's time stamps: it may count milliseconds, or be delayed by an interrupt. Windows do not
 move by that."""
 
+PROOF_NS = 5_000_000_000
+"""A skin that announces nothing and turned out to be another one within this time after it was opened has to send for
+as long without a fault before it counts as streaming again: READY does not come and go with a wrong skin."""
+
 _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 
 
@@ -215,7 +219,10 @@ class LinkSensor(ABC):
 
     States: `streaming`, or `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent`, where `trouble` says what to do.
     A skin that is plugged in again is a new enumeration: its frames get a new epoch in `seq` and a new clock.
+    announced: the skin says what it sends when it is opened.
     """
+
+    announced = True
 
     def __init__(
         self,
@@ -235,6 +242,8 @@ class LinkSensor(ABC):
         self._retry_ns = clock.now_ns()
         self._quiet_ns = 0  # time spent reading since the last frame
         self._unheard = 0  # bytes since then
+        self._opened_ns = 0
+        self._proof_ns: int | None = None  # how long it has to send before it counts as streaming; None: not at all
 
     @property
     def clock(self) -> dict[str, float] | None:
@@ -263,8 +272,10 @@ class LinkSensor(ABC):
             frames = self._frames(data, now)
         if self.counters.frames > before:
             self._quiet_ns = self._unheard = 0
+            if self.state != "streaming" and now - self._opened_ns >= (self._proof_ns or 0):
+                self._set_state("streaming", None)
         self._check_silence()
-        return frames
+        return frames if self.state == "streaming" else Frames.empty(self._format)
 
     def close(self) -> None:
         """Stop the skin and release it."""
@@ -294,7 +305,9 @@ class LinkSensor(ABC):
             return False
         self._stream.restart()
         self._quiet_ns = self._unheard = 0
-        self._set_state("streaming", None)
+        self._opened_ns = self._clock.now_ns()
+        if self.announced or self._proof_ns is None:
+            self._set_state("streaming", None)
         return True
 
     def _transfer(self) -> bytes:
@@ -312,18 +325,21 @@ class LinkSensor(ABC):
         try:
             return self._stream.feed(data, now_ns)
         except SensorMismatch as e:
-            self._drop(e)
+            at_once = now_ns - self._opened_ns < PROOF_NS
+            self._drop(e, PROOF_NS if at_once else 0)
             return Frames.empty(self._format)
 
     def _check_silence(self) -> None:
         """Restart a skin that is connected but has sent no complete frame in `silence_ms` of reading."""
         quiet_ms = self._quiet_ns // 1_000_000
         if self._link and quiet_ms > self._config.silence_ms:
-            self._drop(self._mute(quiet_ms, self._unheard))
+            self._drop(self._mute(quiet_ms, self._unheard), 0)
 
-    def _drop(self, why: SensorError) -> None:
-        """Release the skin, keep the reason, and try again after `retry_ms`."""
+    def _drop(self, why: SensorError, proof_ns: int | None = None) -> None:
+        """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: how long it has to send before it
+        counts as streaming again, 0 for a frame; None: nothing speaks against it once it is opened."""
         self.close()
+        self._proof_ns = proof_ns
         self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000
         self._set_state(why.state, why)
 

@@ -1,5 +1,10 @@
 """Skins on a wire, for tests in virtual time. In: a profile's name. Out: what its frames must hold, their bytes as they are
-described by the makers, and a port that delivers them with a driver's buffer and every fault."""
+described by the makers, and a port that delivers them with a driver's buffer and every fault.
+
+The bytes are written a second time here and not taken from `appliance.sim.skins.wires`, on purpose: two readings of the
+same descriptions, with other choices where a skin leaves one (width of offsets, order of fields, separators), so that a
+mistake of one of them is not confirmed by itself.
+"""
 
 from __future__ import annotations
 

@@ -103,6 +103,17 @@ class FrameCheck(Observer):
         self.statuses.append(str(verdict.status))
 
 
+class PromptClock(SystemClock):
+    """The real clock. latest_ns: the most that a sleep ended late: so long the machine let nobody run."""
+
+    latest_ns = 0
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Sleep until `t_ns`."""
+        super().sleep_until(t_ns)
+        self.latest_ns = max(self.latest_ns, self.now_ns() - t_ns)
+
+
 def hurry(priority: int) -> bool:
     """Schedule this process before all usual ones; False where that is not allowed."""
     try:
@@ -132,12 +143,12 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
         if box.health.skin != "streaming" or box.counters.enumerations != 1:
             raise SystemExit(f"{name}: the skin was lost: {box.health}")
         player.send_signal(signal.SIGTERM)
-        thrown = json.loads(player.communicate()[0])["thrown"]
+        emulator = json.loads(player.communicate()[0])
     came, missing = check.counted()
     return {
         "skin": name, "format": str(current.format), "seconds": round(wall / 1e9, 1), "share": round(cpu / wall, 4),
         "real_time": real_time, "came": came, "missing": missing, "counted_lost": box.counters.lost_frames - lost,
-        "garbage": box.counters.garbage_bytes, "thrown": thrown, "answers": len(check.answer_ms),
+        "garbage": box.counters.garbage_bytes, **emulator, "answers": len(check.answer_ms),
         "statuses": {status: check.statuses.count(status) for status in sorted(set(check.statuses))},
         "answer_ms": {f"p{q}": round(float(np.percentile(check.answer_ms, q)), 2) for q in (50, 99)},
     }  # fmt: skip
@@ -174,16 +185,19 @@ def _playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
 
 
 def play(name: str, rate_hz: float, link: Path) -> None:
-    """Play a skin at `link` until SIGTERM; prints how many bytes nobody took."""
+    """Play a skin at `link` until SIGTERM; prints how many bytes nobody took, and how late it was itself at most."""
     stop = Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     profile = replace(skin_profile.load(name, [PROFILES]), rate_hz=rate_hz)
     source = Sliding(name, profile, profile.format)
     hurry(EMULATOR)
-    player = Player(wire(name, rate_hz), source, SystemClock(), link)
+    clock = PromptClock()
+    player = Player(wire(name, rate_hz), source, clock, link)
+    player.step()
+    clock.latest_ns = 0
     player.run(stop.is_set)
     player.close()
-    print(json.dumps({"thrown": player.thrown}))
+    print(json.dumps({"thrown": player.thrown, "emulator_late_ms": round(clock.latest_ns / 1e6, 1)}))
 
 
 if __name__ == "__main__":

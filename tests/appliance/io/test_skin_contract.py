@@ -168,12 +168,13 @@ def test_garbage(name: str):
 
 @each
 def test_wrong_skin(name: str):
-    """Bytes of another skin: no frame, mismatch, and the message says what was heard and what to do."""
+    """Bytes of another skin: no frame, a mismatch that stays, and the message says what was heard and what to do."""
     other = "3d-vitac" if name != "3d-vitac" else "flexitac"
     skin = WiredSkin(name)
     skin.port.frames = lambda i: wire(other, i)
-    assert len(skin.seconds(2)) == 0
-    assert set(skin.states) == {"streaming", "mismatch"}
+    assert len(skin.seconds(4)) == 0
+    assert skin.states == ["streaming", "mismatch"]
+    assert skin.sensor.counters.enumerations > 1
     why = skin.troubles[skin.states.index("mismatch")]
     assert f"no frame of profile {name}" in why
     assert "palpate skin detect" in why
@@ -193,9 +194,11 @@ def test_wrong_format_of_the_bundle(name: str):
 @each
 @pytest.mark.parametrize("rate", [0.5, 0.9, 1.1, 2.0])
 def test_wrong_rate(name: str, rate: float):
-    """A skin that is too slow or too fast: mismatch, with the measured figure and what to set."""
+    """A skin that is too slow or too fast: a mismatch that stays, with the measured figure and what to set, until it has
+    sent at the right rate for a while."""
     skin = WiredSkin(name, rate=rate)
-    skin.seconds(6)
+    skin.seconds(12)
+    assert skin.states == ["streaming", "mismatch"]
     seen = [why for state, why in zip(skin.states, skin.troubles, strict=True) if state == "mismatch"]
     assert seen
     if skin.sensor.loss_known:
@@ -204,6 +207,12 @@ def test_wrong_rate(name: str, rate: float):
         figure = float(seen[0].split("sends ")[1].split(" frames")[0])
         assert figure == pytest.approx(rate * skin.format.rate_hz, rel=0.05)
         assert "sensor.rate_hz" in seen[0]
+    skin.port.period_ns = skin.format.period_ns  # somebody corrects it
+    skin.port.begun_ns = skin.clock.now_ns() - round(skin.port._next * skin.port.period_ns)
+    skin.port.frames = lambda i: wire(name, i, skin.port.period_ns)
+    skin.seconds(14)
+    assert skin.states == ["streaming", "mismatch", "streaming"]
+    assert len(skin.seconds(1))
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "papillarray"])

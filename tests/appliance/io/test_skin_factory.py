@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -64,21 +65,22 @@ def test_a_wrong_profile_is_named():
 
 @pytest.fixture
 def playing() -> Iterator[str]:
-    """Path of a terminal on which a FlexiTac sends frame after frame, as fast as they are read."""
+    """Path of a terminal on which a FlexiTac sends 100 frames a second."""
     with pseudo_terminal.pair() as (far, path):
         ended = threading.Event()
 
         def play() -> None:
-            rest, i = b"", 0
+            rest, i, begin = b"", 0, time.monotonic()
             while not ended.is_set():
                 if not rest:
+                    ended.wait(
+                        max(0, begin + i / 100 - time.monotonic())
+                    )  # 100 Hz on average, however busy the machine
                     rest, i = wire("flexitac", i), i + 1
                 try:
                     rest = rest[os.write(far, rest) :]
                 except BlockingIOError:
                     ended.wait(0.001)
-                else:
-                    ended.wait(0.01 if not rest else 0)
 
         thread = threading.Thread(target=play)
         thread.start()

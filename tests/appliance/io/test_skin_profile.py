@@ -105,6 +105,20 @@ def test_the_template_explains_each_key():
     assert [key for key in skin_profile._KEYS if not re.search(rf"^#?{key} = ", text, re.MULTILINE)] == []
 
 
+def test_modem_manager_leaves_each_skin_alone():
+    """The rules that `make install` delivers name the USB ids of every delivered profile."""
+    rules = (ROOT / "firmware_config" / "70-palpate.rules").read_text()
+    ignored = 'SUBSYSTEM!="tty", GOTO="palpate_skins_end"', 'LABEL="palpate_skins_end"'
+    lines = rules.split(ignored[0])[1].split(ignored[1])[0].splitlines()
+    named = [re.search(r'idVendor}=="(\w{4})", ATTRS{idProduct}=="(\w{4})"', line) for line in lines if line]
+    assert all(
+        'ENV{ID_MM_DEVICE_IGNORE}="1"' in line and 'ENV{ID_MM_PORT_IGNORE}="1"' in line for line in lines if line
+    )
+    assert sorted(f"{ids[1]}:{ids[2]}" for ids in named if ids) == sorted(
+        usb_id for name in NAMES for usb_id in profile(name).usb_ids
+    )
+
+
 def test_what_each_lacks():
     """Only a skin that counts its frames shows its loss."""
     assert {name: profile(name).lacks for name in NAMES} == {
