@@ -123,7 +123,7 @@ wheel: $(RUNTIME) ## build the wheel of the box into dist/
 	$(PIP) wheel --no-deps -w dist .
 
 lock: ## lock the runtime's versions with hashes, for every platform (needs uv)
-	uv pip compile pyproject.toml --universal --generate-hashes --no-header --python-version 3.11 -o appliance/requirements.lock
+	uv pip compile pyproject.toml --extra page --universal --generate-hashes --no-header --python-version 3.11 -o appliance/requirements.lock
 
 clean: ## remove what was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info train/*.egg-info

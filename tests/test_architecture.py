@@ -21,8 +21,8 @@ GROUNDS = [p for p in TESTS if p.parent.name in ("rig", "backends", "fuzz", "cut
 BOX = [p for p in SOURCES if p.is_relative_to(ROOT / "appliance") and "sim" not in p.parts]
 ALLOWED = {"appliance", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2"}
 """What the box may import; the last is Python's own from 3.12 on."""
-ROS = {"rclpy", "diagnostic_msgs", "sensor_msgs", "std_srvs"}
-"""What the bridge to ROS 2 imports beside that: an extra, in one module that is loaded for it alone."""
+EXTRAS = {"watch": {"tornado"}, "bridges/ros.py": {"rclpy", "diagnostic_msgs", "sensor_msgs", "std_srvs"}}
+"""What a package or module imports beside that, of an extra; it is loaded for this alone."""
 LONGEST = 500
 """Lines of a module, about."""
 
@@ -89,10 +89,11 @@ def test_packages_import_downwards_only():
 
 @pytest.mark.parametrize("path", BOX, ids=lambda p: str(p.relative_to(ROOT)))
 def test_the_box_imports_five_libraries(path: Path):
-    """Only the five libraries of the design, and itself by full names."""
+    """Only the five libraries of the design, and itself by full names; those of an extra only in the part that it is for."""
+    extras = (names for part, names in EXTRAS.items() if path.is_relative_to(ROOT / "appliance" / part))
+    extra = set().union(*extras)
     for name in imports(path):
-        allowed = ALLOWED | (ROS if path.match("bridges/ros.py") else set())
-        assert name.split(".")[0] in allowed | set(sys.stdlib_module_names), f"{path.name} imports {name}"
+        assert name.split(".")[0] in ALLOWED | extra | set(sys.stdlib_module_names), f"{path.name} imports {name}"
 
 
 @pytest.mark.parametrize("path", TESTS, ids=lambda p: str(p.relative_to(ROOT)))
@@ -223,7 +224,7 @@ def test_the_wheel_holds_the_appliance_alone(wheel: Path):
     assert {
         "appliance/default_bundle/model.onnx",
         "appliance/default_bundle/manifest.json",
-        "appliance/alignment/page.html",
+        "appliance/watch/page/watch.html",
     } <= set(names)
     assert any(n.endswith("licenses/LICENSE") for n in names)
 

@@ -3,9 +3,9 @@ displays."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from appliance.alignment.view import Display, View
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import Config
 from appliance.core.devices import Devices
+from appliance.core.schema import typed
 from appliance.core.types import Frames, SweepFormat, normal
 from appliance.io import skins
 from appliance.signal.contact import IN_PLACE, ContactPositions, Point, advice, centre
@@ -33,64 +34,77 @@ SHOWN = 10
 class Expected:
     """What is known of the skin beforehand. bundle: the one that fits it, in words. contact: its threshold, in counts, and
     place: its positions in training, both None without such a bundle, or where it does not know them. unloaded: counts
-    [R, C] along the normal that an unloaded skin gives by the bundle; 0 without."""
+    [R, C] along the normal that an unloaded skin gives by the bundle; 0 without. fingertip: setting `sensor.fingertip`."""
 
     format: SweepFormat
     bundle: str = NO_BUNDLE
     contact: float | None = None
     place: ContactPositions | None = None
     unloaded: NDArray[np.float64] | float = 0.0
+    fingertip: str = ""
 
     @classmethod
-    def by(cls, model: Bundle) -> Expected:
+    def by(cls, model: Bundle, fingertip: str = "") -> Expected:
         """What a bundle says."""
         m = model.manifest
-        return cls(m.format, f"{m.name} {m.version}, {model.id}", m.thresholds.contact, m.place, normal(m.tare, 0))
+        named = f"{m.name} {m.version}, {model.id}"
+        return cls(m.format, named, m.thresholds.contact, m.place, normal(m.tare, 0), fingertip)
+
+    def json(self) -> dict[str, Any]:
+        """All but format and bundle, for the feed."""
+        place = asdict(self.place) if self.place else None
+        unloaded = np.asarray(self.unloaded).tolist()
+        return {"contact": self.contact, "place": place, "unloaded": unloaded, "fingertip": self.fingertip}
+
+    @classmethod
+    def read(cls, fmt: SweepFormat, known: Mapping[str, Any], bundle: str) -> Expected:
+        """From what `json` gave; nothing where `known` is empty. Raises KeyError, TypeError, ValueError or BundleError."""
+        if not known:
+            return cls(fmt, bundle or NO_BUNDLE)
+        place = typed(ContactPositions, known["place"]) if known["place"] else None
+        unloaded = np.array(known["unloaded"], np.float64)
+        if unloaded.shape not in ((), (fmt.rows, fmt.cols)):
+            raise ValueError(f"unloaded counts of {unloaded.shape}")
+        return cls(
+            fmt, bundle or NO_BUNDLE, known["contact"], place, unloaded,
+            str(known["fingertip"]),
+        )  # fmt: skip
 
 
-class Alignment:
-    """Reads the skin and makes Views of it.
+class ContactTracker:
+    """Makes Views of the frames of a skin.
 
     Of a skin with several axes it looks at the normal one alone. The unloaded value of a taxel is the lowest it has been
     since the skin was connected: so nobody has to press a key, and a finger that lay on the skin at the start is noticed
     when it is lifted (with a bundle, whose threshold is above what an unloaded skin gives).
     """
 
-    def __init__(self, settings: Config, expected: Expected, devices: Devices) -> None:
-        self._sensor = skins.sensor(settings, expected.format, devices)
-        self._expected, self._source, self._fingertip = expected, devices.source, settings.sensor.fingertip
+    def __init__(self, expected: Expected, source: str) -> None:
+        self._expected, self._source = expected, source
         self._shape = expected.format.rows, expected.format.cols
         self._span = max(1, round(SPAN_S * expected.format.rate_hz))
         self._number = 0
         self._unloaded = UnloadedTracker(expected.format)
-        self._reset()
+        self.reset()
 
-    def _reset(self) -> None:
+    def reset(self) -> None:
         """Start anew: this may be another skin than before."""
         self._latest = normal(Frames.empty(self._expected.format).taxels, 1)
         self._lowest = np.full(self._shape, np.inf)
         self._full = SHOWN * abs(self._expected.contact or 0.1)
-        self._enumerations = self._sensor.counters.enumerations
         self._unloaded.restart()
 
-    def read(self) -> None:
-        """Read frames from the skin; waits at most `sensor.timeout_ms`."""
-        frames = self._sensor.read()
-        if self._sensor.counters.enumerations != self._enumerations:
-            self._reset()
-        self._latest = np.concatenate([self._latest, normal(frames.taxels, 1)])[-self._span :]
+    def put(self, taxels: NDArray[Any]) -> None:
+        """Take the newest frames, raw counts [n, R, C] or [n, R, C, A]."""
+        self._latest = np.concatenate([self._latest, normal(taxels, 1)])[-self._span :]
         if self._expected.contact is None:
-            self._unloaded.put(frames.taxels)
+            self._unloaded.put(taxels)
 
-    def close(self) -> None:
-        """Release the skin."""
-        self._sensor.close()
-
-    def view(self) -> View:
-        """The View of this moment."""
-        self._number += 1
-        if self._sensor.state != "streaming":
-            return self._view("no-skin", f"no skin: {self._sensor.state}", str(self._sensor.trouble or ""))
+    def view(self, skin: str, trouble: str) -> View:
+        """The View of this moment. skin: its state (PROTOCOL.md). trouble: why it does not stream."""
+        self._number, self._skin = self._number + 1, skin
+        if skin != "streaming":
+            return self._view("no-skin", f"no skin: {skin}", trouble)
         contact = self._expected.contact
         if contact is None and self._unloaded.skin:
             contact = self._unloaded.skin.contact
@@ -129,8 +143,34 @@ class Alignment:
         return self._view("off", advice(offset, self._shape), hint, **shown)
 
     def _view(self, state: str, message: str, hint: str, **shown: Any) -> View:
-        return View(self._number, self._source, self._expected.bundle, self._sensor.state, state, message, hint,
-                    self._shape, place=self._expected.place, fingertip=self._fingertip, **shown)  # fmt: skip
+        known = self._expected
+        return View(self._number, self._source, known.bundle, self._skin, state, message, hint, self._shape,
+                    place=known.place, fingertip=known.fingertip, **shown)  # fmt: skip
+
+
+class Alignment:
+    """Reads the skin and makes Views of it."""
+
+    def __init__(self, settings: Config, expected: Expected, devices: Devices) -> None:
+        self._sensor = skins.sensor(settings, expected.format, devices)
+        self._tracker = ContactTracker(expected, devices.source)
+        self._enumerations = self._sensor.counters.enumerations
+
+    def read(self) -> None:
+        """Read frames from the skin; waits at most `sensor.timeout_ms`."""
+        frames = self._sensor.read()
+        if self._sensor.counters.enumerations != self._enumerations:
+            self._enumerations = self._sensor.counters.enumerations
+            self._tracker.reset()
+        self._tracker.put(frames.taxels)
+
+    def close(self) -> None:
+        """Release the skin."""
+        self._sensor.close()
+
+    def view(self) -> View:
+        """The View of this moment."""
+        return self._tracker.view(self._sensor.state, str(self._sensor.trouble or ""))
 
 
 def run(

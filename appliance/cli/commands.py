@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from appliance.deployment.shadow import Shadow
     from appliance.recording.recording import RecordingSession
     from appliance.runtime.loop import Box
+    from appliance.watch.server import PageServer
 
 Facts = Mapping[str, Callable[[], object]]
 """Further facts of the status and the feed, by their names; a text is shown to a person."""
@@ -196,7 +197,10 @@ def _reports(settings: Config, current: Bundle, source: str, facts: Facts, stack
     m = current.manifest
     model = f"{m.name} {m.version}, {len(m.labels)} labels"
     facts = {"model": lambda: model, **facts}
-    known = {"bundle": current.id, "labels": m.labels}
+    from appliance.alignment.live import Expected
+
+    expected = Expected.by(current, settings.sensor.fingertip)
+    known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
     return [*observers, *_status(settings, facts), *_feed(settings, current.format, source, known, facts)]
 
 
@@ -288,12 +292,21 @@ def run_enrol(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     return 0
 
 
+def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer]:
+    """The server of a page for browsers on this machine, where a port is given."""
+    if port is None:
+        return []
+    from appliance.watch.access import Access
+    from appliance.watch.server import PageServer
+
+    return [stack.enter_context(PageServer(name, Access(port), SystemClock().now_ns))]
+
+
 def run_align(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     """`palpate align`: where the contact lies, until Ctrl-C."""
     from appliance.alignment import live
     from appliance.alignment.terminal import Screen
     from appliance.alignment.view import Display
-    from appliance.alignment.web import Page
 
     if args.sim == "skin":  # its sweeps lift the finger for a tenth of a second; for this it rests
         args.sim = "rest"
@@ -302,7 +315,7 @@ def run_align(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     expected = _expected(devices.wire(settings), devices)
     stopped = stop_flag()  # before anybody can read the page's address
     with ExitStack() as stack:
-        pages = [stack.enter_context(Page(args.web, devices.clock))] if args.web is not None else []
+        pages = local_page("watch.html", args.web, stack)
         screen = stack.enter_context(Screen(sys.stdout, devices.clock, *(page.address for page in pages)))
         displays: list[Display] = [screen, *pages]
         live.run(devices.wire(settings), expected, devices, displays, stopped)
@@ -313,7 +326,7 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     """What is known of the skin: by the bundle, where there is one that fits it or no skin yet."""
     from appliance.alignment.live import Expected
 
-    current = None
+    current, fingertip = None, settings.sensor.fingertip
     try:
         current = load_bundle(settings)
     except BundleError as e:
@@ -323,8 +336,10 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     except SensorError:
         if not current:
             raise
-        return Expected.by(current)  # the skin is waited for
-    return Expected.by(current) if current and fits(fmt, current.format) else Expected(fmt)
+        return Expected.by(current, fingertip)  # the skin is waited for
+    if current and fits(fmt, current.format):
+        return Expected.by(current, fingertip)
+    return Expected(fmt, fingertip=fingertip)
 
 
 def run_replay(args: argparse.Namespace) -> int:

@@ -157,7 +157,12 @@ def _local_commands(
     add("check", "self-test: bundle, golden sweeps, devices", devices, answers)
     add("status", "state of the service, and its last verdicts").add_argument("--json", action="store_true")
     watch = add("watch", "the running box live: skin, verdicts, latency and loss, over its feed")
-    watch.add_argument("--json", action="store_true", help="the feed's lines as they are (PROTOCOL.md, part 4)")
+    shown = watch.add_mutually_exclusive_group()
+    shown.add_argument("--json", action="store_true", help="the feed's lines as they are (PROTOCOL.md, part 4)")
+    shown.add_argument(
+        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        help=f"as a page (default port {WEB_PORT}); watch.address and its token open it to the network",
+    )  # fmt: skip
     add("replay", "judge a capture, a kept sweep or a folder of them again").add_argument("file", type=Path)
     add("config", "print each value with its source")
     bench = add("bench", "measure latency, memory, start and processor share on this machine")

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from functools import partial
 
-from appliance.cli.commands import OpenDevices, load_settings, stop_flag
+from appliance.cli.commands import OpenDevices, load_settings, local_page, stop_flag
 from appliance.core import storage
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
@@ -89,7 +89,6 @@ def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError
 
 def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     """`palpate skin show`: the skin live, in the terminal and on a page, until Ctrl-C."""
-    from appliance.alignment.web import Page
     from appliance.tools import skin_show
     from appliance.tools.skin_screen import SkinScreen
 
@@ -100,7 +99,7 @@ def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         log.warning(f"warning: {slow}")
     stopped = stop_flag()
     with ExitStack() as stack:
-        pages = [] if args.web is None else [stack.enter_context(Page(args.web, devices.clock, skin_show.PAGE))]
+        pages = local_page("skin.html", args.web, stack)
         screen = stack.enter_context(SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages)))
         sensor = stack.enter_context(closing(skins.sensor(settings, fmt, devices)))
         name = settings.sensor.skin

@@ -8,17 +8,25 @@ import sys
 from appliance.cli.commands import load_settings, stop_flag
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ConfigError
-from appliance.core.log import TroubleLog
+from appliance.core.log import TroubleLog, log
 
 
 def run_watch(args: argparse.Namespace) -> int:
     """`palpate watch`: until Ctrl-C or SIGTERM."""
-    from appliance.watch import terminal
-
-    path, clock = load_settings(args).feed.socket, SystemClock()
+    settings, clock = load_settings(args), SystemClock()
+    path, stopped = settings.feed.socket, stop_flag()
     if not path:
         raise ConfigError('feed.socket = "" turns the feed off, so there is nothing to watch; set it to a path')
-    stopped = stop_flag()
+    if args.web is not None:
+        from appliance.watch.access import Access
+        from appliance.watch.web import PageWatcher
+
+        watcher = PageWatcher(path, Access.configured(settings.watch, args.web), clock.now_ns)
+        log.info(f"page: {watcher.server.address}")
+        watcher.run(stopped)
+        return 0
+    from appliance.watch import terminal
+
     if args.json:
         trouble = TroubleLog("feed", end="feed: it is read", known=False)
         terminal.pass_on(path, sys.stdout, clock, stopped, trouble.update)

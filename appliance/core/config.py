@@ -172,6 +172,18 @@ class FeedConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class WatchConfig:
+    """The page of `palpate watch --web`. address: where it listens; beyond this machine only with token and certificate.
+
+    names: further host names by which browsers may ask for it, separated by spaces. folder: token, certificate.pem and key.pem.
+    """
+
+    address: str = "127.0.0.1"
+    names: str = ""
+    folder: str = "/etc/palpate/watch"
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """All settings. board: the board file's name, "" for none. folder: where the files are, skins/ among them.
 
@@ -187,6 +199,7 @@ class Config:
     classifier: ClassifierConfig
     store: StoreConfig
     feed: FeedConfig
+    watch: WatchConfig
     sources: Mapping[str, str] = field(compare=False)
     folder: Path = field(default=SITE.parent, compare=False)
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 from appliance.alignment.live import VIEW_NS
 from appliance.core.clock import Clock
 from appliance.core.types import SweepFormat
 from appliance.io.usb_sensor import Sensor
 from appliance.tools.skin_monitor import LiveView, SkinDisplay, SkinMonitor
-
-PAGE = Path(__file__).with_name("skin_page.html")
 
 
 def run(

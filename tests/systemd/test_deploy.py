@@ -22,21 +22,10 @@ from threading import Thread
 import pytest
 
 from tests.factories import deliveries, emulated_machines, hosts
-from tests.factories.emulated_machines import ROOT
+from tests.factories.install_scripts import SCRIPTS, run_here
 from tests.factories.nspawn import CABLE, CABLED, PALPATE, SIM, WAIT_S
 
 pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
-
-SCRIPTS = ROOT / "systemd"
-
-
-def run_here(code: str) -> str:
-    """Output of Python code that imports the scripts. gevent would change this process too much to import them here."""
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(SCRIPTS)}, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
 
 
 @pytest.fixture(scope="session")

@@ -1,16 +1,13 @@
-"""The page of `palpate align`: what its server answers and refuses, and the page in a headless browser."""
+"""The page of `palpate align` in a headless browser: alone, and as the command serves it."""
 
 from __future__ import annotations
 
-import json
 import re
 import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import pairwise
 from math import dist, hypot
@@ -19,14 +16,13 @@ from typing import Any
 
 import pytest
 
-from appliance.alignment import web
 from appliance.alignment.view import View
-from appliance.alignment.web import MOST_HEAD, MOST_OPEN, Page
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Manifest
 from appliance.core.clock import SystemClock
-from appliance.core.errors import ConfigError
 from appliance.signal.contact import ContactPositions
+from appliance.watch.access import Access
+from appliance.watch.server import PageServer
 from tests.factories.browser import WAIT_S, BrowsedPage, contrast, luminance, until
 
 PLACE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
@@ -38,163 +34,11 @@ VIEW = View(
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
+def page() -> Iterator[PageServer]:
     """A page that shows VIEW, at any free port."""
-    with Page(0, SystemClock()) as one:
+    with PageServer("watch.html", Access(0), SystemClock().now_ns) as one:
         one.show(VIEW)
         yield one
-
-
-def port(page: Page) -> int:
-    """The port it listens on."""
-    return int(page.address.rsplit(":", 1)[1])
-
-
-def connected(page: Page) -> socket.socket:
-    """A connection to it."""
-    return socket.create_connection(("127.0.0.1", port(page)), timeout=WAIT_S)
-
-
-def received_by(one: socket.socket) -> bytes:
-    """All that comes until the other side ends."""
-    received = b""
-    with suppress(ConnectionResetError):
-        while more := one.recv(65536):
-            received += more
-    return received
-
-
-def ask(page: Page, path: str = "/state", method: str = "GET", host: str = "localhost", more: str = "") -> bytes:
-    """Its answer to one request, head and body."""
-    with connected(page) as one:
-        one.sendall(f"{method} {path} HTTP/1.1\r\nHost: {host}\r\n{more}\r\n".encode())
-        return received_by(one)
-
-
-def test_the_state_is_the_newest_view(page: Page):
-    """JSON with every field; the next View replaces it at once."""
-    head, _, body = ask(page).partition(b"\r\n\r\n")
-    assert head.startswith(b"HTTP/1.0 200 ")
-    assert b"Content-Type: application/json" in head
-    assert json.loads(body) == json.loads(json.dumps(VIEW.json()))
-    page.show(replace(VIEW, number=8, centre=None, place=None))
-    state = json.loads(ask(page).partition(b"\r\n\r\n")[2])
-    assert (state["number"], state["centre"], state["place"]) == (8, None, None)
-
-
-@pytest.mark.parametrize("path", ["/", "/state", "/nothing"])
-def test_every_answer_says_what_a_browser_may_do(page: Page, path: str):
-    """No caching, no frames, nothing loaded from elsewhere, and no version of the server; in errors, too."""
-    head = ask(page, path).partition(b"\r\n\r\n")[0].decode()
-    for line in (
-        "Cache-Control: no-store",
-        "X-Frame-Options: DENY",
-        "X-Content-Type-Options: nosniff",
-        "Content-Security-Policy: default-src 'none'; script-src 'sha256-",
-        "frame-ancestors 'none'",
-    ):
-        assert line in head
-    assert "unsafe" not in head
-    assert "Python" not in head
-
-
-@pytest.mark.parametrize(
-    ("path", "method", "host", "answer"),
-    [
-        ("/", "GET", "127.0.0.1:9000", 200),
-        ("/index.html", "GET", "localhost", 404),
-        ("/state?x", "GET", "localhost", 404),
-        ("/state/", "GET", "localhost", 404),
-        ("/../etc/passwd", "GET", "localhost", 404),
-        ("/state", "POST", "localhost", 501),
-        ("/state", "PUT", "localhost", 501),
-        ("/state", "OPTIONS", "localhost", 501),
-        ("/", "GET", "evil.example", 421),
-        ("/", "GET", "localhost.evil.example:80", 421),
-        ("/", "GET", "", 421),
-    ],
-)
-def test_two_paths_for_this_machine_and_no_more(page: Page, path: str, method: str, host: str, answer: int):
-    """GET of `/` and `/state` under this machine's names; anything else is refused with its HTTP status."""
-    reply = ask(page, path, method, host, "Content-Length: 5\r\n")
-    assert int(reply.split()[1]) == answer
-    assert (b"doctype" in reply.lower()) or answer != 200
-
-
-def test_it_listens_on_this_machine_alone(page: Page):
-    """The socket is bound to 127.0.0.1; another address of this machine is refused."""
-    assert page.address.startswith("http://127.0.0.1:")
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.2", port(page)), timeout=WAIT_S)
-
-
-def test_a_port_that_is_taken_is_named(page: Page):
-    """A ConfigError with the port and what to do; so is a number that is no port."""
-    for taken in (port(page), 70_000):
-        with pytest.raises(ConfigError, match=f"port {taken} .*--web PORT"):
-            Page(taken, SystemClock())
-
-
-@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)])
-def test_half_a_request_ends_at_the_deadline(page: Page, sent: bytes, monkeypatch: pytest.MonkeyPatch):
-    """It gets no answer and a closed connection, even if bytes keep coming one by one; others are served."""
-    monkeypatch.setattr(web, "DEADLINE_NS", 300_000_000)
-    with connected(page) as slow, connected(page) as dripping:
-        slow.sendall(sent)
-        dripping.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
-        assert b" 200 " in ask(page)
-        ended = threading.Event()
-
-        def drip() -> None:
-            with suppress(OSError):
-                while not ended.wait(0.02):
-                    dripping.sendall(b"X: y\r\n")
-
-        thread = threading.Thread(target=drip)
-        thread.start()
-        try:
-            assert received_by(slow) == b""
-            assert received_by(dripping) == b""
-        finally:
-            ended.set()
-            thread.join()
-
-
-def test_an_endless_head_is_not_read_on(page: Page):
-    """After MOST_HEAD bytes without an empty line the connection is closed at once, long before the deadline."""
-    with connected(page) as one:
-        with suppress(OSError):
-            one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * MOST_HEAD)
-        assert received_by(one) == b""
-
-
-@pytest.mark.slow
-def test_too_many_connections_are_turned_away(page: Page, monkeypatch: pytest.MonkeyPatch):
-    """MOST_OPEN wait for their deadline; the next one is closed at once; when they are gone, new ones are served."""
-    monkeypatch.setattr(web, "DEADLINE_NS", 700_000_000)
-    with ExitStack() as stack:
-        open_ones = [stack.enter_context(connected(page)) for _ in range(MOST_OPEN)]
-        assert ask(page) == b""
-        assert [received_by(one) for one in open_ones] == [b""] * MOST_OPEN
-    until(lambda: b" 200 " in ask(page))
-
-
-def test_one_who_reads_nothing_holds_nobody_up(page: Page, monkeypatch: pytest.MonkeyPatch):
-    """A browser asks and never reads: its thread ends at the deadline, and others are served meanwhile."""
-    monkeypatch.setattr(web, "DEADLINE_NS", 300_000_000)
-    page._server.content["/"] = "text/html", b"x" * 50_000_000
-    before = threading.active_count()
-    with connected(page) as one:
-        one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        assert b" 200 " in ask(page)
-        until(lambda: threading.active_count() == before)
-
-
-def test_the_page_holds_everything_it_shows():
-    """It is one file: no address but the namespace of SVG, no src, no import, and nothing that could send data."""
-    text = web.PAGE.read_text(encoding="utf-8")
-    assert set(re.findall(r"https?://[^\"' ]+", text)) == {"http://www.w3.org/2000/svg"}
-    assert not re.search(r"\bsrc=|@import|url\(|<form|<a |innerHTML|eval\(|localStorage", text)
 
 
 @pytest.fixture(scope="module")
@@ -242,12 +86,12 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     assert run.wait(timeout=WAIT_S) == 0
     seen.state("no-connection")
     assert seen.text("#message") == "no connection"
-    assert {url.removeprefix(address) for url in seen.requests} == {"/", "/state"}
+    assert {url.removeprefix(address).split("?")[0] for url in seen.requests} <= FILES
     context.close()
 
 
 @pytest.mark.slow
-def test_the_page_draws_what_the_box_says(browser: Any, page: Page):
+def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
     """Loads as shades and numbers, points at their coordinates, the message in large letters and for screen readers."""
     context = browser.new_context(viewport={"width": 1180, "height": 820})
     seen = BrowsedPage(context, page.address)
@@ -289,6 +133,7 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     )
 
 
+FILES = {"/", "/page.css", "/watch.js", "/events.js", "/skin.js", "/plots.js", "/events", "data:,"}
 FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number))"
 
 
@@ -303,7 +148,7 @@ FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number)
     ],
 )
 def test_the_arrow_points_where_the_skin_has_to_go(
-    browser: Any, page: Page, centre: tuple[float, float], message: str, way: tuple[int, int]
+    browser: Any, page: PageServer, centre: tuple[float, float], message: str, way: tuple[int, int]
 ):
     """Towards the row or column that the message names, in the picture and beside the words: a skin on which the contact
     lies too far towards row 1 is moved towards row 1."""
@@ -322,7 +167,7 @@ def test_the_arrow_points_where_the_skin_has_to_go(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_count_can_be_read_on_its_taxel(browser: Any, page: Page, scheme: str):
+def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, scheme: str):
     """A contrast of 4.5 between the number and its taxel, from no load to the full one (WCAG 2.1, 1.4.3)."""
     page.show(replace(VIEW, load=tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4)), full=15.0))
     context = browser.new_context(color_scheme=scheme)
@@ -339,7 +184,7 @@ def test_every_count_can_be_read_on_its_taxel(browser: Any, page: Page, scheme: 
 @pytest.mark.parametrize(
     ("side", "at"), [("first-row", "top"), ("last-row", "bottom"), ("first-column", "left"), ("last-column", "right")]
 )
-def test_the_picture_shows_which_end_is_the_fingertip(browser: Any, page: Page, side: str, at: str):
+def test_the_picture_shows_which_end_is_the_fingertip(browser: Any, page: PageServer, side: str, at: str):
     """A cap at the side that `sensor.fingertip` names; where it is not set, the page says how to find it out."""
     seen = BrowsedPage(browser.new_context(viewport={"width": 1024, "height": 768}), page.address)
     seen.state("off")
@@ -365,7 +210,7 @@ def beyond(board: dict[str, float], box: dict[str, float]) -> str:
 
 
 @pytest.mark.slow
-def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
+def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
     """The server still answers, but its loop hangs: after a while the page shows that instead of an old picture."""
     context = browser.new_context()
     seen = BrowsedPage(context, page.address)
@@ -378,24 +223,26 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: Page):
 
 
 @pytest.mark.slow
-def test_a_server_that_hangs_is_no_connection(browser: Any, page: Page, monkeypatch: pytest.MonkeyPatch):
-    """It accepts the request and never answers: the page does not wait for it."""
-    context, ended = browser.new_context(), threading.Event()
-    seen = BrowsedPage(context, page.address)
-    seen.state("off")
-    monkeypatch.setattr(web.PageHandler, "do_GET", lambda self: ended.wait(3 * WAIT_S))
-    try:
-        seen.state("no-connection")
-    finally:
-        ended.set()
+def test_a_server_that_is_gone_is_no_connection(browser: Any):
+    """The page says so at once and how old its picture is; one that comes back at the same port is shown by itself."""
+    access = Access(0)
+    with PageServer("watch.html", access, SystemClock().now_ns) as page:
+        page.show(VIEW)
+        seen = BrowsedPage(browser.new_context(), page.address)
+        seen.state("off")
+        access = Access(int(page.address.rsplit(":", 1)[1]))
+    seen.state("no-connection")
     assert "tunnel" in seen.text("#hint")
-    context.close()
+    with PageServer("watch.html", access, SystemClock().now_ns) as page:
+        page.show(replace(VIEW, state="in-place", message="in place"))
+        seen.state("in-place")
+        seen.page.close()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_it_fits_phone_tablet_and_desktop(browser: Any, page: Page, width: int, height: int, scheme: str):
+def test_it_fits_phone_tablet_and_desktop(browser: Any, page: PageServer, width: int, height: int, scheme: str):
     """Everything on one screen without scrolling, in the light and the dark scheme; the text has enough contrast."""
     page.show(replace(VIEW, message="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"))
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)

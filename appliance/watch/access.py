@@ -1,0 +1,103 @@
+"""Who may see a page: its address, the names by which browsers may ask for it, token and certificate. In: settings. Out:
+an Access."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import socket
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
+
+from appliance.core.config import WatchConfig
+from appliance.core.errors import ConfigError
+
+HERE = "127.0.0.1"
+NAMES = ("localhost", HERE, "[::1]")
+"""Names by which a browser may ask for this machine. Another name belongs to another site that points here (DNS
+rebinding)."""
+LEAST_TOKEN, MOST_TOKEN = 16, 256
+"""Characters of a token."""
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """Where a page is served, and to whom.
+
+    port: 0 for any that is free. names: further host names that browsers may use. token: what a browser has to know, ""
+    for nothing. certificate, key: PEM files of TLS; None serves without it.
+    """
+
+    port: int
+    address: str = HERE
+    names: tuple[str, ...] = ()
+    token: str = ""
+    certificate: Path | None = None
+    key: Path | None = None
+
+    @classmethod
+    def configured(cls, settings: WatchConfig, port: int) -> Access:
+        """As the settings say. Beyond this machine only with token and certificate.
+
+        Raises ConfigError where these cannot be used.
+        """
+        try:
+            local = ipaddress.ip_address(settings.address).is_loopback
+        except ValueError as e:
+            raise ConfigError(
+                f"watch.address {settings.address!r} is no IP address; use {HERE}, or 0.0.0.0 for the network"
+            ) from e
+        if local:
+            return cls(port, settings.address)
+        folder = Path(settings.folder)
+        return cls(
+            port, settings.address, (*_own_names(), *settings.names.lower().split()), _token(folder / "token"),
+            folder / "certificate.pem", folder / "key.pem",
+        )  # fmt: skip
+
+    def tls(self) -> ssl.SSLContext | None:
+        """The context of TLS. Raises ConfigError where certificate or key cannot be used."""
+        if not self.certificate or not self.key:
+            return None
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        try:
+            context.load_cert_chain(self.certificate, self.key)
+        except (OSError, ssl.SSLError) as e:
+            raise ConfigError(
+                f"{self.certificate} and {self.key.name} cannot be used: {e}; make install makes them"
+            ) from e
+        return context
+
+    def url(self, port: int) -> str:
+        """The page's address for a person; port: the one that is listened on."""
+        name = self.address if not self.certificate else self.names[0] if self.names else HERE
+        return f"http{'s' if self.certificate else ''}://{f'[{name}]' if ':' in name else name}:{port}"
+
+    def is_host(self, host: str, own: str) -> bool:
+        """Whether the Host of a request names this machine. own: the address that the request came to."""
+        name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
+        return bool(name) and name.lower() in (*NAMES, *self.names, f"[{own}]" if ":" in own else own)
+
+    def admits(self, given: str) -> bool:
+        """Whether `given` is the token, or none is needed. Takes as long for every wrong one."""
+        return not self.token or hmac.compare_digest(given.encode(), self.token.encode())
+
+
+def _own_names() -> tuple[str, ...]:
+    """The machine's host name, also as multicast DNS has it."""
+    name = socket.gethostname().lower()
+    return (name, f"{name.partition('.')[0]}.local")
+
+
+def _token(path: Path) -> str:
+    """The token in a file. Raises ConfigError where there is none that can be used."""
+    advice = "make install makes one; or set watch.address to 127.0.0.1"
+    try:
+        token = path.read_text("ascii").strip()
+    except (OSError, ValueError) as e:
+        raise ConfigError(f"{path} cannot be read: {getattr(e, 'strerror', None) or e}; {advice}") from e
+    if not LEAST_TOKEN <= len(token) <= MOST_TOKEN or not token.isalnum():
+        raise ConfigError(f"{path} is not a token of {LEAST_TOKEN} to {MOST_TOKEN} letters and digits; {advice}")
+    return token

@@ -1,0 +1,160 @@
+"""What `palpate watch --web` shows. In: lines of the feed. Out: events of the page, and on request the picture of a sweep.
+
+Nothing is written to a disk: what the page knows of the shift is what this program has seen.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from appliance.alignment.live import VIEW_NS, ContactTracker, Expected
+from appliance.core.errors import FormatError
+from appliance.core.schema import typed
+from appliance.core.status import REASONS
+from appliance.core.types import SweepFormat
+from appliance.watch.sweep_picture import Window, picture, window
+
+SHIFT = 5000
+"""Verdicts that are kept: eight hours with a sweep every six seconds."""
+SWEEPS = 20
+"""Latest sweeps whose windows are kept."""
+MINUTE_NS = 60_000_000_000
+KEPT = {"hello": 8, "verdict": SHIFT, "minute": 1440, "signal": SWEEPS, "note": 200}
+"""Events that stay for browsers that come later; of all others the newest one."""
+FIELDS = ("sweep", "time_ns", "status", "label", "probability", "margin", "fused", "lost", "latency_ns", "bundle", "detail",
+          "share", "moved")  # fmt: skip
+"""Of a verdict."""
+
+Publish = Callable[[str, object], None]
+
+
+class PageBoard:
+    """Turns lines of the feed into events, by their type.
+
+    hello, health, state: as they come. box: whether there is a feed. verdict: with rounded `scores` and the `reason` of
+    a sweep without a label. minute: frames and lost frames of the last minute. signal: that a sweep's window is here.
+    view: see alignment.view. note: another bundle or program.
+    """
+
+    def __init__(self, publish: Publish) -> None:
+        self._publish = publish
+        self._hello: dict[str, Any] = {}
+        self._before: dict[str, Any] = {}  # the hello before, until the restart has been noted
+        self._skin, self._trouble = "", ""
+        self._tracker: ContactTracker | None = None
+        self._enumerations = 0
+        self._view_ns = -VIEW_NS
+        self._minute: tuple[int, int, int] | None = None  # time, frames and lost frames at its begin
+        self._windows: OrderedDict[int, Window] = OrderedDict()
+        self._taken = 0
+
+    def take(self, line: Mapping[str, Any]) -> None:
+        """Take one line. One of an unknown type is for a later version. Raises FormatError for one that is not as it
+        must be."""
+        act = _LINES.get(str(line.get("type")))
+        if not act:
+            return
+        try:
+            act(self, line)
+        except (KeyError, TypeError, ValueError, AttributeError) as e:
+            raise FormatError(
+                f"the feed's line {line.get('type')!r} is not as PROTOCOL.md has it: {e!r}; update one of both"
+            ) from e
+
+    def away(self, why: str) -> None:
+        """There is no feed."""
+        self._minute = None
+        self._publish("box", {"there": False, "why": why})
+
+    def sweep(self, which: str) -> dict[str, Any] | None:
+        """The picture of a sweep by its number in `signal`; None where it is not kept."""
+        kept = self._windows.get(int(which))
+        return picture(kept) if kept else None
+
+    def _take_hello(self, line: Mapping[str, Any]) -> None:
+        rate = replace(typed(SweepFormat, dict(line["format"])), rate_hz=float(line["frames_hz"]))
+        expected = Expected.read(rate, line.get("alignment") or {}, str(line["bundle"]))
+        tracker = ContactTracker(expected, str(line["source"]))
+        hello = dict(line) | {"pid": int(line["pid"]), "labels": list(map(str, line["labels"]))}
+        self._before, self._hello, self._tracker, self._minute = self._hello, hello, tracker, None
+        self._publish("hello", hello)
+        self._publish("box", {"there": True, "why": ""})
+
+    def _take_closed(self, line: Mapping[str, Any]) -> None:
+        self.away(str(line["why"]))
+
+    def _take_health(self, line: Mapping[str, Any]) -> None:
+        self._take_state(line)
+        if self._before and self._before["pid"] != self._hello["pid"]:
+            self._publish("note", {"time_ns": line["time_ns"], "text": _restarted(self._before, self._hello)})
+        self._before = {}
+        now = int(line["time_ns"]), int(line["frames"]), int(line["lost_frames"])
+        if int(line["enumerations"]) != self._enumerations:
+            self._enumerations = int(line["enumerations"])
+            if self._tracker:
+                self._tracker.reset()
+        first = self._minute or now
+        if now[0] - first[0] >= MINUTE_NS:
+            self._publish("minute", {"time_ns": now[0], "frames": now[1] - first[1], "lost": now[2] - first[2]})
+            first = now
+        self._minute = first
+        self._publish("health", {name: value for name, value in line.items() if name != "type"})
+
+    def _take_state(self, line: Mapping[str, Any]) -> None:
+        self._skin, self._trouble = str(line["skin"]), str(line["trouble"])
+        state = {name: line[name] for name in ("skin", "trouble", "sweeping", "ready")}
+        self._publish("state", state)
+        if self._skin != "streaming" and self._tracker:
+            self._tracker.reset()
+            self._publish("view", self._tracker.view(self._skin, self._trouble).json())
+
+    def _take_verdict(self, line: Mapping[str, Any]) -> None:
+        shown = {name: line[name] for name in FIELDS} | {"scores": [round(float(p), 4) for p in line["scores"]]}
+        self._publish("verdict", shown | {"reason": REASONS.get(line["status"], ""), "pid": self._hello.get("pid")})
+
+    def _take_frame(self, line: Mapping[str, Any]) -> None:
+        if not self._tracker:
+            return
+        fmt = typed(SweepFormat, dict(self._hello["format"]))
+        frame = np.array(line["taxels"], np.float64)  # null, of a float skin, becomes nan
+        if frame.shape != fmt.shape:
+            raise ValueError(f"a frame of {frame.shape} instead of {fmt.shape}")
+        self._tracker.put(frame[None])
+        now_ns = int(line["time_ns"])
+        if not 0 <= now_ns - self._view_ns < VIEW_NS:
+            self._view_ns = now_ns
+            self._publish("view", self._tracker.view(self._skin, self._trouble).json())
+
+    def _take_sweep(self, line: Mapping[str, Any]) -> None:
+        kept = window(line, float(self._hello["format"]["rate_hz"]))
+        self._taken += 1
+        self._windows[self._taken] = kept
+        while len(self._windows) > SWEEPS:
+            self._windows.popitem(last=False)
+        self._publish("signal", {"number": self._taken, "sweep": line["sweep"], "pid": self._hello["pid"]})
+
+
+def _restarted(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """What has changed with another program, for a person."""
+    changed = (
+        f"bundle {now['bundle']} in place of {before['bundle']}"
+        if now["bundle"] != before["bundle"]
+        else "the same bundle"
+    )
+    return f"the box was started anew, with {changed}"
+
+
+_LINES: dict[str, Callable[[PageBoard, Mapping[str, Any]], None]] = {
+    "hello": PageBoard._take_hello,
+    "closed": PageBoard._take_closed,
+    "health": PageBoard._take_health,
+    "state": PageBoard._take_state,
+    "verdict": PageBoard._take_verdict,
+    "frame": PageBoard._take_frame,
+    "sweep": PageBoard._take_sweep,
+}

@@ -1,0 +1,41 @@
+/* The events of the page's program: connects, and connects again by itself. */
+
+const SILENT_MS = 3000, RETRY_MS = 1000;
+
+/* heard: functions by the name of an event, called with its content. connection(there, answers): called where it changes;
+   answers: whether there is a program at all, which then has no news. What was kept for newcomers is no news either. */
+export function listen(heard, connection) {
+  let source = null, last = "", newsAt = performance.now(), state = "";
+
+  function connected(there, answers = there) {
+    if (state === (state = `${there} ${answers}`)) return;
+    connection(there, answers);
+  }
+
+  function open() {
+    newsAt = performance.now();
+    source = new EventSource(`/events?last=${encodeURIComponent(last)}`);
+    source.onerror = again;
+    for (const [name, act] of Object.entries({begin() {}, now() {}, ...heard})) {
+      source.addEventListener(name, (event) => {
+        if (event.lastEventId) {
+          last = event.lastEventId;
+          newsAt = performance.now();
+          connected(true);
+        }
+        act(JSON.parse(event.data));
+      });
+    }
+  }
+
+  function again() {
+    if (!source) return;
+    connected(false, source.readyState === EventSource.OPEN);
+    source.close();
+    source = null;
+    setTimeout(open, RETRY_MS);
+  }
+
+  setInterval(() => { if (performance.now() - newsAt > SILENT_MS) again(); }, 500);
+  open();
+}

@@ -1,0 +1,75 @@
+/* The page of `palpate skin show`: every axis of a skin, its noise and its faults. */
+import {listen} from "/events.js";
+import {shades} from "/skin.js";
+
+const NUMBERED = 8, byId = (id) => document.getElementById(id);
+let built = "", tiles = [];
+
+function put(id, text) { if (byId(id).textContent !== text) byId(id).textContent = text; }
+
+function build([rows, cols, axes]) {
+  byId("maps").replaceChildren();
+  tiles = [];
+  for (let a = 0; a < axes; a++) {
+    const figure = document.createElement("figure"), caption = document.createElement("figcaption");
+    const grid = document.createElement("div"), here = [];
+    const axis = axes > 1 ? `axis ${a + 1}${a + 1 === axes ? " (normal)" : ""}: ` : "";
+    caption.textContent = `${axis}raw counts above the lowest seen; row 1 is at the top, column 1 at the left`;
+    grid.className = cols > NUMBERED ? "grid small" : "grid";
+    grid.setAttribute("role", "img");
+    grid.setAttribute("aria-label", `${axis}${rows} rows and ${cols} columns of taxels`);
+    grid.style.gridTemplateColumns = `repeat(${cols}, minmax(0, 1fr))`;
+    for (let i = 0; i < rows * cols; i++) {
+      const tile = document.createElement("div");
+      tile.className = "taxel";
+      grid.append(tile);
+      here.push(tile);
+    }
+    figure.style.setProperty("--shape", cols / rows);
+    figure.append(caption, grid);
+    byId("maps").append(figure);
+    tiles.push(here);
+  }
+}
+
+function name(r, c, a, axes) { return `${r + 1}.${c + 1}${axes > 1 ? ` axis ${a + 1}` : ""}`; }
+
+function draw(view) {
+  const [, cols, axes] = view.shape, kinds = ["stuck", "dead", "saturated"], shade = shades();
+  const faulty = new Set(kinds.flatMap((kind) => view[kind]));
+  view.load.forEach((map, a) => map.forEach((row, r) => row.forEach((load, c) => {
+    const tile = tiles[a][r * cols + c], {back, front} = shade(load / view.full);
+    const called = name(r, c, a, axes);
+    tile.style.backgroundColor = back;
+    tile.style.color = front;
+    tile.classList.toggle("faulty", faulty.has(called));
+    tile.title = `taxel ${called}: ${load}, noise ${view.noise[a][r][c]}`;
+    if (cols <= NUMBERED) tile.textContent = Math.round(load);
+  })));
+  const noise = view.noise.flat(2).sort((a, b) => a - b);
+  put("noise", noise.length ? `${noise[noise.length >> 1].toPrecision(2)}, ${noise.at(-1).toPrecision(2)}` : "–");
+  const found = kinds.filter((kind) => view[kind].length).map((kind) => `${kind}: ${view[kind].join(", ")}`);
+  put("faults", found.join("; ") || "no fault seen");
+  byId("faults").className = found.length ? "" : "fine";
+}
+
+function show(view) {
+  if (built !== `${view.shape}`) { build(view.shape); built = `${view.shape}`; }
+  byId("simulated").hidden = view.source !== "sim";
+  put("skin", view.skin);
+  put("state", view.state);
+  byId("state").className = view.state === "streaming" ? "pill fine" : "pill";
+  byId("trouble").hidden = !view.trouble;
+  put("trouble", view.trouble);
+  put("rate", view.rate_hz === null ? "–" : `${view.rate_hz.toFixed(1)} Hz`);
+  put("frames", view.frames.toLocaleString("en"));
+  put("lost", view.lost === null ? "cannot be known" : view.lost.toLocaleString("en"));
+  if (view.load.length) draw(view);
+}
+
+listen({view: show}, (there) => {
+  document.body.classList.toggle("gone", !there);
+  if (there) return;
+  put("state", "no connection");
+  byId("state").className = "pill";
+});

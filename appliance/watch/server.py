@@ -1,0 +1,336 @@
+"""Serves a page and the events that it shows, with tornado. In: events of the program. Out: both, to browsers, read-only.
+
+The server runs in a thread of its own, so that no browser keeps the program waiting. It answers GET of the paths it was
+given; of a request nothing beyond the head is read. A browser that connects gets the events that are kept, then the new
+ones (server-sent events); one that comes back gets what it has missed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import secrets
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from heapq import merge
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+from appliance.core.errors import ConfigError
+from appliance.core.log import TroubleLog
+from appliance.watch.access import Access
+
+try:
+    from tornado.httpserver import HTTPServer
+    from tornado.ioloop import PeriodicCallback
+    from tornado.iostream import StreamClosedError
+    from tornado.netutil import bind_sockets
+    from tornado.web import Application, HTTPError, RequestHandler
+except ImportError as e:
+    raise ConfigError("--web needs tornado, which is not installed; pip install 'palpate[page]'") from e
+
+FOLDER = Path(__file__).with_name("page")
+KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+}
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Server": "palpate",
+}
+"""What every answer says a browser may do, errors too."""
+HEAD_S = 5.0
+"""Limit for a request's head, with the handshake of TLS before it, and for a connection without a request."""
+TAKEN_S = 30
+"""Limit for taking what was sent: who reads nothing for so long is gone."""
+MOST_HEAD = 8192
+"""Most bytes of a request that are read."""
+MOST_OPEN, MOST_OF_ONE = 64, 24
+"""Most connections at a time, and of one address; a further one is closed at once. A browser opens up to six."""
+MOST_WAITING = 100
+"""Events that wait for one browser. Who is further behind is cut off, and gets what is kept when it comes back."""
+WRONG_S = 1.0
+"""A wrong token is answered after this time."""
+COOKIE = "__Host-palpate"
+DAY = 86_400
+
+Answer = Callable[[str], object | None]
+"""Content for JSON, by the last part of a path; None where there is none."""
+
+
+class State(Protocol):
+    """What a page shows that shows one thing."""
+
+    def json(self) -> dict[str, Any]:
+        """It as the page reads it."""
+        ...
+
+
+class EventLog:
+    """The events of one program. Each has a number; of each name the newest `kept[name]` stay, one where it has none.
+
+    run: tells the browsers of one server from those of the next, whose numbers begin anew.
+    """
+
+    def __init__(self, kept: Mapping[str, int]) -> None:
+        self.run = secrets.token_hex(4)
+        self._kept = kept
+        self._number = 0
+        self._events: dict[str, deque[tuple[int, bytes]]] = {}
+
+    def add(self, name: str, content: object) -> bytes:
+        """The event as it goes to browsers."""
+        self._number += 1
+        data = json.dumps(content, allow_nan=False, separators=(",", ":"))
+        event = f"id: {self.run}-{self._number}\nevent: {name}\ndata: {data}\n\n".encode()
+        self._events.setdefault(name, deque(maxlen=self._kept.get(name, 1))).append((self._number, event))
+        return event
+
+    def since(self, last: str) -> list[bytes]:
+        """What a browser has to get that has got everything up to the event `last` ("": nothing), in order."""
+        run, _, number = last.partition("-")
+        after = int(number) if run == self.run and number.isdecimal() and len(number) < 20 else 0
+        first = [] if after else [f"event: begin\ndata: {json.dumps(self.run)}\n\n".encode()]
+        return first + [event for number, event in merge(*self._events.values()) if number > after]
+
+
+class PageServer:
+    """Serves the page `name` of FOLDER and the other files there, at `access`. kept: as for EventLog.
+
+    now_ns: the clock by which events are stamped. answers: what is computed on request, by the first part of its path.
+    Raises ConfigError where the address cannot be used.
+    """
+
+    def __init__(
+        self, name: str, access: Access, now_ns: Callable[[], int], kept: Mapping[str, int] | None = None,
+        answers: Mapping[str, Answer] | None = None,
+    ) -> None:  # fmt: skip
+        self.access, self.now_ns, self.answers = access, now_ns, answers or {}
+        self.events = EventLog(kept or {})
+        self.queues: set[asyncio.Queue[bytes]] = set()
+        self.wrong = TroubleLog("page")
+        self.files = {f"/{f.name}": (KINDS[f.suffix], f.read_bytes()) for f in FOLDER.iterdir() if f.suffix in KINDS}
+        self.files["/"] = self.files[f"/{name}"]
+        self._stop = asyncio.Event()
+        try:
+            self._tls = access.tls()
+            self._sockets = bind_sockets(_checked(access.port), access.address, backlog=2 * MOST_OPEN)
+        except (OSError, ValueError) as e:
+            where = f"port {access.port} of {access.address}"
+            raise ConfigError(f"{where} cannot be used: {e}; name another with --web PORT") from e
+        self.address = access.url(self._sockets[0].getsockname()[1])
+
+    def __enter__(self) -> Self:
+        # tornado logs each malformed request, and the terminal may show a skin
+        logging.getLogger("tornado").addHandler(logging.NullHandler())
+        logging.getLogger("tornado").propagate = False
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._serve(),), daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join()
+        self._loop.close()
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser is there."""
+        return bool(self.queues)
+
+    def publish(self, name: str, content: object) -> None:
+        """Send an event to all browsers, and keep it. Never waits. Raises ValueError for a number that JSON lacks."""
+        json.dumps(content, allow_nan=False)  # an error belongs to the caller, not into the server's thread
+        self._loop.call_soon_threadsafe(self._spread, name, content)
+
+    def show(self, view: State) -> None:
+        """Make `view` the newest event of this name."""
+        self.publish("view", view.json())
+
+    def _spread(self, name: str, content: object) -> None:
+        event = self.events.add(name, content)
+        for queue in [*self.queues]:
+            if queue.full():
+                self.queues.remove(queue)  # its handler ends at the next event it takes
+            else:
+                queue.put_nowait(event)
+
+    async def _serve(self) -> None:
+        application = Application(
+            [(r"/events", EventsHandler, {"page": self}), (r"/(\w+)/(\d{1,9})", AnswerHandler, {"page": self})],
+            default_handler_class=FileHandler, default_handler_args={"page": self}, log_function=lambda handler: None,
+        )  # fmt: skip
+        server = LimitedServer(
+            application, ssl_options=self._tls, max_header_size=MOST_HEAD, max_body_size=0, max_buffer_size=1 << 16,
+            idle_connection_timeout=HEAD_S, chunk_size=MOST_HEAD,
+        )  # fmt: skip
+        server.add_sockets(self._sockets)
+        tick = PeriodicCallback(server.drop_those_who_take_nothing, 1000)
+        tick.start()
+        await self._stop.wait()
+        tick.stop()
+        server.stop()
+        await server.close_all_connections()
+        await asyncio.sleep(0)  # cancelled handlers end
+
+
+def _checked(port: int) -> int:
+    """Raises ValueError for a number that is no port, which the resolver would take modulo 65536."""
+    if not 0 <= port <= 65535:
+        raise ValueError("ports are numbers from 0 to 65535")
+    return port
+
+
+class LimitedServer(HTTPServer):
+    """tornado's server with a limit of connections, and of the time for taking an answer."""
+
+    def initialize(self, *args: Any, **options: Any) -> None:
+        """As HTTPServer's."""
+        super().initialize(*args, **options)
+        self._open: dict[Any, str] = {}  # stream -> address
+        self._since: Counter[Any] = Counter()  # stream -> seconds for which it has taken nothing
+
+    def handle_stream(self, stream: Any, address: Any) -> None:
+        """Take up a connection where there is room."""
+        self._open = {one: ip for one, ip in self._open.items() if not one.closed()}
+        if len(self._open) >= MOST_OPEN or sum(ip == address[0] for ip in self._open.values()) >= MOST_OF_ONE:
+            stream.close()
+            return
+        self._open[stream] = address[0]
+        super().handle_stream(stream, address)
+
+    def drop_those_who_take_nothing(self) -> None:
+        """Close connections whose other side has taken nothing for TAKEN_S; called once a second."""
+        self._since = Counter({one: self._since[one] + 1 for one in self._open if one.writing()})
+        for stream, seconds in self._since.items():
+            if seconds >= TAKEN_S:
+                stream.close()
+
+
+class _Handler(RequestHandler):
+    """What all requests have in common: who may ask, and what an answer says."""
+
+    SUPPORTED_METHODS = ("GET",)
+
+    def initialize(self, page: PageServer) -> None:
+        """page: whose request it is."""
+        self.page = page
+
+    def set_default_headers(self) -> None:
+        """What every answer has."""
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+
+    async def prepare(self) -> None:
+        """Refuse a request that is meant for another site, and one without the token."""
+        access, request = self.page.access, self.request
+        stream = request.connection.stream if request.connection else None  # type: ignore[attr-defined]
+        own = stream.socket.getsockname()[0] if stream and stream.socket else ""
+        if not access.is_host(request.headers.get("Host", ""), own):
+            raise HTTPError(421)
+        scheme, _, given = request.headers.get("Authorization", "").partition(" ")
+        given = given if scheme == "Bearer" else self.get_cookie(COOKIE, "") or ""
+        if access.admits(given):
+            return
+        if given:
+            self.page.wrong.update(
+                "a wrong token", f"page: wrong token from {request.remote_ip}; further ones are not logged"
+            )
+            await asyncio.sleep(WRONG_S)
+            self.clear_cookie(COOKIE, path="/", secure=True)
+        raise HTTPError(401)
+
+    def write_error(self, status_code: int, **_: Any) -> None:
+        """A line for a person."""
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(f"{status_code} {self._reason}\n")
+
+
+class FileHandler(_Handler):
+    """The page and its files; without the token, the page that asks for it."""
+
+    def get(self) -> None:
+        """Answer with a file; any other path is not found."""
+        if self.request.path == "/enter" and self.page.access.token:  # the token was right
+            self.set_cookie(
+                COOKIE,
+                self.page.access.token,
+                path="/",
+                secure=True,
+                httponly=True,
+                samesite="Strict",
+                max_age=365 * DAY,
+            )
+            self.set_status(204)
+            return
+        if self.request.path not in self.page.files or self.request.query:
+            raise HTTPError(404)
+        self._send(self.request.path)
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """Who asks for the page without a token gets to enter it; the style and script of this are no secret."""
+        path = "/enter.html" if self.request.path == "/" else self.request.path
+        if status_code == 401 and path in ("/enter.html", "/enter.js", "/page.css"):
+            self.set_status(401 if path == "/enter.html" else 200)
+            self._send(path)
+            self.finish()
+        else:
+            super().write_error(status_code, **kwargs)
+
+    def _send(self, path: str) -> None:
+        kind, body = self.page.files[path]
+        self.set_header("Content-Type", kind)
+        self.write(body)
+
+
+class AnswerHandler(_Handler):
+    """What is computed on request."""
+
+    def get(self, name: str, which: str) -> None:
+        """Answer with JSON; what there is not is not found."""
+        answer = self.page.answers.get(name)
+        content = answer(which) if answer else None
+        if content is None:
+            raise HTTPError(404)
+        self.set_header("Content-Type", "application/json")
+        self.finish(json.dumps(content, allow_nan=False, separators=(",", ":")))
+
+
+class EventsHandler(_Handler):
+    """The stream of events to one browser."""
+
+    async def get(self) -> None:
+        """Send what it has missed, then each new event, until one of both ends it."""
+        page, queue = self.page, asyncio.Queue[bytes](MOST_WAITING)
+        self.set_header("Content-Type", "text/event-stream")
+        now = f"event: now\ndata: {page.now_ns()}\n\n".encode()
+        missed = page.events.since(self.get_query_argument("last", ""))
+        page.queues.add(queue)
+        self._queue = queue
+        try:
+            self.write(b"".join([now, *missed]))
+            await self.flush()
+            while queue in page.queues:
+                self.write(await queue.get())
+                await self.flush()
+        except StreamClosedError:
+            pass
+        finally:
+            page.queues.discard(queue)
+
+    def on_connection_close(self) -> None:
+        """The browser has gone: wake the handler up, so that it ends."""
+        if (queue := getattr(self, "_queue", None)) in self.page.queues:
+            self.page.queues.discard(queue)
+            if queue.empty():
+                queue.put_nowait(b"")

@@ -1,0 +1,54 @@
+"""`palpate watch --web`: reads the feed for as long as it is wanted, and keeps the page up to date.
+
+A box that is not there, dies or restarts is shown as away until its feed is there again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from appliance.client.feed import Feed
+from appliance.core.errors import FormatError
+from appliance.core.log import TroubleLog
+from appliance.watch.access import Access
+from appliance.watch.board import KEPT, PageBoard
+from appliance.watch.server import PageServer
+
+FRAMES_HZ = 20.0
+"""Frames that are asked for while somebody watches: alignment averages the last third of a second."""
+READ_S = 0.5
+"""Longest wait for a line: a box that is away is shown as often, which tells browsers that this program is there."""
+
+
+class PageWatcher:
+    """The page of `palpate watch --web` at `access`, and what it shows: the feed at `path`. now_ns: the clock by which the
+    box stamps. Raises ConfigError where the address cannot be used."""
+
+    def __init__(self, path: str, access: Access, now_ns: Callable[[], int]) -> None:
+        self.feed = Feed(path, sweeps=True)
+        self.server = PageServer("watch.html", access, now_ns, KEPT, {"sweep": lambda which: self.board.sweep(which)})
+        self.board = PageBoard(self.server.publish)
+        self._frames = False
+        self._log = TroubleLog("feed", "the page shows the box as away", end="feed: it is read", known=False)
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Watch until `stopped()`."""
+        with self.server, self.feed:
+            while not stopped():
+                self.step()
+
+    def step(self) -> None:
+        """Take the next line, or show that there is none."""
+        if self.server.watched != self._frames:
+            self._frames = not self._frames
+            self.feed.ask(frames_hz=FRAMES_HZ if self._frames else 0)
+        line, trouble = self.feed.read(READ_S), self.feed.trouble
+        if line:
+            try:
+                self.board.take(line)
+            except FormatError as e:
+                self.feed.close()
+                trouble = str(e)
+        if not self.feed.connected:
+            self.board.away(trouble)
+        self._log.update(trouble if not self.feed.connected else "")

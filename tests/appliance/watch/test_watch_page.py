@@ -1,0 +1,344 @@
+"""The page of `palpate watch --web` in a headless browser: what it shows, how it is used, how it looks at three sizes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.core.config import WatchConfig
+from appliance.watch.access import Access
+from appliance.watch.board import KEPT, PageBoard
+from appliance.watch.server import PageServer
+from tests.factories import feed_lines
+from tests.factories.browser import BrowsedPage, contrast, until
+from tests.factories.install_scripts import page_secrets
+
+pytestmark = pytest.mark.slow
+
+SIZES = [(390, 844), (1024, 768), (1920, 1080)]
+NOW_S = 400.0
+"""The box's clock when a page is opened."""
+
+
+class Shown:
+    """A page whose lines of the feed a test writes."""
+
+    def __init__(self, access: Access) -> None:
+        self.server = PageServer(
+            "watch.html", access, lambda: round(NOW_S * feed_lines.SECOND), KEPT, {"sweep": self._sweep}
+        )
+        self.board = PageBoard(self.server.publish)
+
+    def _sweep(self, which: str) -> dict[str, Any] | None:
+        return self.board.sweep(which)
+
+    def shift(self) -> None:
+        """A box at work: forty sweeps, one of them `moved`, some without a label, the signals of the last twenty."""
+        self.board.take(feed_lines.hello())
+        for number in range(1, 41):
+            status = {5: "unsure", 11: "gap", 17: "unsure", 23: "no-contact"}.get(number, "ok")
+            moved = "moved 2.2 mm too far towards row 1" if number == 29 else ""
+            label = feed_lines.LABELS[number % 6]
+            self.board.take(feed_lines.health(9.0 * number, lost_frames=3 * (number > 20)))
+            self.board.take(feed_lines.verdict(number, 9.0 * number, label, status, moved=moved))
+            self.board.take(feed_lines.sweep(number))
+        for i in range(40):
+            strength = 0 if i < 20 else 120
+            self.board.take(feed_lines.frame(370 + i / 20, feed_lines.load(0.7, 1.5, strength)))
+
+
+@pytest.fixture
+def shown() -> Iterator[Shown]:
+    """A page that shows a shift."""
+    one = Shown(Access(0))
+    with one.server:
+        one.shift()
+        yield one
+
+
+def opened(browser: Any, shown: Shown, width: int = 1024, height: int = 768, rows: int = 40) -> BrowsedPage:
+    """The page in a browser, with all of the shift."""
+    seen = BrowsedPage(browser.new_context(viewport={"width": width, "height": height}), shown.server.address)
+    until(lambda: seen.page.locator(".row").count() == rows)
+    return seen
+
+
+def test_the_verdict_comes_first_and_large(browser: Any, shown: Shown):
+    """Letters that are read from two metres: 20' of arc are 12 mm there, 57 px of a tablet's 0.2 mm; less at no size."""
+    for width, height in SIZES:
+        seen = opened(browser, shown, width, height)
+        assert seen.text("#label") == feed_lines.LABELS[40 % 6]
+        assert seen.text("#sure") == "96.2 %"
+        assert seen.text("#which").startswith("sweep 40, ")
+        label = seen.page.locator("#label")
+        assert float(label.evaluate("e => parseFloat(getComputedStyle(e).fontSize)")) >= (57 if width > 400 else 40)
+        box = label.bounding_box()
+        assert box["y"] + box["height"] <= height  # without scrolling
+        assert not seen.errors
+        seen.page.context.close()
+
+
+@pytest.mark.parametrize(
+    "label", ["x", "a material whose name is as long as it may be", "Donaudampfschifffahrtsgesellschaft"]
+)
+def test_a_name_of_any_length_fits(browser: Any, shown: Shown, label: str):
+    """Nothing is cut off, at any size."""
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood") | {"label": label})
+    for width, height in SIZES:
+        seen = opened(browser, shown, width, height, rows=41)
+        until(lambda: seen.text("#label") == label)  # noqa: B023
+        inside = seen.page.locator("#label").evaluate(
+            "e => [e.scrollWidth - e.clientWidth, e.scrollHeight - e.clientHeight]"
+        )
+        assert max(inside) <= 1
+        seen.page.context.close()
+
+
+def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
+    """In words, with its status; the probabilities are gone."""
+    seen = opened(browser, shown)
+    shown.board.take(feed_lines.verdict(41, 390.0, status="sensor-lost"))
+    until(lambda: seen.text("#status") == "sensor-lost")
+    assert "the skin went away during the sweep" in seen.text("#label")
+    assert seen.text("#sure") == ""
+    assert seen.page.locator("#scores li").count() == 0
+
+
+def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser: Any, shown: Shown):
+    """The last one by itself; another by a click, until the latest is asked for; an old one has no signal any more."""
+    seen = opened(browser, shown)
+    scores = seen.page.locator("#scores li").all_inner_texts()
+    assert len(scores) == 6
+    assert scores[0].split("\n") == [feed_lines.LABELS[40 % 6], "96.2 %"]
+    until(lambda: "16 taxels over 2.0 s" in str(seen.page.get_attribute("#signal", "aria-label")))
+    assert re.search(r"strongest at about [57]0 Hz", seen.page.get_attribute("#spectrogram", "aria-label"))
+    seen.page.click(".row:nth-child(3)")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 38"))
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood"))
+    until(lambda: seen.text("#label") == "wood")
+    assert seen.text("#sweep-title").startswith("Sweep 38")
+    seen.page.click("#follow")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 41"))
+    assert not seen.page.is_visible("#follow")
+    until(lambda: "not kept" in str(seen.page.get_attribute("#signal", "aria-label")))  # no `sweep` line came with it
+    assert not seen.errors
+
+
+def test_the_shift_is_filtered_by_status(browser: Any, shown: Shown):
+    """A button for each status with its count; several at a time; `all` again."""
+    seen = opened(browser, shown)
+    buttons = seen.page.locator("#filter button")
+    assert buttons.all_inner_texts() == ["all 40", "ok 36", "unsure 2", "gap 1", "no-contact 1"]
+    buttons.nth(2).click()
+    until(lambda: seen.page.locator(".row").count() == 2)
+    assert buttons.nth(2).get_attribute("aria-pressed") == "true"
+    buttons.nth(3).click()
+    until(lambda: seen.page.locator(".row").count() == 3)
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood", "unsure"))
+    until(lambda: seen.page.locator(".row").count() == 4)
+    assert buttons.nth(2).inner_text() == "unsure 3"
+    buttons.nth(0).click()
+    until(lambda: seen.page.locator(".row").count() == 41)
+
+
+def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
+    """The verdict says it, and leads to the view that shows where the skin has to go, with the service running."""
+    seen = opened(browser, shown)
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood", moved="moved 2.2 mm too far towards row 1"))
+    until(lambda: seen.text("#moved") == "moved 2.2 mm too far towards row 1: align the skin")
+    seen.page.click("#moved a")
+    seen.state("off")
+    until(lambda: seen.page.is_visible("#message"))
+    assert seen.text("#message").endswith("towards row 1")
+    assert seen.page.is_visible("#push")
+    assert seen.page.locator("#way").evaluate("e => e.style.visibility") == "visible"
+    assert not seen.page.is_visible("#watch")
+    seen.page.click("text=Watch")
+    until(lambda: seen.page.is_visible("#label"))
+    assert seen.page.locator("#watch .skin svg").count() == 1
+
+
+def test_loss_latency_and_the_box(browser: Any, shown: Shown):
+    """In words beside their pictures; bundle and trial by name."""
+    seen = opened(browser, shown)
+    assert re.fullmatch(r"median 1\.\d ms, longest 1\.\d ms", seen.text("#latency-said"))
+    assert seen.text("#loss-said") == "3 of 270,003 since the start"
+    assert "in 5 minutes" in seen.page.get_attribute("#loss", "aria-label")
+    facts = seen.text("#facts dl")
+    for text in ("tubes 3, 6 labels (9f3c2a1b)", "on trial: 12 of 20 sweeps", "4x4 uint8 at 750 Hz", "process 71"):
+        assert text in facts
+    shown.board.take(feed_lines.health(380.0, loss_known=False, lost_frames=2))
+    until(lambda: "at least 2" in seen.text("#loss-said"))
+
+
+def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, shown: Shown):
+    """It says so at once, why, and how old what it shows is; the box is there again by itself, with its new bundle."""
+    seen = opened(browser, shown)
+    assert not seen.page.is_visible("#banner")
+    shown.board.take({"type": "closed", "why": "the box is stopping"})
+    until(lambda: seen.page.is_visible("#banner"))
+    assert re.fullmatch(r"the box is away; last heard of it \d+ s ago: the box is stopping", seen.text("#banner"))
+    assert seen.text("#state") == "box away"
+    before = int(re.search(r"(\d+) s ago", seen.text("#banner"))[1])
+    until(lambda: int(re.search(r"(\d+) s ago", seen.text("#banner"))[1]) > before)
+    shown.board.take(feed_lines.hello(pid=72, bundle="aaaa0001"))
+    shown.board.take(feed_lines.health(NOW_S, pid=72, bundle="aaaa0001", model="tubes 4, 6 labels"))
+    until(lambda: not seen.page.is_visible("#banner"))
+    assert seen.text("#state") == "ready"
+    assert seen.text("#bundle") == "tubes 4, 6 labels"
+    assert "aaaa0001 in place of 9f3c2a1b" in seen.text(".note")
+    assert seen.page.locator(".row").count() == 40
+    assert not seen.errors
+
+
+def test_a_page_program_that_dies_and_comes_back(browser: Any):
+    """The connection is gone: said at once, tried again, and what the new program knows is shown in place of the old."""
+    first = Shown(Access(0))
+    with first.server:
+        first.shift()
+        seen = opened(browser, first)
+        access = Access(int(first.server.address.rsplit(":", 1)[1]))
+    until(lambda: "no connection to the box" in seen.text("#banner"))
+    assert "trying again" in seen.text("#banner")
+    second = Shown(access)
+    with second.server:
+        second.board.take(feed_lines.hello())
+        second.board.take(feed_lines.health(NOW_S))
+        until(lambda: not seen.page.is_visible("#banner"))
+        until(lambda: seen.page.locator(".row").count() == 0)
+        assert seen.text("#state") == "ready"
+        seen.page.context.close()
+
+
+def test_a_skin_that_is_away_is_not_a_box_that_is_away(browser: Any, shown: Shown):
+    """The banner names the skin and what to do."""
+    seen = opened(browser, shown)
+    shown.board.take(feed_lines.health(NOW_S, skin="absent", trouble="no skin on USB; check the cable", ready=False))
+    until(lambda: seen.page.is_visible("#banner"))
+    assert seen.text("#banner") == "no skin: absent; no skin on USB; check the cable"
+    assert seen.text("#state") == "skin absent"
+
+
+def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
+    """Tab goes from the views over the filter to the sweeps, each visibly; arrows choose a sweep, space a status."""
+    seen = opened(browser, shown)
+    stops = []
+    for _ in range(8):
+        seen.page.keyboard.press("Tab")
+        stops.append(seen.page.evaluate("document.activeElement.id || document.activeElement.textContent"))
+        outline = seen.page.evaluate("getComputedStyle(document.activeElement).outlineWidth")
+        assert float(outline.removesuffix("px")) >= 2
+    assert stops == ["Watch", "Align", "all 40", "ok 36", "unsure 2", "gap 1", "no-contact 1", "rows"]
+    seen.page.keyboard.press("ArrowDown")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 39"))
+    seen.page.keyboard.press("End")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 1,"))
+    active = seen.page.get_attribute("#rows", "aria-activedescendant")
+    assert seen.page.locator(f"#{active}").get_attribute("aria-selected") == "true"
+    for _ in range(4):
+        seen.page.keyboard.press("Shift+Tab")
+    seen.page.keyboard.press("Space")
+    until(lambda: seen.page.locator(".row").count() == 36)
+
+
+def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
+    """Sections, pictures, lists and buttons, for who does not see them; what is urgent is spoken."""
+    seen = opened(browser, shown)
+    unnamed = seen.page.evaluate(
+        """() => [...document.querySelectorAll("section, canvas, meter, button, a, [role]")].filter((e) => !(e.textContent.trim()
+        || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby"))).map((e) => e.outerHTML.slice(0, 80))"""
+    )
+    assert [one for one in unnamed if 'id="banner"' not in one] == []
+    assert seen.page.get_attribute("#banner", "role") == "status"
+    assert seen.page.get_attribute("#label", "aria-live") == "polite"
+    assert seen.page.locator("[role=listbox] [role=option]").count() == 40
+    assert seen.page.locator("nav a[aria-current=page]").inner_text() == "Watch"
+
+
+COLOURS = """() => {
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number), found = [];
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let node = walk.nextNode(); node; node = walk.nextNode()) {
+    const one = node.parentElement, style = getComputedStyle(one);
+    if (!node.textContent.trim() || !one.checkVisibility() || ["SCRIPT", "TITLE", "title"].includes(one.tagName)) continue;
+    if (one.closest("svg .skin, .spoken") || one.classList.contains("count")) continue;
+    let behind = one;
+    while (behind && (rgb(getComputedStyle(behind).backgroundColor)[3] ?? 1) === 0) behind = behind.parentElement;
+    const text = one instanceof SVGElement ? style.fill : style.color;
+    found.push([node.textContent.trim(), rgb(text).slice(0, 3), rgb(getComputedStyle(behind ?? document.body).backgroundColor).slice(0, 3)]);
+  }
+  return found;
+}"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize("at", ["/", "/#align"])
+def test_every_text_can_be_read(browser: Any, shown: Shown, width: int, height: int, scheme: str, at: str):
+    """A contrast of 4.5 with what is behind it (WCAG 2.1, 1.4.3), also with a banner and each tone; nothing is too wide."""
+    for number, status in enumerate(("unsure", "unknown", "gap", "aborted"), 41):
+        shown.board.take(feed_lines.verdict(number, 390.0, "wood", status, moved="moved 2 mm too far towards row 1"))
+    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+    seen = BrowsedPage(context, shown.server.address + at)
+    until(lambda: seen.page.locator(".row").count() == 44 or bool(at[1:]))
+    seen.state("off")
+    for act in (lambda: None, lambda: shown.board.away("it was stopped")):
+        act()
+        until(lambda: seen.page.is_visible("#message" if at[1:] else "#label"))
+        texts = seen.page.evaluate(COLOURS)
+        assert len(texts) > (10 if at[1:] else 100)
+        faint = [(text, round(contrast(front, back), 2)) for text, front, back in texts if contrast(front, back) < 4.5]
+        assert faint == []
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+    assert not seen.errors
+    context.close()
+
+
+def test_nothing_moves_when_something_new_comes(browser: Any, shown: Shown):
+    """Each section stays where it is over verdicts of all kinds, views and a box that goes away."""
+    seen = opened(browser, shown)
+    boxes = "() => [...document.querySelectorAll('#watch > section')].map((e) => [e.offsetLeft, e.offsetTop, e.offsetWidth, e.offsetHeight])"
+    before = seen.page.evaluate(boxes)
+    for number, (label, status) in enumerate([("foam", "ok"), ("", "no-start"), ("plastic smooth", "unsure")], 41):
+        moved = "moved 2.2 mm too far towards row 1 and 1.1 mm towards column 4" * (status == "unsure")
+        shown.board.take(feed_lines.verdict(number, 390.0, label, status, moved=moved))
+        until(lambda number=number: seen.text("#which").startswith(f"sweep {number}"))
+        shown.board.take(feed_lines.frame(380.0 + number, feed_lines.load(2.0, 2.0)))
+        assert seen.page.evaluate(boxes)[:2] == before[:2]
+    shown.board.away("it was stopped")
+    until(lambda: seen.page.is_visible("#banner"))
+    assert seen.page.evaluate(boxes)[:2] == before[:2]
+
+
+def test_on_a_tablet_in_the_network(browser: Any, tmp_path: Path):
+    """Over TLS: the token is asked for; a wrong one is refused; with the right one, or a link that holds it, the page is
+    there, and a reload needs no token. The address shows none."""
+    page_secrets(tmp_path)
+    token = (tmp_path / "token").read_text().strip()
+    shown = Shown(Access.configured(WatchConfig(address="0.0.0.0", folder=str(tmp_path)), 0))
+    with shown.server:
+        shown.shift()
+        address = f"https://localhost:{shown.server.address.rsplit(':', 1)[1]}"
+        context = browser.new_context(ignore_https_errors=True)
+        seen = BrowsedPage(context, address)
+        assert seen.page.evaluate("document.activeElement.id") == "token"
+        for wrong, said in (("nonsense", "this is not the token"), ("schlüssel €", "letters and digits")):
+            seen.page.fill("#token", wrong)
+            seen.page.keyboard.press("Enter")
+            until(lambda said=said: said in seen.text("#said"))
+        seen.page.fill("#token", token)
+        seen.page.click("#go")
+        until(lambda: seen.page.locator(".row").count() == 40)
+        seen.page.reload()
+        until(lambda: seen.page.locator(".row").count() == 40)
+        assert token not in seen.page.url
+        assert token not in "".join(seen.requests)
+        other = BrowsedPage(browser.new_context(ignore_https_errors=True), f"{address}/#{token}")
+        until(lambda: other.page.locator(".row").count() == 40)
+        assert token not in other.page.url
+        other.page.context.close()
+        context.close()

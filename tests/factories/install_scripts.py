@@ -1,0 +1,27 @@
+"""Scripts of systemd/ that a box runs at its install, run here."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.factories.paths import ROOT
+
+SCRIPTS = ROOT / "systemd"
+
+
+def run_here(code: str) -> str:
+    """Output of Python code that imports the scripts. gevent would change this process too much to import them here."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(SCRIPTS)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def page_secrets(folder: Path) -> None:
+    """Token, key and certificate of the page, as the install makes them."""
+    code = f"import page_secrets, os; print(page_secrets.make({str(folder)!r}, str(os.getgid())))"
+    subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True)
