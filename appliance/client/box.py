@@ -28,8 +28,8 @@ from appliance.core.sentences import Sentence, sentence
 BAUD = 115200
 KEPT = 256
 """Most answers that wait for `result`; then the oldest is dropped and counted as missed."""
-POLL_S = 0.2
-"""Time between two questions of `wait_ready`."""
+POLL_S, QUESTION_S = 0.2, 1.0
+"""Time between two questions of `wait_ready`, and for the answer to one: a box that starts does not hear what was sent before."""
 
 Heard = Answer | BoxState
 
@@ -95,7 +95,7 @@ class Palpate:
         while True:
             try:
                 # a last question gets the time for its answer
-                state = self.state(min(self._timeout_s, max(POLL_S, self._left_s(end_ns))))
+                state = self.state(min(self._timeout_s, QUESTION_S, max(POLL_S, self._left_s(end_ns))))
                 if state.ready:
                     self.forget()
                     return state

@@ -19,10 +19,9 @@ from tests.factories.paths import ROOT
 LONG_S = 30.0
 
 
-def page_block(page: str, language: str) -> str:
-    """The one block in this language of a page in docs/robots."""
-    (block,) = re.findall(rf"```{language}\n(.*?)```", (ROOT / "docs" / "robots" / page).read_text(), re.S)
-    return block
+def page_blocks(page: str, language: str) -> list[str]:
+    """The blocks in this language of a page in docs/robots."""
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "docs" / "robots" / page).read_text(), re.S)
 
 
 def eventually(there: Callable[[], bool], limit_s: float = LONG_S) -> None:

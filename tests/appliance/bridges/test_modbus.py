@@ -27,7 +27,7 @@ from appliance.core.errors import FormatError
 from appliance.core.sentences import Sentence, read, sentence
 from appliance.core.status import Status
 from tests.factories import speaking_box
-from tests.factories.bridges import LONG_S, RawModbus, bridge, eventually, page_block
+from tests.factories.bridges import LONG_S, RawModbus, bridge, eventually, page_blocks
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, obeying, result, state
 
@@ -354,7 +354,7 @@ def test_before_anything_was_heard():
 def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: Address):
     """docs/robots/modbus.md: `unsure` is swept again, `ok` gives its code, other statuses their errors."""
     names: dict[str, Any] = {}
-    exec(page_block("modbus.md", "python"), names)
+    exec(page_blocks("modbus.md", "python")[0], names)
     numbers = itertools.count(1)
     statuses = iter(["unsure", "ok", "unknown", "stuck-taxel"])
 
