@@ -92,10 +92,10 @@ class LatencyListener:
 
 
 def measure(
-    minutes: float, seed: int, before: Sequence[str], report: Any
+    names: Sequence[str], minutes: float, seed: int, before: Sequence[str], report: Any
 ) -> tuple[dict[str, Kind], int, dict[str, Any]]:
     """All kinds in turns; resident memory in KiB before there was any reader; what was measured."""
-    kinds = {name: Kind() for name in KINDS}
+    kinds = {name: Kind() for name in names}
     with ExitStack() as stack:
         path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
         box, sweeps = ThisMachine(before, [f"feed.socket={path}"]), Script(seed)
@@ -186,7 +186,14 @@ def missed(figures: dict[str, Any]) -> list[str]:
     return found
 
 
-NAMES = {"0": "none", "1": "1 reader", "8": "8, one never reads", "64": "64, one never reads", "attacked": "attacked"}
+NAMES = {
+    "0": "none",
+    "1": "1 reader",
+    "8": "8, one never reads",
+    "64": "64, one never reads",
+    "attacked": "attacked",
+    "bridge": "a bridge that is attacked",
+}
 
 
 def table(figures: dict[str, Any]) -> str:
@@ -210,12 +217,17 @@ def main() -> int:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=5.0, help="for each kind of readers (%(default)s)")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="some of them, beside 0")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("build/feed.json"))
     args = parser.parse_args()
     real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
     kinds, rss_kib, about = measure(
-        args.minutes, args.seed, REAL_TIME if real_time else (), lambda line: print(line, flush=True)
+        ["0", *(name for name in args.kinds if name != "0")],
+        args.minutes,
+        args.seed,
+        REAL_TIME if real_time else (),
+        lambda line: print(line, flush=True),
     )
     figures = result(kinds, rss_kib)
     content = {"commit": commit(), "seed": args.seed, **about, "real_time": real_time, "readers": figures}

@@ -11,29 +11,38 @@ import os
 import random
 import select
 import socket
+import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 from appliance.client.feed import parse
 from appliance.core.errors import FormatError
+from tests.factories.paths import ROOT
 
 ALL = b'{"frames": 20, "sweeps": true}\n'
 PAUSE_S = 0.002
 STORM = 1000
 """Connections that are open at once while the feed is attacked, most of which the box has not taken up or has refused."""
-KINDS = ("0", "1", "8", "64", "attacked")
+KINDS = ("0", "1", "8", "64", "attacked", "bridge")
 
 Act = Callable[[], None]
+Address = str | tuple[str, int]
 
 
-def connected(path: str) -> socket.socket | None:
-    """A connection that does not wait, None where the box has no room for it now."""
-    one = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+def connected(address: Address) -> socket.socket | None:
+    """A connection that does not wait, None where there is no room for it now. address: of a local socket or of TCP."""
+    family = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET
+    one = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
-        one.connect(path)
+        one.connect(address)
+    except BlockingIOError:
+        if family == socket.AF_INET:  # it is on its way
+            return one
+        one.close()
+        return None
     except OSError:
         one.close()
         return None
@@ -108,7 +117,7 @@ def sluggish(path: str, seen: Counter[str]) -> Act:
     return act
 
 
-def talker(path: str, seen: Counter[str], said: Callable[[], bytes]) -> Act:
+def talker(path: Address, seen: Counter[str], said: Callable[[], bytes]) -> Act:
     """One that sends without end, and comes again when it is closed."""
     held: list[socket.socket] = []
 
@@ -123,7 +132,7 @@ def talker(path: str, seen: Counter[str], said: Callable[[], bytes]) -> Act:
     return act
 
 
-def storm(path: str, seen: Counter[str]) -> Act:
+def storm(path: Address, seen: Counter[str]) -> Act:
     """Connections by the hundred: as many as the box lets wait, held until there are STORM; the oldest then go."""
     held: list[socket.socket] = []
 
@@ -162,15 +171,64 @@ def acts(kind: str, path: str, seen: Counter[str]) -> list[Act]:
     return [*good, *slow, *floods, *garbage, *endless, storm(path, bad), note]
 
 
+def asker(address: Address, seen: Counter[str], request: bytes) -> Act:
+    """One that asks again when it has its answer, as a controller does; answers are counted."""
+    held: list[socket.socket] = []
+    asked = False
+
+    def act() -> None:
+        nonlocal asked
+        if not held:
+            one, asked = connected(address), False
+            held.extend([one] if one else [])
+            return
+        try:
+            if not asked:
+                asked = held[0].send(request) > 0
+            elif data := held[0].recv(1 << 12):
+                seen["answers of the bridge"] += bool(data)
+                asked = False
+            else:
+                held.pop().close()
+        except BlockingIOError:
+            pass
+        except OSError:
+            held.pop().close()
+
+    return act
+
+
+def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
+    """A Modbus bridge on the feed, whose own port is attacked: floods of requests, garbage, endless frames, a storm."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "appliance", "bridge", "modbus", "--feed", path, "--listen", f"127.0.0.1:{port}"]
+    bridge = stack.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=ROOT))
+    stack.callback(bridge.terminate)
+    there = ("127.0.0.1", port)
+    read = b"\0\1\0\0\0\6\1\3\0\0\0\x0a"  # ten holding registers from the first
+    floods = [talker(there, seen, lambda: read * 50) for _ in range(5)]
+    garbage = [talker(there, seen, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(5)]
+    good = asker(there, seen, read)
+    return [
+        good,
+        *floods,
+        *garbage,
+        *(talker(there, seen, lambda: b"\0\1\0\0\0\xff") for _ in range(3)),
+        storm(there, seen),
+    ]
+
+
 def main(path: str, kind: str) -> None:
     """Until standard input ends."""
     os.nice(19)
     seen: Counter[str] = Counter()
-    all_acts = acts(kind, path, seen)
-    while not select.select([sys.stdin], [], [], 0)[0]:
-        for act in all_acts:
-            act()
-        time.sleep(PAUSE_S if all_acts else 0.1)
+    with ExitStack() as stack:
+        all_acts = bridged(path, seen, stack) if kind == "bridge" else acts(kind, path, seen)
+        while not select.select([sys.stdin], [], [], 0)[0]:
+            for act in all_acts:
+                act()
+            time.sleep(PAUSE_S if all_acts else 0.1)
     print(json.dumps(seen))
 
 
