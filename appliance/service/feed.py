@@ -43,6 +43,8 @@ MOST_VALUES_S = 10_000
 """Raw counts a second that are written as text: of a large skin fewer frames a second are offered."""
 PERIOD_NS = 30_000_000
 """Time between two looks at the sockets; system calls in every turn of the loop would cost more than all that is sent."""
+SOON_NS = 5_000_000
+"""A verdict, or another state, is sent so soon after the look before it."""
 SERVED, HEARD, HEARD_BYTES = 16, 2, 64
 """Readers that are written to, and sockets and bytes that are read, at one look."""
 KERNEL_BYTES = 16 * 1024
@@ -225,7 +227,7 @@ class FeedServer(Observer):
         self._due: deque[Reader] = deque()  # those with something to send, in the order in which they get their turn
         self._newest: Frames | None = None
         self._retry_ns = self._health_ns = self._next_ns = clock.now_ns()
-        self._tick = 0
+        self._tick, self._fresh = 0, False
         self._state: tuple[object, ...] = ()
         self._log = TroubleLog(
             f"feed: {path} cannot be offered", "classifying goes on; see feed.socket", end=f"feed: offered at {path}"
@@ -239,6 +241,7 @@ class FeedServer(Observer):
         """Have a verdict sent at the end of the turn."""
         if self._readers:
             self._to_all(encode("verdict", verdict.as_dict()))
+            self._fresh = True
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Have the window of a sweep sent to those who asked for it; one larger than a queue is lost to them."""
@@ -259,13 +262,13 @@ class FeedServer(Observer):
         """Queue what is new; when it is time, take up connections and requests, and send to the next few readers."""
         state = health.skin, health.trouble, health.sweeping, health.ready
         if state != self._state:
-            self._state = state
+            self._state, self._fresh = state, True
             if self._readers:
                 self._to_all(encode("state", dict(zip(STATE, state, strict=True))))
         now_ns = self._clock.now_ns()
-        if now_ns < self._next_ns:
+        if now_ns < self._next_ns - (PERIOD_NS - SOON_NS if self._fresh else 0):
             return
-        self._next_ns = now_ns + PERIOD_NS
+        self._next_ns, self._fresh = now_ns + PERIOD_NS, False
         listener = self._listener or self._offer(now_ns)
         if listener:
             self._work(listener, health, now_ns)

@@ -102,6 +102,24 @@ def test_frames_come_at_the_rate_that_was_asked_for(offered: Offered, hz: float)
     assert "frame" not in kinds(peer.lines() + other.lines())
 
 
+def test_a_verdict_is_not_kept_for_the_next_look(offered: Offered) -> None:
+    """It is there with the turn that has it, 8 ms after the last look; a storm of them is sent each 5 ms at most."""
+    peer = offered.peer()
+    peer.lines()
+    for turn in range(1, 4):
+        offered.turns(step_s=0)
+        offered.clock.sleep_until(offered.clock.now_ns() + 8_000_000 - turn)
+        offered.feed.answered(OK)
+        offered.turns(step_s=0)
+        assert kinds(peer.lines()).count("verdict") == 1
+    offered.clock.sleep_until(offered.clock.now_ns() + 1_000_000)
+    offered.feed.answered(OK)
+    offered.turns(step_s=0)
+    assert peer.lines() == []
+    offered.turns(2, step_s=0.005)
+    assert kinds(peer.lines()) == ["verdict"]
+
+
 def test_without_a_new_frame_none_is_repeated(offered: Offered) -> None:
     """A skin that has gone: its last frame comes once."""
     peer = offered.peer()
