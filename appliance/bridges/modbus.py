@@ -30,6 +30,8 @@ INPUTS = ("alive", "ready", "sweeping", "fault", "known", "early")
 LABEL_WORDS = 16
 IDLE_S = 60.0
 """A connection without a request for this long is closed."""
+PACE_S = 0.005
+"""Rest after each request of a connection: whatever peers do, the other programs of the computer keep their share of it."""
 REQUEST_S = 5.0
 """Longest time for the rest of a request, and for a peer to take a reply."""
 
@@ -130,6 +132,7 @@ class ModbusBridge:
             for request in found:
                 peer.write(pdu.reply(request, await self.answer(request, coils)))
             await peer.flush(REQUEST_S)
+            await asyncio.sleep(PACE_S * len(found))
 
     async def answer(self, request: ModbusRequest, coils: list[bool]) -> bytes:
         """The reply's function and data. coils: as this connection has left them."""

@@ -21,7 +21,7 @@ from appliance.client.box import BAUD, Heard, Palpate
 from appliance.client.feed import Feed
 from appliance.client.line import READ_S
 from appliance.core.clock import Clock, SystemClock
-from appliance.core.errors import ApplianceError, CommandRefused, ConfigError, FormatError
+from appliance.core.errors import ApplianceError, CommandRefused, ConfigError
 from appliance.core.status import Status
 from appliance.tools import pseudo_terminal
 
@@ -107,7 +107,7 @@ class LineSource:
         if view.state and view.state.bundle and view.state.bundle != view.bundle:
             try:
                 labels = self._box.labels()
-            except (ApplianceError, FormatError):  # the next second is another chance
+            except ApplianceError:  # the next second is another chance
                 return
             self._view = replace(self._view, labels=labels, bundle=view.state.bundle)
 

@@ -14,6 +14,8 @@ from appliance.core import sentences
 from appliance.core.errors import LinkLost
 from appliance.core.sentences import Sentence, sentence
 
+PACE_S = 0.02
+"""Time between two commands to the box, of all peers together: its loop answers each, and a flood must not reach it."""
 QUESTIONS = ("ID", "STATE", "LABEL")
 """Commands that change nothing, and need no permission."""
 
@@ -25,7 +27,7 @@ class TcpBridge:
         self, name: str, opener: Callable[[], Any], *, writes: bool, most: int, loop: asyncio.AbstractEventLoop
     ) -> None:
         self.server = TcpServer(self.serve, most)
-        self._writes, self._loop = writes, loop
+        self._writes, self._loop, self._sending = writes, loop, asyncio.Lock()
         self._line = Line(opener, self._heard, lambda: None, name=name)
 
     @property
@@ -62,8 +64,11 @@ class TcpBridge:
             return command.error
         if not self._writes and command.kind not in QUESTIONS:
             return "this bridge is read-only; start it with --allow-writes"
-        try:
-            await asyncio.to_thread(self._line.write, sentence(command.kind, *command.fields))
-        except LinkLost as e:
-            return str(e)
+        async with self._sending:
+            try:
+                await asyncio.to_thread(self._line.write, sentence(command.kind, *command.fields))
+            except LinkLost as e:
+                return str(e)
+            finally:
+                await asyncio.sleep(PACE_S)
         return ""

@@ -26,7 +26,7 @@ import numpy as np
 from appliance.core import storage
 from appliance.core.provenance import commit
 from appliance.sim import skin
-from appliance.tools.score import Answer
+from appliance.client.answers import Answer
 from tests.campaigns.feed_readers import KINDS
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine

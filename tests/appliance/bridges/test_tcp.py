@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -15,11 +16,12 @@ from pathlib import Path
 import pytest
 import serial
 
+from appliance.bridges import tcp
 from appliance.bridges.server import QUIET_S, TcpServer
 from appliance.bridges.source import LinkPort
 from appliance.client.box import Palpate
 from appliance.core.errors import CommandRefused, ConfigError
-from appliance.core.sentences import sentence
+from appliance.core.sentences import Sentence, sentence
 from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, result, state
@@ -139,6 +141,45 @@ def test_a_peer_that_never_reads_is_given_up(box: SpeakingBox):
             assert heard.count(b"$PPLP,RES,") == 5_000
         deaf.settimeout(LONG_S)
         assert all_of(deaf).count(b"$PPLP,RES,") < 5_000
+
+
+class DeafPort:
+    """A port that takes what it is given."""
+
+    def __init__(self) -> None:
+        self.written: list[bytes] = []
+        self.in_waiting = 0
+
+    def read(self, size: int) -> bytes:
+        """Nothing comes."""
+        threading.Event().wait(0.01)
+        return b""
+
+    def write(self, data: bytes) -> None:
+        """Keep it."""
+        self.written.append(data)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPatch):
+    """Of many commands at once one goes out, and the next after its time, whoever sent it."""
+    monkeypatch.setattr(tcp, "PACE_S", 3600.0)
+    port = DeafPort()
+
+    async def run() -> None:
+        bridge = tcp.TcpBridge("x", lambda: port, writes=True, most=9, loop=asyncio.get_running_loop())
+        flood = [asyncio.create_task(bridge._send(Sentence("STATE"))) for _ in range(200)]
+        while not port.written:
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.1)
+        for task in flood:
+            task.cancel()
+        bridge.close()
+
+    asyncio.run(run())
+    assert port.written == [sentence("STATE")]
 
 
 def test_a_silent_peer_makes_room():
