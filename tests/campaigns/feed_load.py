@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
+from appliance.client.answers import Answer
 from appliance.core import storage
 from appliance.core.provenance import commit
 from appliance.sim import skin
-from appliance.client.answers import Answer
 from tests.campaigns.feed_readers import KINDS
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine
