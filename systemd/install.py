@@ -14,20 +14,22 @@ import tempfile
 from pathlib import Path
 
 from fleet import Failed, FleetBox, each, options, remedy
+from page_secrets import make as make_page_secrets
 from release import ROOT, ReleaseArchives
 
 from appliance import __version__
 from appliance.core.config import boards
 
 WHEEL = ROOT / "dist" / f"palpate-{__version__}-py3-none-any.whl"
-PACKAGES = ("python3-venv", "libusb-1.0-0", "openssh-client")
-"""Debian packages: for a virtual environment, the skin on USB, signatures (ssh-keygen)."""
+PACKAGES = ("python3-venv", "libusb-1.0-0", "openssh-client", "openssl")
+"""Debian packages: for a virtual environment, the skin on USB, signatures (ssh-keygen), the page's certificate."""
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 """Names of an architecture: by Debian, and in Python's wheels."""
 LINK = "/opt/palpate"
 """Leads to the release that runs."""
 PATHS = {
     "systemd/palpate.service": "/etc/systemd/system/palpate.service",
+    "systemd/palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
     "systemd/palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "systemd/palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
     "firmware_config/70-palpate.rules": "/etc/udev/rules.d/70-palpate.rules",
@@ -175,6 +177,7 @@ def prepare(release: str, board: str, signers: str) -> str:
         "set -e; umask 022",
         f"systemd-sysusers {share}/palpate.sysusers",
         f"systemd-tmpfiles --create {share}/palpate.tmpfiles",
+        make_page_secrets(),
     ]
     if signers:
         file, text = "/etc/palpate/allowed_signers", shlex.quote(signers)
@@ -231,6 +234,8 @@ def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
         ready = _start(box)
     except Failed as e:
         raise Failed(f"{e}{_swap_back(box, release)}") from e
+    # it serves the release before until then; where it is off, this does nothing
+    box.run("restarting the page", "systemctl try-restart palpate-watch", user="root")
     keep = f"$(readlink -e {LINK}) $(readlink -e {LINK}.previous || true)"
     tidy = f'for one in {LINK}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
     box.run("removing older releases", tidy, user="root", limit_s=120)

@@ -14,7 +14,8 @@ def make(folder: str = FOLDER, group: str = "palpate-watch") -> str:
     The certificate is for this machine's host name, also as multicast DNS has it, for localhost, and for the addresses
     that the machine has now. It signs nothing but itself.
     """
-    return f"""mkdir -p {folder}
+    return f"""(
+install -d -m 750 -g {group} {folder}
 umask 077
 put() {{ chgrp {group} {folder}/$1.new && chmod 640 {folder}/$1.new && sync -f {folder}/$1.new && mv {folder}/$1.new {folder}/$1; }}
 if [ ! -s {folder}/token ]; then openssl rand -hex 16 > {folder}/token.new && put token; fi
@@ -25,4 +26,5 @@ if ! openssl x509 -checkend {RENEWED_DAYS * 86400} -noout -in {folder}/certifica
     -addext "subjectAltName=$names" -addext basicConstraints=critical,CA:FALSE -addext extendedKeyUsage=serverAuth \\
     -keyout {folder}/key.pem.new -out {folder}/certificate.pem.new 2> /dev/null
   put key.pem; put certificate.pem
-fi"""
+fi
+)"""

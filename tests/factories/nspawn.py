@@ -27,12 +27,22 @@ from tests.factories.emulated_machines import HOME, LOCK, PIP, ROOT, Missing, ru
 CACHE = HOME.parent / "nspawn"
 SUITE, PYTHON = "bookworm", "3.11"
 """Debian 12, what the boards run, and its Python."""
-PACKAGES = ("systemd", "systemd-sysv", "python3-venv", "libstdc++6", "libusb-1.0-0", "openssh-client", "udev")
+PACKAGES = (
+    "systemd",
+    "systemd-sysv",
+    "python3-venv",
+    "libstdc++6",
+    "libusb-1.0-0",
+    "openssh-client",
+    "openssl",
+    "udev",
+)
 TOOLS = {
     "mmdebstrap": "mmdebstrap", "systemd-nspawn": "systemd-container", "nsenter": "util-linux", "setpriv": "util-linux",
 }  # fmt: skip
 PLACES = {
     "palpate.service": "/etc/systemd/system/palpate.service",
+    "palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
     "palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
 }

@@ -1,0 +1,112 @@
+"""The page's unit under a real systemd, in a container: off at first, hardened, over TLS with the install's token."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import pytest
+
+from tests.factories import nspawn
+from tests.factories.install_scripts import run_here
+from tests.factories.nspawn import SITE, STREAMS, Machine, Service
+
+pytestmark = pytest.mark.slow
+
+pytest_plugins = ["tests.factories.systemd_fixtures"]
+
+UNIT = "palpate-watch"
+ASK = """
+import json, socket, ssl, sys, time, urllib.request
+end = time.monotonic() + 20
+while socket.socket().connect_ex(("127.0.0.1", 8137)) and time.monotonic() < end:
+    time.sleep(0.1)
+trusts = ssl.create_default_context(cafile="/etc/palpate/watch/certificate.pem")
+token = open("/etc/palpate/watch/token").read().strip()
+request = urllib.request.Request("https://127.0.0.1:8137/events", headers={"Authorization": f"Bearer {token}"})
+with urllib.request.urlopen(request, context=trusts, timeout=20) as answer:
+    found = {}
+    while "verdict" not in found and not (sys.argv[1:] and found.get("box", {}).get("there") is False):
+        name, _, text = answer.readline().decode().strip().partition(": ")
+        if name == "event":
+            event = text
+        elif name == "data":
+            found[event] = json.loads(text)
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture
+def page(machine: Machine, service: Service) -> Iterator[Machine]:
+    """The machine with the page on the network, beside the running service."""
+    machine.get("sh", "-ec", run_here("import page_secrets; print(page_secrets.make())"))
+    machine.put(SITE, '[watch]\naddress = "0.0.0.0"\n')
+    service.start()
+    service.until("StatusText", STREAMS)
+    machine.get("systemctl", "start", UNIT)
+    yield machine
+    machine.get("systemctl", "stop", UNIT)
+
+
+def test_the_unit_is_sound_hardened_and_off(machine: Machine, before: list[bool]):
+    """systemd reports no problem; the exposure is at most 1.5 of 10, as the service's; an install does not enable it."""
+    place = nspawn.PLACES[f"{UNIT}.service"]
+    done = machine.run("systemd-analyze", "verify", place)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = machine.run("systemd-analyze", "security", "--offline=true", "--threshold=15", place)
+    print(done.stdout.splitlines()[-1])
+    assert done.returncode == 0, done.stdout
+    assert machine.run("systemctl", "is-enabled", UNIT).stdout.strip() == "disabled"
+
+
+def test_the_page_is_served_with_the_token_of_the_install(page: Machine):
+    """Over TLS with the certificate that was made there: the box's name, state and verdicts come through."""
+    found = json.loads(page.get("/opt/palpate/bin/python", "-c", ASK))
+    assert found["hello"]["source"] == "sim"
+    assert found["box"] == {"there": True, "why": ""}
+    assert found["verdict"]["scores"]
+    assert page.get("systemctl", "is-active", UNIT) == "active"
+
+
+def test_it_goes_on_without_the_service(page: Machine, service: Service):
+    """The service stops under it: the page says so, and is there when it starts again."""
+    before = page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID")
+    page.get("systemctl", "stop", "palpate")
+    assert json.loads(page.get("/opt/palpate/bin/python", "-c", ASK, "away"))["box"]["there"] is False
+    page.get("systemctl", "start", "palpate")
+    assert json.loads(page.get("/opt/palpate/bin/python", "-c", ASK))["box"]["there"] is True
+    assert page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID") == before
+
+
+def test_the_token_is_for_root_and_the_page_alone(page: Machine):
+    """Another user reads neither token nor key, nor the feed; the page reads nothing of what the service keeps."""
+    other = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", "cat")
+    for name in ("token", "key.pem", "certificate.pem"):
+        path = f"/etc/palpate/watch/{name}"
+        assert page.get("stat", "-c", "%U:%G %a", path) == "root:palpate-watch 640"
+        assert page.run(*other, path).returncode != 0
+    pid = page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID")
+    uid, groups = (
+        page.get("stat", "-c", "%u", f"/proc/{pid}"),
+        page.get("sed", "-n", "s/^Groups:\t//p", f"/proc/{pid}/status"),
+    )
+    assert uid == page.get("id", "-u", UNIT)
+    inside = page.run(
+        "nsenter", "-t", pid, "-m", "setpriv", f"--reuid={uid}", f"--regid={uid}", f"--groups={groups.replace(' ', ',')}",
+        "ls", "/var/lib/palpate",
+    )  # fmt: skip
+    assert inside.returncode != 0
+    assert "Permission denied" in inside.stderr
+
+
+def test_without_a_token_it_does_not_start_on_the_network(machine: Machine, service: Service):
+    """Exit 78, no restart; the journal names the file and what makes it."""
+    machine.run("rm", "-rf", "/etc/palpate/watch")
+    machine.put(SITE, '[watch]\naddress = "0.0.0.0"\n')
+    machine.get("systemctl", "start", UNIT)
+    machine.get("sh", "-c", f"for i in $(seq 60); do systemctl is-failed -q {UNIT} && exit; sleep 0.5; done; exit 1")
+    assert machine.get("systemctl", "show", UNIT, "--value", "-p", "ExecMainStatus") == "78"
+    journal = machine.get("journalctl", "-q", "-u", UNIT, "-o", "cat")
+    assert "/etc/palpate/watch/token cannot be read" in journal
+    assert "make install makes one" in journal
+    machine.get("systemctl", "reset-failed", UNIT)
