@@ -53,6 +53,8 @@ class Kind:
     answers: list[tuple[float, int]] = field(default_factory=list)
     """When each answer came, in seconds, and the frame at which its stop edge was."""
     latency_ms: list[float] = field(default_factory=list)
+    way_ms: list[float] = field(default_factory=list)
+    """From the verdict, whose time has whole milliseconds, to the robot's end: what is not the box's."""
     lost: int = 0
     dropped: int = 0
     faults: Counter[str] = field(default_factory=Counter)
@@ -89,6 +91,7 @@ class LatencyListener:
             self._next = answer.sweep + 1
             kind.answers.append((at_s, fact.stop))
             kind.latency_ms.append(answer.latency_ms)
+            kind.way_ms.append(1e3 * (at_s - float(fields[3])))
 
 
 def measure(
@@ -162,11 +165,18 @@ def result(kinds: dict[str, Kind], rss_kib: int) -> dict[str, Any]:
             "share_more": [round(float(v), 5) for v in (more.mean(), more.mean() - width, more.mean() + width)],
             "memory_mib": round((max(kind.rss_kib) - rss_kib) / 1024, 2),
             "late_ms": {f"p{q}": round(float(np.percentile(late[name], q)), 2) for q in (50, 99)},
+            "way_ms": {f"p{q}": round(float(np.percentile(kind.way_ms, q)), 1) for q in (50, 99)},
+            "slowest": [[round(float(v), 1), round(kind.way_ms[i], 1)] for i, v in slowest(late[name])],
             "latency_ms": {f"p{q}": round(float(np.percentile(kind.latency_ms, q)), 2) for q in (50, 99)},
             "frames_lost": kind.lost, "sentences_dropped": kind.dropped,
             "faults": {k: n for k, n in kind.faults.items() if n}, "lines": dict(kind.seen),
         }  # fmt: skip
     return figures
+
+
+def slowest(late_ms: Any) -> list[tuple[int, float]]:
+    """The three latest answers: number in the list, milliseconds."""
+    return [(int(i), float(late_ms[i])) for i in np.argsort(-late_ms)[:3]]
 
 
 def missed(figures: dict[str, Any]) -> list[str]:

@@ -22,7 +22,7 @@ def kind(share: float, late_ms: float = 1.0, **more: object) -> Kind:
     seen_s = (np.ceil((stops - 4) / PACKET) * PACKET + 4) / RATE
     answers = [(float(s) + late_ms / 1e3, int(stop)) for s, stop in zip(seen_s, stops, strict=True)]
     values = {"wall_s": 300.0, "cpu_s": 300 * share, "shares": [share] * 15, "rss_kib": [70_000], "answers": answers,
-              "latency_ms": [1.2] * 40}  # fmt: skip
+              "latency_ms": [1.2] * 40, "way_ms": [0.5] * 40}  # fmt: skip
     return Kind(**(values | more))
 
 
