@@ -1,5 +1,5 @@
 """What readers of the feed cost the box: `python -m tests.campaigns.feed_load --minutes 5 --out docs/feed.json`. In: minutes for
-each kind of readers. Out: a table and JSON: share of a core, memory, latency and losses, with and without them; exit code 1
+each kind of readers. Out: JSON and a table: share of a core, memory, latency and losses, with and without them; exit code 1
 if a target was missed.
 
 One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had the same machine. Box
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -30,6 +31,7 @@ from appliance.sim import skin
 from tests.campaigns.feed_readers import KINDS
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine
+from train.reports import marked_text
 
 SLOT_S, SETTLE_S = 20.0, 2.0
 WAIT_S = 0.1
@@ -206,9 +208,14 @@ NAMES = {
 }
 
 
-def table(figures: dict[str, Any]) -> str:
-    """The figures in Markdown."""
+def table(content: dict[str, Any]) -> str:
+    """What was measured, in Markdown."""
+    figures = content["readers"]
     rows = [
+        f"Measured by `python -m tests.campaigns.feed_load`, {figures['0']['seconds']} s of each kind in turns of {SLOT_S:g} s, on "
+        f"{content['machine']}{', with real-time priority' * content['real_time']}; load average {content['load']:.1f} by other "
+        f"work; commit {content['commit'][:12]}.",
+        "",
         "| readers | share of a core | more than without | memory, more | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -230,7 +237,23 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="some of them, beside 0")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("build/feed.json"))
+    parser.add_argument("--page", type=Path, help="also put the table there, between the markers named after --out")
+    parser.add_argument("--draw", action="store_true", help="measure nothing: the table of --out as it is")
     args = parser.parse_args()
+    if not args.draw:
+        _measured(args)
+    content = json.loads(args.out.read_text())
+    print(table(content))
+    if args.page:
+        page = marked_text.insert(args.page.read_text("utf-8"), args.out.stem, table(content), str(args.page))
+        args.page.write_text(page, "utf-8")
+    for text in (bad := missed(content["readers"])):
+        print(f"FAIL {text}")
+    return 1 if bad else 0
+
+
+def _measured(args: argparse.Namespace) -> None:
+    """Measure, and write the figures to --out."""
     real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
     kinds, rss_kib, about = measure(
         ["0", *(name for name in args.kinds if name != "0")],
@@ -240,12 +263,9 @@ def main() -> int:
         lambda line: print(line, flush=True),
     )
     figures = result(kinds, rss_kib)
-    content = {"commit": commit(), "seed": args.seed, **about, "real_time": real_time, "readers": figures}
+    load = round(os.getloadavg()[2], 1)
+    content = {"commit": commit(), "seed": args.seed, **about, "real_time": real_time, "load": load, "readers": figures}
     storage.put(args.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
-    print(table(figures))
-    for text in (bad := missed(figures)):
-        print(f"FAIL {text}")
-    return 1 if bad else 0
 
 
 if __name__ == "__main__":

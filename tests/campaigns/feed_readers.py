@@ -1,7 +1,8 @@
 """Programs at the box's feed, good and bad: `python -m tests.campaigns.feed_readers PATH KIND` until its input ends. In: the
 socket, one of KINDS. Out: one line of JSON, what they got.
 
-All are in one process of low priority, which pauses between its rounds, so that it takes less than a core.
+All are in one process, which pauses between its rounds, so that it takes less than a core. It has the usual priority, also where
+the one that starts it has another.
 """
 
 from __future__ import annotations
@@ -204,7 +205,7 @@ def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "appliance", "bridge", "modbus", "--feed", path, "--listen", f"127.0.0.1:{port}"]
     bridge = stack.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=ROOT))
-    stack.callback(bridge.terminate)
+    stack.callback(bridge.kill)
     there = ("127.0.0.1", port)
     read = b"\0\1\0\0\0\6\1\3\0\0\0\x0a"  # ten holding registers from the first
     floods = [talker(there, seen, lambda: read * 50) for _ in range(5)]
@@ -221,7 +222,7 @@ def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
 
 def main(path: str, kind: str) -> None:
     """Until standard input ends."""
-    os.nice(19)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     seen: Counter[str] = Counter()
     with ExitStack() as stack:
         all_acts = bridged(path, seen, stack) if kind == "bridge" else acts(kind, path, seen)

@@ -40,9 +40,11 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(kinds: dict[str, Kind]) 
     assert figures["64"]["late_ms"]["p50"] == pytest.approx(0.7, abs=0.01)
     assert figures["0"]["late_ms"] == {"p50": 0.0, "p99": 0.0}
     assert figures["1"]["memory_mib"] == 0.98
-    rows = feed_load.table(figures).splitlines()
-    assert len(rows) == 2 + len(kinds)
-    assert "+0.70 % [+0.70, +0.70]" in rows[4]
+    content = {"machine": "m", "real_time": True, "load": 1.5, "commit": "abc", "readers": figures}
+    rows = feed_load.table(content).splitlines()
+    assert len(rows) == 4 + len(kinds)
+    assert "300 s of each kind in turns of 20 s, on m, with real-time priority; load average 1.5" in rows[0]
+    assert "+0.70 % [+0.70, +0.70]" in rows[6]
 
 
 @pytest.mark.parametrize(
