@@ -24,6 +24,9 @@ from appliance.sim.skins.wires import Wire
 
 DRIVER_BYTES = 65_536
 """What the kernel's driver of a real adapter holds for a slow reader, about; what comes then is thrown away."""
+MOST_AT_ONCE = 1000
+"""Frames that one step makes, of those that are due. A computer that is too slow for the skin would fall behind more with
+each step, and its step never end."""
 LOOK_NS = 2_000_000
 """Time between two looks for commands while nothing is due."""
 
@@ -144,6 +147,9 @@ class Player:
     def _send_due(self) -> None:
         now = self._clock.now_ns()
         until = self._first_after(now // self._collect_ns * self._collect_ns if self._collect_ns else now)
+        if (late := until - self._next - MOST_AT_ONCE) > 0:
+            self.wire.skip(late)
+            self._next += late
         while self._next < until:
             self._send_one(self._next)
 

@@ -36,8 +36,19 @@ class Wire(Protocol):
         """Bytes from the box; what the skin answers."""
         ...
 
+    def skip(self, frames: int) -> None:
+        """So many frames are taken and never sent: a skin that counts them goes on counting."""
+        ...
 
-class _Deaf:
+
+class _Uncounted:
+    """A skin whose frames have no number."""
+
+    def skip(self, frames: int) -> None:
+        """Nobody can tell."""
+
+
+class _Deaf(_Uncounted):
     """A skin that streams from power-on and takes no commands."""
 
     streaming = True
@@ -151,6 +162,10 @@ class PapillArray:
         self.counter += 1
         return self.START + body + struct.pack("<H", sum(body) & 0xFFFF) + self.END
 
+    def skip(self, frames: int) -> None:
+        """The counter of the next packet shows the gap."""
+        self.counter += frames
+
     def _blocks(self, force: NDArray[np.float64], t_us: int) -> bytes:
         table, payload = b"", b""
         kinds = 1, 3, 4, 5, 6, 7
@@ -190,7 +205,7 @@ def _listed(items: Sequence[bytes], at: int) -> bytes:
     return struct.pack(f"<H{len(items)}H", len(items), *begins) + b"".join(items)
 
 
-class Slcan:
+class Slcan(_Uncounted):
     """XELA's uSkin on CAN, behind a USB adapter that speaks slcan. Frames [R, C, 3] uint16: X, Y, Z.
 
     Sources: Lawicel's slcan as github.com/mac-can/SLCAN describes it (commands end with CR, answers are CR or BEL, `z` CR
@@ -247,7 +262,7 @@ class Slcan:
         return b"".join(b"t%03X8%b\r" % (self.FIRST_ID + i, m.hex().upper().encode()) for i, m in enumerate(messages))
 
 
-class Robotiq:
+class Robotiq(_Uncounted):
     """Robotiq's TSF-85 fingertips. Frames [7 F, 4] uint16: F fingers of 7 x 4 taxels.
 
     Source: Robotiq's reader for Python (tactile_sensors, sensor_quickstart) as packages repeat it: 9A, a byte that is no

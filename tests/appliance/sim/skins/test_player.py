@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from appliance.sim.rig import VirtualClock
-from appliance.sim.skins.player import DRIVER_BYTES, Player, PlayerClock
+from appliance.sim.skins.player import DRIVER_BYTES, MOST_AT_ONCE, Player, PlayerClock
 from appliance.sim.skins.wires import wire
 from tests.factories.played_skins import Numbered
 
@@ -104,6 +104,17 @@ def test_slow_reader_gets_what_the_driver_held(bench: PlayedSkin) -> None:
     assert bench.player.thrown > 50_000
     assert len(data) + bench.player.thrown == len(bench.expected(0, 550))
     assert data.endswith(bench.expected(540, 10))
+
+
+def test_a_computer_that_is_too_slow_for_the_skin_skips_frames(tmp_path: Path) -> None:
+    """A step makes a bounded number of frames, however long ago the last one was; a skin's counter shows the gap."""
+    bench = PlayedSkin("papillarray", tmp_path)
+    bench.open()
+    bench.virtual.sleep_until(bench.clock.now_ns() + 3600 * SECOND)
+    bench.player.step()
+    assert bench.player.frames == MOST_AT_ONCE
+    assert bench.player.wire.counter == 3600 * bench.source.rate_hz
+    bench.close()
 
 
 def test_pause_and_bad_cable(bench: PlayedSkin) -> None:
