@@ -8,7 +8,8 @@ them is of an unknown material. The box needs only this map and the means.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,16 +33,33 @@ FLAT = 1e-9
 
 @dataclass(frozen=True)
 class Embedding:
-    """z = features @ projection + offset. projection: float32 [F, r], offset [r]; means: float32 [K, r], of each label.
+    """z = features @ projection + offset. offset: float32 [r]; means: float32 [K, r], of each label.
+
+    The projection [F, r] is in two parts, for most of it only selects: directions [F, d] and the last F' features as they
+    are, side by side, times turn [d + F', r]. F' is 0 where that would save nothing.
 
     The sweeps of all materials have the identity as covariance in z (Mahalanobis distance; Lee et al. 2018). shapes:
     float16 [K, b, b], how each material's own sweeps scatter in the last b directions; see the box's shaped_distances.
     """
 
-    projection: Array
+    directions: Array
+    turn: Array
     offset: Array
     means: Array
     shapes: Array
+
+    @property
+    def selected(self) -> int:
+        """How many features, the last ones, are turned as they are."""
+        return int(self.turn.shape[0] - self.directions.shape[1])
+
+    @cached_property
+    def projection(self) -> Array:
+        """float32 [F, r]."""
+        turn, rest = np.split(self.turn.astype(np.float64), [self.directions.shape[1]])
+        product = self.directions @ turn
+        product[len(product) - len(rest) :] += rest
+        return product.astype(np.float32)
 
     def __call__(self, features: Array) -> Array:
         """Features [..., F] -> z, float64 [..., r]."""
@@ -93,14 +111,19 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     means = np.stack([x[labels == k].mean(axis=0) for k in range(classes)]) - middle
     white, coloured = _whitening(x, labels)
     axes = np.linalg.svd((means - means.mean(axis=0)) @ white)[2][: classes - 1].T
-    axes = np.linalg.qr(np.hstack([axes, coloured[:, size - fixed :]]))[0]
-    whole, steps = sixteen_bits(white @ axes)  # as a bundle's graph holds it
-    projection = whole * steps
+    orthonormal, mixed = np.linalg.qr(np.hstack([axes, coloured[:, size - fixed :]]))
+    if fixed and classes - 1 + fixed < size:  # white @ coloured selects
+        directions, turn = white @ axes, np.linalg.inv(mixed)
+    else:
+        directions, turn = white @ orthonormal, np.eye(orthonormal.shape[1])
+    whole, steps = sixteen_bits(directions)  # as a bundle's graph holds it
+    bare = Embedding(whole * steps, turn.astype(np.float32), *[np.empty(0)] * 3)
+    projection = bare.projection
     means = (means @ projection).astype(np.float32)
     own = min(fixed, projection.shape[1])
     away = ((x - middle) @ projection - means[labels])[:, projection.shape[1] - own :]
     shapes = np.stack([_shape(away[labels == k]) for k in range(classes)])
-    return Embedding(projection, (-middle @ projection).astype(np.float32), means, shapes)
+    return replace(bare, offset=(-middle @ projection).astype(np.float32), means=means, shapes=shapes)
 
 
 def _shape(away: Array) -> Array:

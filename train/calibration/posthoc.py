@@ -32,10 +32,10 @@ from train.onnx_tools.graph_builder import joined, run
 from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
-
-
 HELD_COPIES_SEED = 1
 """Added to a fit's seed for the copies of its held-out sweeps."""
+DIRECTIONS, TURN, OFFSET = "embedding.axes", "embedding.turn", "embedding.offset"
+"""Names of a model's matrices; see novelty.Embedding."""
 
 
 @dataclass(frozen=True)
@@ -199,14 +199,14 @@ def assemble_model(
     centred = _sixteen_bits(add, weight - weight.mean(1, keepdims=True), "head.weight")
     add("Gemm", whole, centred, bias - bias.mean(), output="logits")
     outputs: dict[str, list[int]] = {"logits": [1, len(bias)]}
-    projection, offset = "embedding.projection", "embedding.offset"
+    embedded = partial(_embedded, add, embedding)
     if known or steps is not None:
-        _sixteen_bits(add, embedding.projection, projection)
-        model.graph.initializer.append(numpy_helper.from_array(embedding.offset, offset))
+        _sixteen_bits(add, embedding.directions, DIRECTIONS)
+        for name, constant in ((TURN, embedding.turn), (OFFSET, embedding.offset))[not embedding.selected :]:
+            model.graph.initializer.append(numpy_helper.from_array(constant, name))
     if steps is not None:
         count = len(steps.weight)
-        z = add("MatMul", *tenths, projection, output="head.turned")
-        z = add("Add", z, offset, output="head.each")
+        z = embedded(tenths[0], axis=2, output="head.each")
         # [1, D, r] -> [D, 1, r]: one head for each row
         rows = add("Slice", z, np.array([0]), np.array([count]), np.array([1]), output="head.first")
         rows = add("Transpose", rows, output="head.rows", perm=[1, 0, 2])
@@ -214,13 +214,23 @@ def assemble_model(
         add("Transpose", add("Add", rows, steps.bias[:, None], output="head.said"), output="early", perm=[1, 0, 2])
         outputs["early"] = [1, count, len(bias)]
     if known:
-        add("Gemm", whole, projection, offset, output="embedding")
-        outputs["embedding"] = [1, embedding.projection.shape[1]]
+        embedded(whole, axis=1, output="embedding")
+        outputs["embedding"] = [1, len(embedding.offset)]
     del model.graph.output[:]
     for name, shape in outputs.items():
         model.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
     onnx.checker.check_model(model, full_check=True)
     return model
+
+
+def _embedded(add: Callable[..., str], embedding: Embedding, x: str, axis: int, output: str) -> str:
+    """Features [..., F], F being the axis `axis` -> what `embedding` makes of them; its constants are in the graph."""
+    z, size = add("MatMul", x, DIRECTIONS, output=f"{output}.known"), len(embedding.directions)
+    if embedding.selected:
+        ends = (np.array([n]) for n in (size - embedding.selected, size, axis))
+        z = add("Concat", z, add("Slice", x, *ends, output=f"{output}.selected"), output=f"{output}.both", axis=axis)
+        z = add("MatMul", z, TURN, output=f"{output}.whole")
+    return add("Add", z, OFFSET, output=output)
 
 
 def _sixteen_bits(add: Callable[..., str], matrix: Array, name: str) -> str:

@@ -132,3 +132,19 @@ def test_auroc_of_a_known_separation():
     assert novelty.auroc(np.zeros(3), np.zeros(5)) == 0.5
     with pytest.raises(FormatError, match="both kinds"):
         novelty.auroc(np.zeros(3), np.empty(0))
+
+
+def test_untrained_features_are_selected_and_not_multiplied():
+    """Where there are more features than directions the projection is that of all features, from a matrix for the trained
+    ones alone: the covariance of z is 1, and the last features decide by themselves in their own span."""
+    mix = np.random.default_rng(1).standard_normal((20, 20))
+    x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 20)) @ mix, mix=mix)
+    one = novelty.embed(x, y, 5)
+    assert one.directions.shape == (20, 3)
+    assert one.selected == 5
+    assert one.projection.shape == (20, 8)
+    within = np.cov((one(x) - one.means[y]).T)
+    np.testing.assert_allclose(within, np.eye(8), atol=0.15)
+    few = novelty.embed(x, y, 18)
+    assert few.selected == 0
+    assert few.projection.shape == (20, 20)

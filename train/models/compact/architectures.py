@@ -52,7 +52,7 @@ class Architecture:
     planned: how many stages there were before some were cut off, 0 if none were; with none left the head sees only the
     spectrum. spectrum: whether the head sees the bands of spectrum.py after the stages' responses. fewest: number of
     stages that are never cut off. pools: how the filter bank of bank.py is pooled: 0 where there is none, 1 by magnitudes,
-    2 by shares as well.
+    2 by shares as well. distribution: whether the head sees the shares of distribution.py.
     """
 
     channels: tuple[int, ...]
@@ -62,6 +62,7 @@ class Architecture:
     spectrum: bool = False
     fewest: int = 1
     pools: int = 0
+    distribution: bool = False
 
     def cut(self, depth: int, spectrum: bool = False) -> Architecture:
         """The first `depth` stages, each as it was, with the spectrum or without."""

@@ -28,8 +28,8 @@ from train.onnx_tools.quantize import PERCENTILE
 Array = NDArray[Any]
 TAPS, DILATIONS = 9, (1, 2, 4, 8, 16)
 MOST_FILTERS, LEAST_FILTERS = 512, 64
-MOST_TAPS = 43_200
-"""Of all filters of a kind together: 300 filters of sixteen taxels, 512 of ten and fewer."""
+MOST_TAPS = 36_864
+"""Of all filters of a kind together: 256 filters of sixteen taxels, 512 of eight and fewer."""
 LARGEST, SPREAD = 8, 3.0
 """Largest factor of a taxel and of a frame, whose product is a tap of seven bits; deviation of what is rounded to them."""
 MOST_MACS, MOST_STEPS = 6_000_000, 256

@@ -127,16 +127,21 @@ def _error(x: Array) -> float:
 
 
 def choose(
-    court: Court, kinds: Sequence[Array], pools: Sequence[Array], bands: Array, log: Callable[[str], None]
+    court: Court,
+    kinds: Sequence[Array],
+    pools: Sequence[Array],
+    levels: Array,
+    bands: Array,
+    log: Callable[[str], None],
 ) -> Judged:
     """The candidate with the least loss, where it is `better` than the usual one; else the usual one.
 
-    What the sweeps are too few to tell apart is not chosen among. The usual one adds two discriminants for each kind of
-    filters: one sees their magnitudes, one their shares as well. An average is seldom worse than the better of two, and
-    no held-out part need show which that is. Filters' pools are chosen first; then whether these see the spectrum and
-    copies, or the spectrum is enough alone.
-    kinds: filters [n] of each kind. pools: the features [F] of every filter's magnitude, then of its share. bands:
-    numbers of the spectrum's features, which may be none.
+    What the sweeps are too few to tell apart is not chosen among. The usual one adds three discriminants for each kind of
+    filters: all see their magnitudes, one their shares and the spectrum as well, one the distribution of counts and the
+    spectrum. An average is seldom worse than the better of two, and no held-out part need show which that is. Whether
+    magnitudes are enough is chosen first; then whether all see the spectrum and copies, or the spectrum is enough alone.
+    kinds: filters [n] of each kind. pools: the features [F] of every filter's magnitude, then of its share. levels,
+    bands: numbers of the features of the distribution and of the spectrum, which may be none.
     """
 
     def judged(named: str, parts: Sequence[HeadPart]) -> Judged:
@@ -146,23 +151,29 @@ def choose(
     def best(of: Sequence[Judged]) -> Judged:
         return min(of, key=court.loss)
 
-    sizes, both = (views(kinds, pools[:n]) for n in (1, len(pools)))
-    plain = [judged("magnitudes; magnitudes and shares", [*sizes, *both]), judged("magnitudes", sizes)]
+    sizes, shares = (views(kinds, pools[:n]) for n in (1, 2))
+    usual = [*sizes, *_with(shares, bands), *(_with(sizes, np.append(levels, bands)) if len(levels) else ())]
+    plain = [judged("magnitudes, shares, distribution", usual), judged("magnitudes", sizes)]
     first = best(plain).plan.parts
-    seen = {"without the spectrum": first}
+    seen = {"without more of the spectrum": list(first)}
     if len(bands):
         seen |= {
-            "with the spectrum": tuple(replace(p, columns=(*p.columns, *bands.tolist())) for p in first),
-            "the spectrum alone": (HeadPart(tuple(bands.tolist()), False),),
+            "with the spectrum": _with(first, bands),
+            "the spectrum alone": [HeadPart(tuple(bands.tolist()), False)],
         }
     more = [
         judged(f"{name}{', with copies' * copies}", [replace(part, copies=copies) for part in parts])
         for name, parts in seen.items()
         for copies in (False, True)
-        if copies or parts is not first
+        if copies or name != "without more of the spectrum"
     ]
     chosen = best([*plain, *more])
     return chosen if court.better(chosen, plain[0]) else plain[0]
+
+
+def _with(parts: Sequence[HeadPart], more: Array) -> list[HeadPart]:
+    """`parts`, each of which sees the features `more` too."""
+    return [replace(p, columns=tuple(dict.fromkeys([*p.columns, *more.tolist()]))) for p in parts]
 
 
 def fewer(court: Court, chosen: Judged, filters: Array, least: int, log: Callable[[str], None]) -> Judged:

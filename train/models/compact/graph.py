@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from onnx import helper
 
 from appliance.core.types import SweepFormat
-from train.models.compact import bank, nodes, spectrum
+from train.models.compact import bank, distribution, nodes, spectrum
 from train.models.compact.architectures import FLOOR, NOISE_LIMIT, Architecture
 from train.models.compact.nodes import FLOAT, MIDDLE, TENTHS
 from train.onnx_tools.graph_builder import GraphBuilder
@@ -66,13 +66,17 @@ def trunk_graph(
     if architecture.channels:
         x, step = _prepared(g, form, scale, architecture, raw, attenuation, ranges, tenths)
         parts.append(_log_means(g, form, architecture, weights, x, step, ranges, tenths))
-    if architecture.pools:
-        own = ranges if form.dtype == "uint8" else None  # a byte does not hold wider counts, see decision 11
+    own = ranges if form.dtype == "uint8" else None  # a byte does not hold wider counts, see decision 11
+    if architecture.pools or architecture.distribution:
         x, step = _prepared(g, form, scale, architecture, raw, attenuation, own, tenths)
+    if architecture.pools:
         rowwise = tenths and not architecture.zero_sum(form.window)
         asked = bank.Pooling(own is not None, architecture.pools > 1, tenths, rowwise)
         pooled = bank.pooled(g, form, bank.Bank.of(weights), x, step, asked)
         parts += [g("Reshape", part, g.constant([1, TENTHS, -1], "int64")) for part in pooled] if rowwise else pooled
+    if architecture.distribution:
+        levels, unit = distribution.Levels.of(weights), step if own is None else 1.0
+        parts.append(distribution.pooled(g, form, levels, x, unit, own is not None, tenths))
     if keep_means:
         counts = nodes.known_steps(nodes.frames(form.window), form.window, tenths)
         parts.append(g("Mul", _levels(g, g("Cast", raw, to=FLOAT), form, counts), g.constant(scale)))
@@ -88,10 +92,12 @@ def trunk_graph(
 def layout(
     form: SweepFormat, weights: Mapping[str, Array], architecture: Architecture, keep_means: bool = False
 ) -> dict[str, slice]:
-    """Where the features of each part of a trunk are: `stages`, `sizes` and `shares` of the bank, `means`, `bands`."""
+    """Where the features of each part of a trunk are: `stages`, `sizes` and `shares` of the bank, `levels` of the
+    distribution, `means`, `bands`."""
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
         "stages": sum(architecture.channels), "sizes": filters, "shares": filters * (architecture.pools > 1),
+        "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
         "means": keep_means * form.channels, "bands": architecture.spectrum * spectrum.count(form),
     }  # fmt: skip
     ends = np.cumsum(list(counts.values())).tolist()

@@ -1,6 +1,6 @@
 """The default recipe: a trunk and its heads, chosen by held-out groups of the training sweeps. In: a Dataset. Out: a Fit.
 
-The bank and the spectrum are fixed, so that choosing among them takes seconds and no PyTorch. Trained stages join what was
+Bank, distribution and spectrum are fixed, so that choosing among them takes seconds and no PyTorch. Trained stages join what was
 chosen, where PyTorch is installed and sweeps are many, unless that names nearly everything. What the heads do not use is
 left out of the trunk.
 """
@@ -20,7 +20,7 @@ from appliance.core.errors import FormatError
 from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
 from train.metrics.score import interval
-from train.models.compact import bank, choice, graph, spectrum
+from train.models.compact import bank, choice, distribution, graph, spectrum
 from train.models.compact.architectures import ARCHITECTURES, Architecture
 from train.models.compact.augment import Augmentation, default_augmentation
 from train.models.compact.bank import Bank
@@ -122,14 +122,16 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
 
 
 def fixed_trunk(sweeps: Dataset, seed: int) -> Trunk:
-    """The trunk with the whole bank and the spectrum. Raises FormatError where the window is shorter than a filter, or
-    every taxel of every sweep is constant."""
+    """The trunk with the whole bank, the distribution and the spectrum.
+
+    Raises FormatError where the window is shorter than a filter, or every taxel of every sweep is constant.
+    """
     form, rng = sweeps.format, np.random.default_rng(seed)
     some = calibration_sweeps(sweeps.samples[rng.permutation(len(sweeps))])
     if not np.ptp(sweeps.samples, axis=1).any():
         raise FormatError("every taxel of every sweep is constant; check the skin, nothing can be learnt from this")
     scale = texture_scale(sweeps.samples)
-    architecture = replace(FIXED, spectrum=spectrum.count(form) > 0, pools=2)
+    architecture = replace(FIXED, spectrum=spectrum.count(form) > 0, pools=2, distribution=True)
     kinds = (False,) if architecture.zero_sum(form.window) else (False, True)
     drawn = bank.draw(form, rng, kinds)
     seen: list[Array] = [np.empty(0)] * len(drawn)
@@ -137,18 +139,21 @@ def fixed_trunk(sweeps: Dataset, seed: int) -> Trunk:
         for number, values in zip(numbers, run(model, some).swapaxes(0, 2), strict=True):
             seen[number] = values.ravel()
     ranges = graph.Ranges(graph.count_range(some, architecture), ())
-    return Trunk(sweeps, scale, bank.fitted(drawn, seen, rng).weights(), architecture, ranges)
+    weights = bank.fitted(drawn, seen, rng).weights() | distribution.fitted(some, scale, rng).weights()
+    return Trunk(sweeps, scale, weights, architecture, ranges)
 
 
 def _choose(court: Court, trunk: Trunk, choosing: bool, log: Log) -> Judged:
     """choice.choose for a trunk with the whole bank; the usual candidate where there is no choosing."""
     layout, filters = trunk.layout(), Bank.of(trunk.weights)
-    pools = [np.arange(layout[name].start, layout[name].stop) for name in ("sizes", "shares")]
-    bands = np.arange(layout["bands"].start, layout["bands"].stop) if "bands" in layout else np.empty(0, int)
+    *pools, levels, bands = (
+        np.arange(layout[name].start, layout[name].stop) if name in layout else np.empty(0, int)
+        for name in ("sizes", "shares", "levels", "bands")
+    )
     kinds = [which for free in (False, True) if len(which := np.flatnonzero(filters.free == free))]
     if not choosing:
         return court.judge(choice.views([np.flatnonzero(~filters.free)], pools))
-    chosen = choice.choose(court, kinds, pools, bands, log)
+    chosen = choice.choose(court, kinds, pools, levels, bands, log)
     number = np.full(max(part.stop for part in layout.values()), -1)
     for pool in pools:
         number[pool] = np.arange(len(pool))
@@ -200,16 +205,21 @@ def _pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, 
     """The trunk with only what the plan's discriminants see, and the plan for it."""
     size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
     fixed_used = used[used >= size] - size
-    filters, shares, bands = (
+    filters, shares, levels, bands = (
         fixed_used[(fixed_used >= layout[name].start) & (fixed_used < layout[name].stop)] - layout[name].start
         if name in layout
         else np.empty(0, int)
-        for name in ("sizes", "shares", "bands")
+        for name in ("sizes", "shares", "levels", "bands")
     )
-    pools = (len(filters) > 0) + (len(shares) > 0)
-    architecture = replace(stages.architecture if stages else FIXED, spectrum=len(bands) > 0, pools=pools)
+    architecture = replace(
+        stages.architecture if stages else FIXED,
+        pools=(len(filters) > 0) + (len(shares) > 0),
+        distribution=len(levels) > 0,
+        spectrum=len(bands) > 0,
+    )
     weights = dict(stages.weights) if stages else {}
-    weights |= Bank.of(fixed.weights).take(filters).weights() if pools else {}
+    weights |= Bank.of(fixed.weights).take(filters).weights() if architecture.pools else {}
+    weights |= distribution.Levels.of(fixed.weights).weights() if architecture.distribution else {}
     ranges = replace(fixed.ranges, responses=stages.ranges.responses) if stages else fixed.ranges
     return Trunk(fixed.sweeps, fixed.scale, weights, architecture, ranges), plan.renumbered(used)
 
@@ -220,6 +230,7 @@ def describe(trunk: Trunk, plan: HeadPlan) -> str:
     what = [f"{int((filters == free).sum())} {name} filters" for free, name in ((False, "zero-sum"), (True, "free"))
             if (filters == free).any()]  # fmt: skip
     what += ["magnitudes and shares" if trunk.architecture.pools > 1 else "magnitudes"] if len(filters) else []
+    what += ["distribution"] if trunk.architecture.distribution else []
     what += ["spectrum"] if trunk.architecture.spectrum else []
     what += (
         [f"stages of {', '.join(map(str, trunk.architecture.channels))} channels"]

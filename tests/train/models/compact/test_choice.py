@@ -74,15 +74,17 @@ def test_what_lies_in_another_group_is_not_chosen():
     assert losses[0] < 0.2 < losses[1]
     assert losses[0] < losses[2]
     pools = np.array(GOOD), np.array(NOISE)
-    chosen = choice.choose(at, [np.array([0, 1])], pools, np.array(TRAP), print)
-    assert not any(set(part.columns) & set(TRAP) for part in chosen.plan.parts)
+    chosen = choice.choose(at, [np.array([0, 1])], pools, np.arange(0), np.array(TRAP), print)
+    assert sum(TRAP[0] in part.columns for part in chosen.plan.parts) <= 1  # where the usual one sees the spectrum
     assert at.accuracy(chosen) > 0.9
 
 
 def test_what_is_clearly_better_is_chosen():
     """Bands that name the materials, beside filters that say nothing; all discriminants see them."""
     at = court()
-    chosen = choice.choose(at, [np.arange(2)], (np.array(NOISE), np.array(TRAP * 2)), np.array(GOOD), print)
+    chosen = choice.choose(
+        at, [np.arange(2)], (np.array(NOISE), np.array(TRAP * 2)), np.arange(0), np.array(GOOD), print
+    )
     assert all(set(GOOD) <= set(part.columns) for part in chosen.plan.parts)
     assert at.better(chosen, at.judge([HeadPart(NOISE, False)]))
 
@@ -90,7 +92,7 @@ def test_what_is_clearly_better_is_chosen():
 def test_the_usual_one_stays_where_nothing_is_clearly_better():
     """A discriminant of all magnitudes and one of all features, without copies."""
     at = court()
-    chosen = choice.choose(at, [np.arange(2)], (np.array(GOOD), np.array(NOISE)), np.arange(0), print)
+    chosen = choice.choose(at, [np.arange(2)], (np.array(GOOD), np.array(NOISE)), np.arange(0), np.arange(0), print)
     assert chosen.plan == at.judge([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
 
 
@@ -173,14 +175,30 @@ def test_the_temperature_is_the_best_for_held_out_sweeps():
 
 
 def test_candidates_are_what_the_features_allow():
-    """Magnitudes with shares and without; then the best with copies, with the spectrum, and that alone."""
+    """The usual one and magnitudes alone; then the best with copies, with the spectrum, and that alone."""
     tried: list[str] = []
-    kinds = [np.array([0]), np.array([1])]
-    chosen = choice.choose(court(), kinds, (np.array([0, 1]), np.array([2, 3])), np.array([4]), tried.append)
+    kinds, pools, none = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3])), np.arange(0)
+    choice.choose(court(), kinds, pools, none, np.array([4]), tried.append)
     assert len(tried) == len(set(tried)) == 2 + 5
-    assert tried[:2] == ["choosing: magnitudes; magnitudes and shares", "choosing: magnitudes"]
+    assert tried[:2] == ["choosing: magnitudes, shares, distribution", "choosing: magnitudes"]
     assert tried[-1] == "choosing: the spectrum alone, with copies"
-    assert {part.columns for part in chosen.plan.parts} == {(0,), (1,), (0, 2), (1, 3)}
     tried.clear()
-    choice.choose(court(), kinds[:1], (np.array([0, 1]), np.array([2, 3])), np.arange(0), tried.append)
+    chosen = choice.choose(court(), kinds[:1], pools, none, none, tried.append)
     assert len(tried) == 2 + 1
+    assert {part.columns for part in chosen.plan.parts} == {(0,), (0, 2)}
+
+
+def test_the_usual_one_sees_each_kind_three_times():
+    """Magnitudes; with shares and the spectrum; with the distribution and the spectrum: no feature twice in one."""
+    given, parts = known()
+    x = np.hstack([given.features[:, [0]]] * 6 + [given.features[:, [1]]] * 6)
+    rng = np.random.default_rng(0)
+    own = replace(
+        given, features=(x + 0.1 * rng.standard_normal(x.shape)).astype(np.float32), copied=np.zeros((240, 12))
+    )
+    kinds, pools = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3]))
+    at = Court([own] * 3, parts, 3)
+    chosen = choice.choose(at, kinds, pools, np.arange(4, 8), np.arange(8, 12), print)
+    wanted = [(0,), (1,)]
+    wanted += [(kind, kind + 2, 8, 9, 10, 11) for kind in (0, 1)] + [(kind, *range(4, 12)) for kind in (0, 1)]
+    assert [part.columns for part in chosen.plan.parts] == wanted
