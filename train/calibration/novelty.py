@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.covariance import ledoit_wolf
 
 from appliance.bundle.bundle import Classes
 from appliance.core.errors import FormatError
 from appliance.inference.novelty import shaped_distances
+from train.models import discriminant
 from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
@@ -109,13 +109,13 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     x = np.asarray(features, np.float64)
     middle, size = x.mean(axis=0), x.shape[1]
     means = np.stack([x[labels == k].mean(axis=0) for k in range(classes)]) - middle
-    white, coloured = _whitening(x, labels)
-    axes = np.linalg.svd((means - means.mean(axis=0)) @ white)[2][: classes - 1].T
-    orthonormal, mixed = np.linalg.qr(np.hstack([axes, coloured[:, size - fixed :]]))
-    if fixed and classes - 1 + fixed < size:  # white @ coloured selects
-        directions, turn = white @ axes, np.linalg.inv(mixed)
+    white = _whitening(x, labels)
+    axes = np.linalg.svd(white.transposed(means - means.mean(axis=0)), full_matrices=False)[2][: classes - 1].T
+    orthonormal, mixed = np.linalg.qr(np.hstack([axes, white.inverse(slice(size - fixed, size))]))
+    if fixed and classes - 1 + fixed < size:  # what is whitened after its inverse is as it was
+        directions, turn = white.apply(axes), np.linalg.inv(mixed)
     else:
-        directions, turn = white @ orthonormal, np.eye(orthonormal.shape[1])
+        directions, turn = white.apply(orthonormal), np.eye(orthonormal.shape[1])
     whole, steps = sixteen_bits(directions)  # as a bundle's graph holds it
     bare = Embedding(whole * steps, turn.astype(np.float32), *[np.empty(0)] * 3)
     projection = bare.projection
@@ -144,24 +144,56 @@ def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embed
     return embed(features, numbered, fixed), present
 
 
-def _whitening(x: Array, labels: Array) -> tuple[Array, Array]:
-    """The inverse root of the covariance within materials and the root itself, symmetric [F, F] both."""
-    variances, directions = np.linalg.eigh(_covariance(x, labels))
-    spread = np.sqrt(np.maximum(variances, max(FLAT * float(variances.max()), FLAT)))
-    return (directions / spread) @ directions.T, (directions * spread) @ directions.T
+@dataclass(frozen=True)
+class _Whitening:
+    """W [F, F] with W' C W = 1, C being the covariance within materials: a diagonal matrix and that of a few directions.
+
+    C = R (1 + V S V') R and W = inverse of R times (1 + V S V') ^ -1/2. root: [F], the diagonal of R. directions: V [F, n],
+    orthonormal; variances: the diagonal [n] of S. Nothing of the size [F, F] is computed where there are fewer sweeps.
+    """
+
+    root: Array
+    directions: Array
+    variances: Array
+
+    def apply(self, b: Array) -> Array:
+        """W times `b` [F, m]."""
+        return self._power(b, -0.5) / self.root[:, None]
+
+    def inverse(self, columns: slice) -> Array:
+        """Some columns of the inverse of W [F, m]."""
+        return self._power(np.eye(len(self.root))[:, columns] * self.root[columns], 0.5)
+
+    def transposed(self, b: Array) -> Array:
+        """`b` [m, F] times W."""
+        return self._power((b / self.root).T, -0.5).T
+
+    def _power(self, b: Array, power: float) -> Array:
+        """(1 + V S V') to this power times `b` [F, m]."""
+        factors = (1 + self.variances) ** power - 1
+        raised: Array = b + self.directions @ (factors[:, None] * (self.directions.T @ b))
+        return raised
 
 
-def _covariance(x: Array, labels: Array) -> Array:
-    """Within materials [F, F], as LinearDiscriminantAnalysis(shrinkage="auto") has it, which also solves equations of it:
-    Ledoit and Wolf's of each material's features, scaled to the same spread, and their mean, each as often as it occurs."""
-    total = np.zeros((x.shape[1],) * 2)
+def _whitening(x: Array, labels: Array) -> _Whitening:
+    """Of the covariance that LinearDiscriminantAnalysis(shrinkage="auto") has: Ledoit and Wolf's of each material's features
+    [n, F], scaled to the same spread, and their mean, each as often as it occurs."""
+    diagonal, rows = np.zeros(x.shape[1]), []
     for label in np.unique(labels):
         own = x[labels == label]
         spread = own.std(axis=0)
         spread[spread <= 10 * np.finfo(float).eps * np.abs(own).max(axis=0)] = 1
-        shrunk = ledoit_wolf((own - own.mean(axis=0)) / spread)[0]
-        total += len(own) / len(x) * spread[:, None] * shrunk * spread
-    return total
+        z = (own - own.mean(axis=0)) / spread
+        share, mean = discriminant.shrinkage(z, z @ z.T if len(z) < len(spread) else z.T @ z)
+        diagonal += len(own) / len(x) * share * mean * spread**2
+        rows.append(np.sqrt((1 - share) / len(x)) * z * spread)
+    root = np.sqrt(np.maximum(diagonal, max(FLAT * float(diagonal.max()), FLAT)))
+    scattered = np.concatenate(rows) / root
+    few = len(scattered) < len(root)
+    variances, vectors = np.linalg.eigh(scattered @ scattered.T if few else scattered.T @ scattered)
+    seen = variances > FLAT * max(float(variances.max()), FLAT)
+    variances, vectors = variances[seen], vectors[:, seen]
+    return _Whitening(root, scattered.T @ (vectors / np.sqrt(variances)) if few else vectors, variances)
 
 
 def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Array, Array]]:

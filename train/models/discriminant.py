@@ -49,12 +49,8 @@ def _solve(z: Array, wanted: Array) -> Array:
     n, size = z.shape
     few = n < size
     gram = z @ z.T if few else z.T @ z
-    trace, squares = float(np.trace(gram)) / n, float((gram**2).sum()) / n**2
-    fourth = float(((z**2).sum(axis=1) ** 2).sum())
-    mean = trace / size
-    distance = (squares - 2 * mean * trace + size * mean**2) / size
-    noise = min(max((fourth / n - squares) / (size * n), 0.0), distance)
-    share = max(noise / distance if distance > 0 else 1.0, LEAST_SHRINKAGE)
+    share, mean = shrinkage(z, gram)
+    share = max(share, LEAST_SHRINKAGE)
     ridge = max(share * mean, 1e-12)
     if not few:
         solution: Array = np.linalg.solve((1 - share) / n * gram + ridge * np.eye(size), wanted.T).T
@@ -63,3 +59,17 @@ def _solve(z: Array, wanted: Array) -> Array:
     inner = np.linalg.solve(gram + ridge * n / (1 - share) * np.eye(n), z @ wanted.T)
     solution = (wanted - (z.T @ inner).T) / ridge
     return solution
+
+
+def shrinkage(z: Array, gram: Array) -> tuple[float, float]:
+    """Ledoit and Wolf's share of the mean variance in the covariance of `z` [N, F], whose means are 0, and that variance.
+
+    gram: z @ z.T or z.T @ z, whichever is smaller.
+    """
+    n, size = z.shape
+    trace, squares = float(np.trace(gram)) / n, float((gram**2).sum()) / n**2
+    fourth = float(((z**2).sum(axis=1) ** 2).sum())
+    mean = trace / size
+    distance = (squares - 2 * mean * trace + size * mean**2) / size
+    noise = min(max((fourth / n - squares) / (size * n), 0.0), distance)
+    return noise / distance if distance > 0 else 1.0, mean
