@@ -401,6 +401,7 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
         "held-out recording, by recording",
         "bundle",
         "what it names of sweeps that the fit has not seen",
+        "a page about it, with what breaks it",
     ]
     assert lines[-1].endswith(f": palpate-train score {tmp_path / 'bundle'} --set SET")
     assert bundle.load(tmp_path / "bundle").manifest.version == "3"
