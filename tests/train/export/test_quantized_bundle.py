@@ -403,7 +403,8 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
         "what it names of sweeps that the fit has not seen",
         "a page about it, with what breaks it",
     ]
-    assert lines[-1].endswith(f": palpate-train score {tmp_path / 'bundle'} --set SET")
+    assert lines[-2].endswith(f": palpate-train score {tmp_path / 'bundle'} --set SET")
+    assert lines[-1].endswith(f": palpate-train report {tmp_path / 'bundle'} --set SET --out report.html")
     assert bundle.load(tmp_path / "bundle").manifest.version == "3"
     assert main(["export", str(tmp_path / "bundle" / "golden.npz"), *args]) == FormatError.exit_code
     assert "golden.npz: not a fit" in capsys.readouterr().err
