@@ -22,7 +22,7 @@ from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
 from train.calibration import early_exit, novelty
 from train.calibration.early_exit import EarlyRule, Heads
-from train.calibration.moved import AugmentedCopies, MovedFit, fit_moved
+from train.calibration.moved import AugmentedCopies, MovedFit, displaced, fit_moved
 from train.calibration.novelty import Embedding
 from train.calibration.temperature import fit_temperature
 from train.models.compact.copies import COPIES, copies
@@ -114,7 +114,8 @@ def calibrate(fit: Fit) -> Posthoc:
 
 def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies, HeadPlan]:
     """The arguments of `fit_posthoc`: what the int8 trunk gives for the sweeps that were trained on and held out, in this
-    order, and for augmented copies of both; those of the training sweeps are the ones that its head was fitted to.
+    order, and for augmented copies of both; those of the training sweeps are the ones that its head was fitted to, those of
+    the others judge what a moved skin does.
 
     Raises FormatError where none was held out: nothing could judge.
     """
@@ -124,8 +125,9 @@ def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, Augmented
     tenths = run(fit.trunk(tenths=True), np.concatenate([train.samples, held.samples]))
     labels, groups = np.append(train.labels, held.labels), np.append(train.group(by), held.group(by))
     trunk, features, seed = fit.trunk(), [], fit.about["seed"]
-    for sweeps, drawn in ((train, seed), (held, seed + HELD_COPIES_SEED)):
-        features += [run(trunk, copy.samples) for copy in copies(sweeps, fit.augmentation, drawn, COPIES)]
+    judging = displaced(fit.augmentation)
+    for sweeps, change, drawn in ((train, fit.augmentation, seed), (held, judging, seed + HELD_COPIES_SEED)):
+        features += [run(trunk, copy.samples) for copy in copies(sweeps, change, drawn, COPIES)]
     sides = [np.tile(train.labels, COPIES), np.tile(held.labels, COPIES)]
     copied_groups = np.append(np.tile(train.group(by), COPIES), np.tile(held.group(by), COPIES))
     is_held = np.repeat([False, True], [len(side) for side in sides])

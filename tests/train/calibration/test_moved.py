@@ -6,6 +6,7 @@ import pytest
 from appliance.bundle.bundle import Classes
 from train.calibration import moved, novelty
 from train.calibration.moved import AugmentedCopies, fit_moved
+from train.models.compact.augment import Augmentation
 
 MEANS = 8 * np.eye(4)[:3]
 
@@ -31,6 +32,14 @@ def made(n: int = 20, wrong: float = 0.0):
     others = np.arange(len(truth)) < wrong * len(truth)
     logits[others] = 1.2 * np.eye(3)[(truth[others] + 1) % 3]
     return novelty.embed(x, labels, 2), fit_moved(x, labels, held, 2, copied, logits), copied
+
+
+def test_copies_that_judge_are_moved_and_nothing_else():
+    """The skin's place, its contact and its gains change; what the sensor adds or loses does not."""
+    usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3, clipped=0.4)
+    judging = moved.displaced(usual)
+    assert (judging.noise, judging.noisy, judging.silent, judging.drift, judging.hum, judging.clipped) == (0,) * 6
+    assert (judging.shift, judging.damped, judging.gains) == (usual.shift, usual.damped, usual.gains)
 
 
 def test_what_the_copies_vary_in_makes_nothing_unknown():
