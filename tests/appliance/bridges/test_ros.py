@@ -176,7 +176,7 @@ def test_no_box_is_named():
 def test_without_ros_the_command_says_what_to_do(capsys: pytest.CaptureFixture[str]):
     """This environment has no rclpy: exit code 78, one line with the remedy."""
     assert main(["bridge", "ros"]) == 78
-    assert "source its setup.bash, or install the wheels: pip install 'palpate[ros]'" in capsys.readouterr().err
+    assert "source its setup.bash, or install the wheels with the extra [ros]" in capsys.readouterr().err
 
 
 def test_the_launch_file_is_python():

@@ -1,0 +1,109 @@
+"""What bridges cost the box, and bridges under attack: `python -m tests.robots.attacked --minutes 2`. In: minutes for each
+case. Out: a table, docs/robots/attacked.json; exit code 1 if a frame, a sentence or an answer was lost.
+
+One box (`palpate run --sim skin`, in real time) meets all cases in turns of SLOT_S, so that all had the same machine: no bridge,
+Modbus and ROS 2 on its feed, the same with peers that flood the Modbus bridge with requests, noise and connections. Box and
+listener run with real-time priority where `chrt` may be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from appliance.core.provenance import commit
+from tests.campaigns.feed_load import REAL_TIME, SETTLE_S, SLOT_S, Kind, LatencyListener, result
+from tests.factories import ros
+from tests.factories.bridges import bridge
+from tests.factories.paths import ROOT
+from tests.rig.soak_boxes import Script, ThisMachine
+from tests.robots import page
+
+CASES = {"0": "no bridge", "bridges": "Modbus and ROS 2 on the feed", "attacked": "the same, Modbus attacked"}
+
+
+def slot(name: str, feed: Path, box: ThisMachine, listener: LatencyListener, kind: Kind) -> None:
+    """One turn of a case: bridges and peers come, the box is watched, they go."""
+    with ExitStack() as stack:
+        attackers = None
+        if name != "0":
+            _, port = stack.enter_context(bridge("modbus", "--feed", feed))
+            stack.enter_context(ros.bridge("-p", f"feed:={feed}", "-p", "frames_hz:=10.0"))
+            if name == "attacked":
+                command = [sys.executable, "-m", "tests.robots.attackers", str(port)]
+                pipe = subprocess.PIPE
+                attackers = stack.enter_context(subprocess.Popen(command, stdin=pipe, stdout=pipe, cwd=ROOT))
+        listener.listen(SETTLE_S, Kind())
+        before_s = box.process()[2]
+        listener.listen(SLOT_S, kind)
+        used_s = box.process()[2] - before_s
+        kind.wall_s, kind.cpu_s = kind.wall_s + SLOT_S, kind.cpu_s + used_s
+        kind.shares.append(used_s / SLOT_S)
+        kind.rss_kib.append(box.process()[0])
+        if attackers:
+            kind.seen.update(json.loads(attackers.communicate(b"\n", timeout=30)[0]))
+    listener.listen(SETTLE_S, Kind())
+
+
+def measure(minutes: float, before: list[str]) -> dict[str, Any]:
+    """Figures by case, see `feed_load.result`."""
+    kinds = {name: Kind() for name in CASES}
+    with ExitStack() as stack:
+        feed = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
+        box, sweeps = ThisMachine(before, [f"feed.socket={feed}"]), Script(1)
+        stack.callback(box.close)
+        box.start(1, sweeps)
+        listener = LatencyListener(box, sweeps)
+        listener.listen(30.0, Kind())  # the start, and the first sweeps
+        rss_kib = box.process()[0]
+        for turn in range(max(1, round(minutes * 60 / SLOT_S))):
+            for name, kind in kinds.items():
+                slot(name, feed, box, listener, kind)
+                print(f"{turn + 1}  {CASES[name]}: {100 * kind.shares[-1]:.2f} % of a core", flush=True)
+        box.stop()
+    return result(kinds, rss_kib)
+
+
+def table(figures: dict[str, Any]) -> str:
+    """The figures in Markdown."""
+    rows = [
+        "| | share of a core | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost | the peers |"
+    ]
+    rows.append("|---|---|---|---|---|---|---|")
+    for name, one in figures.items():
+        late, within, peers = one["late_ms"], one["latency_ms"], one["lines"]
+        bore = f"{peers['connections']} connections, {peers['bytes'] / 1e6:.1f} MB" if peers else ""
+        rows.append(
+            f"| {CASES[name]} | {100 * one['share']:.2f} % | {late['p50']:.1f} / {late['p99']:.1f} ms | {within['p50']:.2f} / "
+            f"{within['p99']:.2f} ms | {one['answers']} | {one['frames_lost']} | {bore} |"
+        )
+    return "\n".join(rows)
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=2.0, help="for each case (%(default)s)")
+    args = parser.parse_args()
+    ros.required()
+    real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    if real_time:  # this process alone, which listens: bridges and peers are ordinary programs
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
+    figures = measure(args.minutes, [*REAL_TIME] if real_time else [])
+    content = {"commit": commit(), "real_time": real_time, "cases": figures}
+    (ROOT / "docs" / "robots" / "attacked.json").write_text(json.dumps(content, indent=1) + "\n")
+    page.write(ROOT / "docs" / "robots" / "README.md", "attacked", table(figures))
+    print(table(figures))
+    bad = [name for name, one in figures.items() if one["frames_lost"] or one["sentences_dropped"] or one["faults"]]
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
