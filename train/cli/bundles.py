@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import shlex
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import labels
 from train.data.sets import Dataset, digest
+from train.data.summary import doubts
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
 from train.export import bundle_score, measure, pack, quantized_bundle
@@ -132,6 +134,8 @@ def run_fit(args: argparse.Namespace) -> None:
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}")
     sweeps, rest = labels.check(options.load(args, args.seed)), None
+    for line in doubts(sweeps):
+        print(f"palpate-train: {line}", file=sys.stderr)
     if args.split:
         by, share = _by_share(args.split)
         sweeps, rest = sweeps.split(by, share, args.seed)

@@ -32,7 +32,9 @@ def describe(spec: str) -> str:
     folder = Path(spec)
     if spec.startswith("sim:") or not folder.is_dir():
         whole = sets.load(spec, 1)
-        return "\n".join([*description(whole, {}), *_unsendable(whole.materials)])
+        return "\n".join(
+            [*description(whole, {}), *(f"  {line}" for line in doubts(whole)), *_unsendable(whole.materials)]
+        )
     recorded = readers.recorded(folder)
     named, names = _named(recorded)
     lines = description(readers.joined(named, folder, Dataset), names)
@@ -45,6 +47,22 @@ def describe(spec: str) -> str:
     except FormatError as e:
         lines.append(f"  cannot be trained on yet: {e}")
     return "\n".join([*lines, *_unsendable(sorted({one.sweep.material for one in readers.ok(recorded)} - {""}))])
+
+
+def doubts(sweeps: Dataset) -> list[str]:
+    """What a model can be trained on, but should not be without a look: one line each."""
+    lines = []
+    if still := np.argwhere(sweeps.samples.min(axis=(0, 1)) == sweeps.samples.max(axis=(0, 1))).tolist():
+        listed = shortened([".".join(str(i + 1) for i in place) for place in still])
+        lines.append(
+            f"warning: taxels that never change in any sweep: {listed}; check the skin with `palpate skin show`"
+        )
+    counts = np.bincount(sweeps.labels, minlength=len(sweeps.materials))
+    if empty := [name for name, n in zip(sweeps.materials, counts, strict=True) if not n]:
+        lines.append(
+            f"warning: materials without a sweep: {', '.join(empty)}; record some, or leave them out with --only"
+        )
+    return lines
 
 
 def _unsendable(materials: Iterable[str]) -> list[str]:

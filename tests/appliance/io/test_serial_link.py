@@ -31,6 +31,7 @@ from appliance.io.serial_link import BoardLink, SerialLink
 from appliance.io.serial_port import PortInfo
 from appliance.io.usb_sensor import UsbSensor
 from appliance.sim import skin
+from appliance.sim.rig import VirtualClock
 from appliance.tools import pseudo_terminal
 from tests.backends import Skin, skins
 from tests.factories.serial_board import SerialBoard
@@ -167,6 +168,20 @@ def test_read_and_write(line: tuple[int, str]):
         assert link.read(100, 1000) + link.read(1000, 1000) == every
         link.write(every)
         assert os.read(far, 1000) == every
+
+
+@pytest.mark.parametrize(("held", "pause_ns"), [(100, 8_000_000), (2100, 4_000_000), (4095, 0)])
+def test_the_pause_after_a_read(line: tuple[int, str], held: int, pause_ns: int, monkeypatch: pytest.MonkeyPatch):
+    """The fuller the port was, the sooner it is read again: a stream that a short pause has piled up is caught up with."""
+    far, path = line
+    clock = VirtualClock()
+    with closing(SerialLink(path, 2_000_000, clock)) as link:
+        monkeypatch.setattr(os, "read", lambda fd, size: bytes(held))
+        os.write(far, b"x")
+        assert len(link.read(8192, 1000)) == held
+        before = clock.now_ns()
+        link.read(8192, 1000)
+        assert clock.now_ns() - before == pause_ns
 
 
 def test_a_port_that_takes_nothing(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch):

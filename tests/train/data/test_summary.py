@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,22 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
+    """A taxel that no sweep changes is named by row and column from 1, a material without sweeps by its name; a sound set
+    gives no such line."""
+    sound = easy()
+    assert summary.doubts(sound) == []
+    still = sound.samples.copy()
+    still[:, :, 0, -1] = 7
+    broken = replace(sound, samples=still, materials=(*sound.materials, "ghost"))
+    where = ".".join(map(str, (1, still.shape[3], *([still.shape[4]] if still.ndim == 5 else []))))
+    taxels, materials = summary.doubts(broken)
+    assert f"never change in any sweep: {where};" in taxels
+    assert "materials without a sweep: ghost;" in materials
+    broken.save(tmp_path / "broken.npz")
+    assert "ghost" in summary.describe(str(tmp_path / "broken.npz")).split("warning", 1)[1]
+
+
 def test_what_is_known_can_be_loaded():
     """Every simulated set in the list has as many sweeps as it states (the large one: sixty for each of its scenes)."""
     stated = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
