@@ -22,8 +22,7 @@ from typing import Any
 
 from appliance.core import storage
 from appliance.core.provenance import commit
-from appliance.watch.server import PageServer
-from tests.factories.page_client import EventReader, ask
+from tests.factories.page_client import EventReader, PageAddress, ask
 from tests.factories.paths import ROOT
 
 BROWSERS = (0, 1, 8)
@@ -38,7 +37,7 @@ def used(pid: int) -> tuple[float, int, int]:
     return (int(parts[11]) + int(parts[12])) / os.sysconf("SC_CLK_TCK"), int(kib["Rss"]), int(kib["Pss"])
 
 
-def browse(page: PageServer, ended: threading.Event, read: list[int]) -> None:
+def browse(page: PageAddress, ended: threading.Event, read: list[int]) -> None:
     """Read events as a page does, and ask for the picture of each sweep."""
     with suppress(OSError, EOFError):
         reader = EventReader(page)
@@ -49,7 +48,7 @@ def browse(page: PageServer, ended: threading.Event, read: list[int]) -> None:
                 ask(page, f"/sweep/{content['number']}")
 
 
-def measured(pid: int, page: PageServer, browsers: int, seconds: float) -> dict[str, Any]:
+def measured(pid: int, page: PageAddress, browsers: int, seconds: float) -> dict[str, Any]:
     """What the process uses while so many browsers are there."""
     ended, read = threading.Event(), []
     threads = [threading.Thread(target=browse, args=(page, ended, read), daemon=True) for _ in range(browsers)]
@@ -87,8 +86,7 @@ def main() -> int:
             [*RUN, "watch", "--web", "0", *feed], stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environ
         )
         try:
-            page = PageServer.__new__(PageServer)
-            page.address = watch.stderr.readline().split("page: ")[1].strip()
+            page = PageAddress(watch.stderr.readline().split("page: ")[1].strip())
             results = [measured(watch.pid, page, browsers, args.seconds) for browsers in BROWSERS]
         finally:
             for one in (watch, box):

@@ -6,18 +6,29 @@ import json
 import socket
 import ssl
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 from appliance.watch.server import PageServer
 from tests.factories.browser import WAIT_S
 
 
-def port(page: PageServer) -> int:
+@dataclass(frozen=True)
+class PageAddress:
+    """A page of another process."""
+
+    address: str
+
+
+Page = PageServer | PageAddress
+
+
+def port(page: Page) -> int:
     """The port it listens on."""
     return int(page.address.rsplit(":", 1)[1])
 
 
-def connected(page: PageServer, tls: ssl.SSLContext | None = None) -> socket.socket:
+def connected(page: Page, tls: ssl.SSLContext | None = None) -> socket.socket:
     """A connection to it."""
     plain = socket.create_connection(("127.0.0.1", port(page)), timeout=WAIT_S)
     return tls.wrap_socket(plain, server_hostname="localhost") if tls else plain
@@ -33,7 +44,7 @@ def received_by(one: socket.socket) -> bytes:
 
 
 def ask(
-    page: PageServer, path: str = "/", method: str = "GET", host: str = "localhost", more: str = "",
+    page: Page, path: str = "/", method: str = "GET", host: str = "localhost", more: str = "",
     tls: ssl.SSLContext | None = None,
 ) -> bytes:  # fmt: skip
     """Its answer to one request, head and body."""
@@ -50,7 +61,7 @@ def status(answer: bytes) -> int:
 class EventReader:
     """A browser that listens to the events. last: the number of the last one it has."""
 
-    def __init__(self, page: PageServer, last: str = "") -> None:
+    def __init__(self, page: Page, last: str = "") -> None:
         self.socket = connected(page)
         self.socket.sendall(f"GET /events?last={last} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
         self.last, self._rest = "", b""

@@ -2,6 +2,7 @@
 
 const SVG = "http://www.w3.org/2000/svg", TAXEL = 100, RING = 21, TIP = 90, RIM = 14, SIDE = 62;
 const NUMBERED = 8; // a larger skin gets no numbers, and names every fourth row and column
+const PLAIN = 5; // signs and letters grow with a larger skin
 
 function element(name, attributes, parent, text) {
   const made = document.createElementNS(SVG, name);
@@ -55,33 +56,34 @@ export class SkinPicture {
     this.way.style.visibility = "hidden";
     if (!view.centre) return;
     const [x, y] = at(view.centre, view.place);
-    this.centre.style.transform = `translate(${x}px, ${y}px)`;
+    this.centre.style.transform = `translate(${x}px, ${y}px) scale(${this.big})`;
     if (view.state === "off") this.pointOut(...at(view.nearest, view.place), x, y);
   }
 
   build(view) {
     const [rows, cols] = view.shape, w = cols * TAXEL, h = rows * TAXEL, tip = view.fingertip;
-    const big = Math.max(1, Math.max(rows, cols) / NUMBERED);
-    const left = -SIDE * big - (tip === "first-column") * TIP, top = -34 * big - (tip === "first-row") * TIP;
-    const right = w + RIM + 6 + (tip === "last-column") * TIP, bottom = h + RIM + 6 + (tip === "last-row") * TIP;
+    const most = Math.max(rows, cols), big = Math.max(1, most / PLAIN), far = TIP * big;
+    this.big = big; // signs and letters of a large skin, whose taxels are small on the screen
+    const left = -SIDE * big - (tip === "first-column") * far, top = -34 * big - (tip === "first-row") * far;
+    const right = w + RIM + 6 + (tip === "last-column") * far, bottom = h + RIM + 6 + (tip === "last-row") * far;
     const svg = element("svg", {viewBox: `${left} ${top} ${right - left} ${bottom - top}`, role: "img",
       preserveAspectRatio: "xMidYMid"}, this.parent);
     svg.style.setProperty("--big", big);
     element("title", {}, svg, `${rows} rows and ${cols} columns of taxels${tip && `; the fingertip is at the ${tip.replace("-", " ")}`}`);
-    if (tip) drawTip(svg, tip, w, h);
+    if (tip) drawTip(svg, tip, w, h, big);
     element("rect", {class: "board", x: -RIM, y: -RIM, width: w + 2 * RIM, height: h + 2 * RIM, rx: 18}, svg);
     [this.tiles, this.counts] = [[], []];
-    const named = (i, count) => Math.max(rows, cols) <= NUMBERED || i === 0 || i === count - 1 || (i + 1) % 4 === 0;
+    const named = (i, count) => most <= NUMBERED || i === 0 || i === count - 1 || (i + 1) % 4 === 0;
     for (let r = 0; r < rows; r++) {
-      if (named(r, rows)) element("text", {class: "name", x: -RIM - 24 * big, y: (r + 0.5) * TAXEL}, svg, big > 1 ? r + 1 : `row ${r + 1}`);
+      if (named(r, rows)) element("text", {class: "name", x: -RIM - 24 * big, y: (r + 0.5) * TAXEL}, svg, most > NUMBERED ? r + 1 : `row ${r + 1}`);
       for (let c = 0; c < cols; c++) {
         const box = {x: c * TAXEL + 4, y: r * TAXEL + 4, width: TAXEL - 8, height: TAXEL - 8, rx: 10};
         this.tiles.push(element("rect", {class: "tile", ...box}, svg));
-        if (big === 1) this.counts.push(element("text", {class: "count", x: (c + 0.5) * TAXEL, y: (r + 0.82) * TAXEL}, svg));
+        if (most <= NUMBERED) this.counts.push(element("text", {class: "count", x: (c + 0.5) * TAXEL, y: (r + 0.82) * TAXEL}, svg));
       }
     }
     for (let c = 0; c < cols; c++) {
-      if (named(c, cols)) element("text", {class: "name", x: (c + 0.5) * TAXEL, y: -RIM - 11 * big}, svg, big > 1 ? c + 1 : `column ${c + 1}`);
+      if (named(c, cols)) element("text", {class: "name", x: (c + 0.5) * TAXEL, y: -RIM - 11 * big}, svg, most > NUMBERED ? c + 1 : `column ${c + 1}`);
     }
     if (view.place) drawPlace(svg, view.place);
     this.way = element("g", {id: "way"}, svg);
@@ -93,9 +95,9 @@ export class SkinPicture {
 
   /* The way in which the skin has to be moved: a trained position comes under the contact, which stays where it is. */
   pointOut(x0, y0, x, y) {
-    const [dx, dy, length] = direction(x0, y0, x, y), end = length - RING - 6;
-    if (end < 12) return;
-    const tip = [x0 + dx * end, y0 + dy * end], wing = (turn) => `${tip[0] - 12 * (dx + turn * dy)} ${tip[1] - 12 * (dy - turn * dx)}`;
+    const [dx, dy, length] = direction(x0, y0, x, y), end = length - (RING + 6) * this.big, side = 12 * this.big;
+    if (end < side) return;
+    const tip = [x0 + dx * end, y0 + dy * end], wing = (turn) => `${tip[0] - side * (dx + turn * dy)} ${tip[1] - side * (dy - turn * dx)}`;
     const drawn = `M ${x0} ${y0} L ${tip.join(" ")} M ${wing(1)} L ${tip.join(" ")} L ${wing(-1)}`;
     for (const path of this.way.children) path.setAttribute("d", drawn);
     this.way.style.visibility = "visible";
@@ -128,11 +130,11 @@ function drawPlace(svg, place) {
 }
 
 /* The end of the finger, as a cap on the side of the skin that is nearest to it. */
-function drawTip(svg, side, w, h) {
+function drawTip(svg, side, w, h, big) {
   const turn = {"first-row": 0, "last-column": 90, "last-row": 180, "first-column": 270}[side];
-  const [along, across] = turn % 180 ? [w, h] : [h, w], half = across / 2, top = -along / 2 - RIM;
+  const [along, across] = turn % 180 ? [w, h] : [h, w], half = across / 2, top = -along / 2 - RIM, far = TIP * big;
   const cap = element("g", {transform: `translate(${w / 2} ${h / 2}) rotate(${turn})`}, svg);
-  element("path", {class: "finger", d: `M ${-half} ${top} C ${-half} ${top - TIP} ${half} ${top - TIP} ${half} ${top} Z`}, cap);
-  const [x, y] = {0: [w / 2, -RIM - 48], 90: [w + RIM + 34, h / 2], 180: [w / 2, h + RIM + 30], 270: [-RIM - 74, h / 2]}[turn];
+  element("path", {class: "finger", d: `M ${-half} ${top} C ${-half} ${top - far} ${half} ${top - far} ${half} ${top} Z`}, cap);
+  const [x, y] = {0: [w / 2, -RIM - 48 * big], 90: [w + RIM + 34 * big, h / 2], 180: [w / 2, h + RIM + 30 * big], 270: [-RIM - 56 * big, h / 2]}[turn];
   element("text", {class: "name", x, y, "writing-mode": turn % 180 ? "vertical-rl" : "horizontal-tb"}, svg, "fingertip");
 }

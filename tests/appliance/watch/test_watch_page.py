@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from appliance.core.config import WatchConfig
@@ -83,10 +84,16 @@ def test_the_verdict_comes_first_and_large(browser: Any, shown: Shown):
 
 
 @pytest.mark.parametrize(
-    "label", ["x", "a material whose name is as long as it may be", "Donaudampfschifffahrtsgesellschaft"]
+    "label",
+    [
+        "x",
+        "a material whose name is as long as it may be",
+        "Donaudampfschifffahrtsgesellschaft",
+        "<img src=x onerror=alert(1)>",
+    ],
 )
 def test_a_name_of_any_length_fits(browser: Any, shown: Shown, label: str):
-    """Nothing is cut off, at any size."""
+    """Nothing is cut off, at any size; what a name holds is text and nothing else."""
     shown.board.take(feed_lines.verdict(41, 390.0, "wood") | {"label": label})
     for width, height in SIZES:
         seen = opened(browser, shown, width, height, rows=41)
@@ -160,6 +167,30 @@ def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
     seen.page.click("text=Watch")
     until(lambda: seen.page.is_visible("#label"))
     assert seen.page.locator("#watch .skin svg").count() == 1
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_large_skin_is_drawn_without_numbers(browser: Any, shown: Shown, width: int, height: int):
+    """12 x 32 taxels: a few rows and columns by their number, none over another; the contact's ring is large enough."""
+    shape = {"rows": 12, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "uint16"}
+    known = {"contact": 5.0, "place": None, "unloaded": 0.0, "fingertip": "first-column"}
+    shown.board.take(feed_lines.hello(format=shape, alignment=known))
+    for i in range(20):
+        taxels = np.zeros((12, 32))
+        taxels[4:6, 10:14] = 200 * (i > 9)
+        shown.board.take(feed_lines.frame(380 + i / 20, taxels))
+    seen = opened(browser, shown, width, height)
+    until(lambda: seen.page.locator(".tile").count() == 12 * 32)
+    assert seen.page.locator(".count").count() == 0
+    boxes = [one.bounding_box() for one in seen.page.locator("svg .name").all()]
+    assert len(boxes) == 4 + 9 + 1
+    for i, one in enumerate(boxes):
+        for other in boxes[:i]:
+            apart = max(one["x"] - other["x"] - other["width"], other["x"] - one["x"] - one["width"],
+                        one["y"] - other["y"] - other["height"], other["y"] - one["y"] - one["height"])  # fmt: skip
+            assert apart >= -1
+    assert seen.page.locator("#centre").bounding_box()["width"] > 12
+    seen.page.context.close()
 
 
 def test_loss_latency_and_the_box(browser: Any, shown: Shown):

@@ -18,12 +18,11 @@ import pytest
 
 from appliance.core.clock import SystemClock
 from appliance.watch.access import Access
-from appliance.watch.server import PageServer
 from appliance.watch.web import FRAMES_HZ, PageWatcher
 from tests.factories import feed_lines
 from tests.factories.browser import WAIT_S, until
 from tests.factories.feeds import HEALTH, OK, Offered, cut, frames
-from tests.factories.page_client import EventReader, ask, status
+from tests.factories.page_client import EventReader, PageAddress, ask, status
 
 
 @pytest.fixture
@@ -156,8 +155,7 @@ def test_the_command_serves_its_page_until_it_is_ended(tmp_path: Path):
     command = [sys.executable, "-m", "appliance", "watch", "--web", "0", "--set", f"feed.socket={tmp_path}/none.sock"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
         address = re.search(r"page: (http://127\.0\.0\.1:\d+)", run.stderr.readline())[1]
-        there = PageServer.__new__(PageServer)
-        there.address = address
+        there = PageAddress(address)
         assert status(ask(there)) == 200
         reader = EventReader(there)
         assert reader.until("box")["there"] is False
