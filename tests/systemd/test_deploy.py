@@ -105,6 +105,9 @@ def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: st
     assert host.machine.get("/usr/local/bin/palpate", "config").count("# board-rpi5.toml") > 3
     assert host.machine.get("stat", "-c", "%U %a", "/etc/palpate/allowed_signers") == "root 644"
     assert host.machine.run("systemd-analyze", "verify", "palpate.service").stderr == ""
+    files = [f"/etc/palpate/watch/{one}" for one in ("token", "key.pem", "certificate.pem")]
+    assert set(host.machine.get("stat", "-c", "%U:%G %a", *files).splitlines()) == {"root:palpate-watch 640"}
+    assert host.machine.run("systemctl", "is-enabled", "palpate-watch").stdout.strip() == "linked"  # and not enabled
     assert host.machine.get("find", f"/home/{hosts.USER}", "-name", ".palpate*") == ""
 
 
