@@ -89,6 +89,7 @@ def test_what_is_no_feed_is_named(feed: Feed, data: bytes, why: str):
         assert not feed.connected
 
 
+@pytest.mark.slow
 def test_what_is_asked_for_is_asked_again_after_a_restart(feed: Feed):
     """Each new connection begins with what this reader wants."""
     server = FakeFeed(feed.path)
@@ -107,6 +108,7 @@ def test_what_is_asked_for_is_asked_again_after_a_restart(feed: Feed):
         assert feed.trouble == ""
 
 
+@pytest.mark.slow
 def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
     """No socket, and one that nobody serves: no error but a reason; a loop over lines ends with it."""
     assert feed.read(0) is None

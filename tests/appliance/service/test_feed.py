@@ -247,6 +247,7 @@ def test_a_window_takes_no_room_from_what_waits_already(offered: Offered) -> Non
     assert [line["sweep"] for line in got if line["type"] == "verdict"][-1] == 3
 
 
+@pytest.mark.slow
 def test_one_that_never_reads_costs_no_memory_without_bound(offered: Offered) -> None:
     """Sixty-four of them that asked for all: after thousands of lines and windows the box holds less than 2 MiB more."""
     peers = [offered.peer() for _ in range(MOST_READERS)]

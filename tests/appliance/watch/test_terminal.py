@@ -210,6 +210,7 @@ def test_it_draws_and_gives_the_terminal_back(offered: Offered, monkeypatch: pyt
     assert out.getvalue().endswith(LEAVE)
 
 
+@pytest.mark.slow
 def test_without_a_terminal_each_event_is_a_line(offered: Offered, monkeypatch: pytest.MonkeyPatch) -> None:
     """Connection, verdict, change of the state, the end of the box and its return; no frames are asked for."""
     monkeypatch.setattr(terminal, "READ_S", 0.01)
