@@ -18,6 +18,8 @@ QUIET_S = 5.0
 """A connection that has sent nothing for this long makes room where the server is full."""
 BUFFER = 64 * 1024
 """Bytes that wait for one peer; one that does not read them is given up."""
+CLOSE_S = 1.0
+"""Longest wait for a peer to take the rest."""
 
 Serve = Callable[["TcpPeer"], Awaitable[None]]
 
@@ -51,10 +53,11 @@ class TcpPeer:
         self._writer.transport.abort()
 
     async def close(self) -> None:
-        """End the connection."""
-        with suppress(OSError):
+        """End the connection; what the peer does not take in CLOSE_S is thrown away, so that the program can end."""
+        with suppress(OSError, TimeoutError):
             self._writer.close()
-            await self._writer.wait_closed()
+            await asyncio.wait_for(self._writer.wait_closed(), CLOSE_S)
+        self.drop()
 
 
 class TcpServer:
