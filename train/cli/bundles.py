@@ -25,7 +25,7 @@ from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import labels
 from train.data.sets import Dataset, digest
-from train.data.summary import doubts
+from train.data.summary import warnings_of
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
 from train.export import bundle_score, measure, pack, quantized_bundle
@@ -134,7 +134,7 @@ def run_fit(args: argparse.Namespace) -> None:
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}")
     sweeps, rest = labels.check(options.load(args, args.seed)), None
-    for line in doubts(sweeps):
+    for line in warnings_of(sweeps):
         print(f"palpate-train: {line}", file=sys.stderr)
     if args.split:
         by, share = _by_share(args.split)

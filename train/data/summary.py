@@ -33,7 +33,7 @@ def describe(spec: str) -> str:
     if spec.startswith("sim:") or not folder.is_dir():
         whole = sets.load(spec, 1)
         return "\n".join(
-            [*description(whole, {}), *(f"  {line}" for line in doubts(whole)), *_unsendable(whole.materials)]
+            [*description(whole, {}), *(f"  {line}" for line in warnings_of(whole)), *_unsendable(whole.materials)]
         )
     recorded = readers.recorded(folder)
     named, names = _named(recorded)
@@ -49,7 +49,7 @@ def describe(spec: str) -> str:
     return "\n".join([*lines, *_unsendable(sorted({one.sweep.material for one in readers.ok(recorded)} - {""}))])
 
 
-def doubts(sweeps: Dataset) -> list[str]:
+def warnings_of(sweeps: Dataset) -> list[str]:
     """What a model can be trained on, but should not be without a look: one line each."""
     lines = []
     if still := np.argwhere(sweeps.samples.min(axis=(0, 1)) == sweeps.samples.max(axis=(0, 1))).tolist():

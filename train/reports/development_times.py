@@ -65,8 +65,8 @@ def measured(
 
 
 def _briefly(name: str, effort: Effort) -> Method:
-    """The method, with SHARE of the iterations where it is a peer."""
-    return methods.find([name], effort if name in OURS else replace(effort, share=SHARE * effort.share))[0]
+    """The method, with SHARE of the iterations where it is a peer and the effort is not smaller anyway."""
+    return methods.find([name], effort if name in OURS else replace(effort, share=min(SHARE, effort.share)))[0]
 
 
 def _callable(method: Method, sweeps: Dataset, seed: int, cache: Path) -> list[tuple[Json, measure.Call]]:

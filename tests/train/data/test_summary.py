@@ -138,12 +138,12 @@ def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
     """A taxel that no sweep changes is named by row and column from 1, a material without sweeps by its name; a sound set
     gives no such line."""
     sound = easy()
-    assert summary.doubts(sound) == []
+    assert summary.warnings_of(sound) == []
     still = sound.samples.copy()
     still[:, :, 0, -1] = 7
     broken = replace(sound, samples=still, materials=(*sound.materials, "ghost"))
     where = ".".join(map(str, (1, still.shape[3], *([still.shape[4]] if still.ndim == 5 else []))))
-    taxels, materials = summary.doubts(broken)
+    taxels, materials = summary.warnings_of(broken)
     assert f"never change in any sweep: {where};" in taxels
     assert "materials without a sweep: ghost;" in materials
     broken.save(tmp_path / "broken.npz")

@@ -20,7 +20,9 @@ from tests.factories import choice_data, development_data
 from tests.factories.chart_data import DOTS
 from tests.factories.paths import ROOT
 from tests.rig import soak_page
+from train.data import sets
 from train.reports import (
+    bundle_report,
     contact_plot,
     development_report,
     overview_plot,
@@ -65,6 +67,13 @@ PICTURES: dict[str, Callable[[], Any]] = {
     "sweep": lambda: sweep_plot.draw(sweep_plot.load("sim:T-REAL:1001:1", 3)),
     "image": image,
     "development": lambda: development_report.render(development_data.figures()),
+    "bundle": lambda: bundle_report.calibration(
+        {"n": 9, "bins": [{"said": 0.6, "right": 0.5, "n": 4}, {"said": 0.9, "right": 1.0, "n": 5}]}
+    ),
+    "spectrograms": lambda: bundle_report.spectrograms(sets.load("sim:T-REAL:1001:1", 1), [0, 5]),
+    "confusion of a bundle": lambda: bundle_report.confusion(
+        {"labels": ["a", "b"], "answers": {"a": {"a": 3, "b": 1}}}
+    ),
     "overview": lambda: overview_plot.draw("paper"),
 }
 
