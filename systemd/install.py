@@ -30,6 +30,7 @@ LINK = "/opt/palpate"
 PATHS = {
     "systemd/palpate.service": "/etc/systemd/system/palpate.service",
     "systemd/palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
+    "systemd/palpate-bridge@.service": "/etc/systemd/system/palpate-bridge@.service",
     "systemd/palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "systemd/palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
     "firmware_config/70-palpate.rules": "/etc/udev/rules.d/70-palpate.rules",
@@ -235,8 +236,8 @@ def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
         ready = _start(box)
     except Failed as e:
         raise Failed(f"{e}{_swap_back(box, release)}") from e
-    # it serves the release before until then; where it is off, this does nothing
-    box.run("restarting the page", "systemctl try-restart palpate-watch", user="root")
+    # they are of the release before until then; what is off stays off
+    box.run("restarting page and bridges", "systemctl try-restart palpate-watch 'palpate-bridge@*'", user="root")
     keep = f"$(readlink -e {LINK}) $(readlink -e {LINK}.previous || true)"
     tidy = f'for one in {LINK}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
     box.run("removing older releases", tidy, user="root", limit_s=120)

@@ -8,17 +8,39 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Any
 
-from appliance.bridges.options import add_arguments
+from appliance.bridges.options import LINKS, PORTS, add_arguments
 from appliance.bridges.server import TcpServer, address, stop_event, until
 from appliance.bridges.source import FeedSource, LineSource, LinkPort, Source
 from appliance.client.line import open_port
+from appliance.core import config
 from appliance.core.clock import SystemClock
+from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.log import log, to_stderr
 
 EVERY_S = 1.0
+
+
+def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
+    """Take from the settings of the box what no option says. Raises ConfigError where they have no line for the bridge."""
+    if args.listen is None:
+        args.listen = f"{settings.bridge.address}:{PORTS[kind]}"
+    args.allow_writes = args.allow_writes or settings.bridge.allow_writes
+    if args.port or args.link or getattr(args, "feed", None):
+        return
+    if settings.serial.port == LINKS[kind]:
+        args.link = Path(LINKS[kind])
+    elif kind == "modbus" and settings.feed.socket and not args.allow_writes:
+        args.feed = settings.feed.socket
+    else:
+        why = " and its feed cannot be written to" if kind == "modbus" else ""
+        raise ConfigError(
+            f'serial.port = "{settings.serial.port}" is no line that this bridge can have{why}; set serial.port = '
+            f'"{LINKS[kind]}", or name the box\'s line with --port'
+        )
 
 
 def _source(args: argparse.Namespace) -> Source:
@@ -39,6 +61,7 @@ def run_modbus(args: argparse.Namespace) -> int:
     """`palpate bridge modbus`, until SIGTERM."""
     from appliance.bridges.modbus import ModbusBridge
 
+    settle("modbus", args, config.load(None))
     host, port = address(args.listen)
 
     async def serve() -> None:
@@ -60,6 +83,7 @@ def run_tcp(args: argparse.Namespace) -> int:
     """`palpate bridge tcp`, until SIGTERM."""
     from appliance.bridges.tcp import TcpBridge
 
+    settle("tcp", args, config.load(None))
     host, port = address(args.listen)
 
     async def serve() -> None:

@@ -11,6 +11,9 @@ from appliance.core.config import FeedConfig, SerialConfig
 FEED, BAUD = FeedConfig().socket, SerialConfig().baud
 MOST = 16
 """Connections at a time."""
+PORTS = {"tcp": 1503, "modbus": 1502}
+LINKS = {"tcp": "/run/palpate-tcp/line", "modbus": "/run/palpate-modbus/line"}
+"""The box's line on the box itself, where `serial.port` has this value; their folders are of palpate-bridge@.service."""
 TEXTS = {
     "tcp": "the sentences of the serial line on a TCP port",
     "modbus": "the box as a Modbus TCP server",
@@ -28,17 +31,23 @@ def add_arguments(add: Callable[[str, str], argparse.ArgumentParser]) -> None:
                 help="parameters and names, as ROS has them; comes last",
             )  # fmt: skip
             continue
-        box = command.add_mutually_exclusive_group(required=True)
+        box = command.add_mutually_exclusive_group()
         box.add_argument("--port", metavar="PORT", help="the box's serial line: a device, or socket://HOST:PORT")
-        box.add_argument("--link", type=Path, metavar="PATH", help="on the box: make PATH, for serial.port")
+        link = f"on the box: make PATH, for serial.port; the default where that is {LINKS[name]}"
+        box.add_argument("--link", type=Path, metavar="PATH", help=link)
         if name == "modbus":
             box.add_argument(
-                "--feed", nargs="?", const=FEED, metavar="PATH", help=f"on the box: read its feed ({FEED})"
+                "--feed",
+                nargs="?",
+                const=FEED,
+                metavar="PATH",
+                help=f"on the box: read its feed ({FEED}); else the default",
             )
-        listen = "127.0.0.1:1503" if name == "tcp" else "127.0.0.1:1502"
         command.add_argument("--baud", type=int, default=BAUD, metavar="N", help=f"of the serial line ({BAUD})")
-        command.add_argument("--listen", default=listen, metavar="HOST:PORT", help=f"default {listen}")
-        command.add_argument("--allow-writes", action="store_true", help="peers may start, stop, tare and abort")
+        listen = f"default: bridge.address of the settings, port {PORTS[name]}"
+        command.add_argument("--listen", metavar="HOST:PORT", help=listen)
+        writes = "peers may start, stop, tare and abort, also where bridge.allow_writes is false"
+        command.add_argument("--allow-writes", action="store_true", help=writes)
         command.add_argument("--most", type=_number, default=MOST, metavar="N", help=f"connections at a time ({MOST})")
 
 

@@ -213,13 +213,16 @@ def noted(view: BoxView, news: Heard, now_ns: int) -> BoxView:
 class LinkPort:
     """A port that the box on this machine opens by a name: one end of a pseudo-terminal, the other at `path`.
 
-    For a box whose serial port is not wired: `serial.port = "PATH"`. Raises ConfigError if something else is at `path`.
+    For a box whose serial port is not wired: `serial.port = "PATH"`. Programs of this one's group may open it, the box among
+    them. Raises ConfigError if something else is at `path`.
     """
 
     def __init__(self, path: Path) -> None:
         self._stack = ExitStack()
         self._far, name = self._stack.enter_context(pseudo_terminal.pair())
         try:
+            os.chown(name, -1, os.getgid())
+            os.chmod(name, 0o660)
             if path.is_symlink():  # of a bridge that was killed
                 path.unlink()
             path.symlink_to(name)

@@ -184,6 +184,17 @@ class WatchConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class BridgeConfig:
+    """`palpate bridge` on the box, where no option says otherwise. address: where it listens, at the port of its kind.
+
+    allow_writes: whether peers may start, stop, tare and abort. A bridge has no password.
+    """
+
+    address: str = "127.0.0.1"
+    allow_writes: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """All settings. board: the board file's name, "" for none. folder: where the files are, skins/ among them.
 
@@ -200,6 +211,7 @@ class Config:
     store: StoreConfig
     feed: FeedConfig
     watch: WatchConfig
+    bridge: BridgeConfig
     sources: Mapping[str, str] = field(compare=False)
     folder: Path = field(default=SITE.parent, compare=False)
 
@@ -296,6 +308,8 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
     """Each value of a layer with its full name, converted to its field's type."""
     for section, content in table.items():
         if section not in _SECTIONS:
+            if section == "board":
+                raise ConfigError(f"{where}: board is chosen in {SITE}, or with --board; move it there")
             raise _unknown(section, [*_SECTIONS, "board"], where)
         if not isinstance(content, dict):
             raise ConfigError(
@@ -311,7 +325,6 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
 def _unknown(name: str, known: list[str], where: str) -> ConfigError:
     """The error for an unknown name; a key of that name in another section is suggested before a similar spelling."""
     last = name.rpartition(".")[2]
-    known = [k for k in known if k != name]
     near = [k for k in _KEYS if k.endswith(f".{last}")] or closest(name, known)
     hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
     return ConfigError(f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}")

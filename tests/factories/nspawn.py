@@ -43,6 +43,7 @@ TOOLS = {
 PLACES = {
     "palpate.service": "/etc/systemd/system/palpate.service",
     "palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
+    "palpate-bridge@.service": "/etc/systemd/system/palpate-bridge@.service",
     "palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
 }

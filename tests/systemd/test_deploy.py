@@ -107,7 +107,8 @@ def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: st
     assert host.machine.run("systemd-analyze", "verify", "palpate.service").stderr == ""
     files = [f"/etc/palpate/watch/{one}" for one in ("token", "key.pem", "certificate.pem")]
     assert set(host.machine.get("stat", "-c", "%U:%G %a", *files).splitlines()) == {"root:palpate-watch 640"}
-    assert host.machine.run("systemctl", "is-enabled", "palpate-watch").stdout.strip() == "linked"  # and not enabled
+    off = {"palpate-watch": "linked", "palpate-bridge@tcp": "disabled", "palpate-bridge@modbus": "disabled"}
+    assert {unit: host.machine.run("systemctl", "is-enabled", unit).stdout.strip() for unit in off} == off
     assert host.machine.get("find", f"/home/{hosts.USER}", "-name", ".palpate*") == ""
 
 

@@ -403,9 +403,9 @@ def test_settings_that_cannot_be(options: list[str], why: str, capsys: pytest.Ca
     assert why in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("options", [[], ["--port", "x", "--most", "0"], ["--port", "x", "--link", "y"]])
+@pytest.mark.parametrize("options", [["--port", "x", "--most", "0"], ["--port", "x", "--link", "y"]])
 def test_wrong_arguments(options: list[str]):
-    """No box, no connections, two boxes: usage errors."""
+    """No connections, two boxes: usage errors."""
     with pytest.raises(SystemExit) as e:
         main(["bridge", "modbus", *options])
     assert e.value.code == 2

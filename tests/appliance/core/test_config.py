@@ -169,7 +169,7 @@ def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> N
 def test_only_the_site_file_may_choose_the_board(folder: Path) -> None:
     """`board` in sensor.toml would be read too late."""
     (folder / "sensor.toml").write_text('board = "a"\n')
-    with pytest.raises(ConfigError, match=r"sensor\.toml: board is unknown; known are sensor"):
+    with pytest.raises(ConfigError, match=r"sensor\.toml: board is chosen in .*palpate\.toml, or with --board"):
         _load(folder)
 
 

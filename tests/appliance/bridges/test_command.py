@@ -1,0 +1,62 @@
+"""What a bridge takes from the settings of the box where no option says otherwise."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from appliance.bridges import command
+from appliance.bridges.options import LINKS, add_arguments
+from appliance.core import config
+from appliance.core.errors import ConfigError
+from tests.factories.paths import NO_SITE
+
+
+def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Namespace:
+    """The options of a bridge, once the settings have filled them in."""
+    parser = argparse.ArgumentParser()
+    commands = parser.add_subparsers()
+    add_arguments(lambda name, text: commands.add_parser(name))
+    args = parser.parse_args([kind, *options])
+    command.settle(kind, args, config.load(None, sets, site=NO_SITE))
+    return args
+
+
+def test_the_settings_of_a_new_box():
+    """Modbus reads the feed, on this machine alone, and refuses commands; TCP lacks a line, and says which to set."""
+    args = settled("modbus")
+    assert (args.feed, args.link, args.listen, args.allow_writes) == (
+        "/run/palpate/feed.sock", None, "127.0.0.1:1502", False,
+    )  # fmt: skip
+    with pytest.raises(
+        ConfigError, match=r'serial\.port = "" is no line .* set serial\.port = "/run/palpate-tcp/line"'
+    ):
+        settled("tcp")
+
+
+@pytest.mark.parametrize("kind", LINKS)
+def test_the_line_of_the_bridge(kind: str):
+    """serial.port names its link: it makes that one, at the address of the settings, and passes commands on if they may be."""
+    sets = (f"serial.port={LINKS[kind]}", "bridge.address=192.168.0.10", "bridge.allow_writes=true")
+    args = settled(kind, sets=sets)
+    assert (args.link, args.allow_writes) == (Path(LINKS[kind]), True)
+    assert args.listen == {"tcp": "192.168.0.10:1503", "modbus": "192.168.0.10:1502"}[kind]
+
+
+def test_options_hold():
+    """A line, an address, or a feed by option: the settings do not change them."""
+    sets = (f"serial.port={LINKS['tcp']}", "bridge.address=192.168.0.10")
+    args = settled("tcp", "--port", "/dev/ttyUSB0", "--listen", "[::1]:7", "--allow-writes", sets=sets)
+    assert (args.port, args.link, args.listen, args.allow_writes) == ("/dev/ttyUSB0", None, "[::1]:7", True)
+    assert settled("modbus", "--feed", "/tmp/x", sets=sets).feed == "/tmp/x"
+
+
+@pytest.mark.parametrize(
+    "sets", [("bridge.allow_writes=true",), ("feed.socket=",), ("serial.port=/dev/ttyAMA0", "feed.socket=")]
+)
+def test_no_way_to_the_box(sets: tuple[str, ...]):
+    """Commands without a line, or neither line nor feed: refused, with what to set."""
+    with pytest.raises(ConfigError, match=r'feed cannot be written to; set serial\.port = "/run/palpate-modbus/line"'):
+        settled("modbus", sets=sets)

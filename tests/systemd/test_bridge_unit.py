@@ -1,0 +1,142 @@
+"""The bridges' unit under a real systemd, in a container: off at first, hardened; the feed and the line reach it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from tests.factories import nspawn
+from tests.factories.nspawn import SITE, STREAMS, WAIT_S, Machine, Service
+
+pytestmark = pytest.mark.slow
+
+pytest_plugins = ["tests.factories.systemd_fixtures"]
+
+TCP, MODBUS = "palpate-bridge@tcp", "palpate-bridge@modbus"
+LINE = "/run/palpate-tcp/line"
+ASK_TCP = """
+import json, sys
+from appliance.client.box import Palpate
+from appliance.core.errors import CommandRefused
+with Palpate("socket://127.0.0.1:1503", timeout_s=30) as box:
+    box.wait_ready(30)  # what is said before the box has opened the line is lost
+    found = {"labels": list(box.labels()), "state": box.state().skin}
+    try:
+        found["start"] = box.start()
+    except CommandRefused as e:
+        found["start"] = str(e)
+    print(json.dumps(found))
+"""
+ASK_MODBUS = """
+import socket, struct, sys, time
+def asked():
+    with socket.create_connection(("127.0.0.1", 1502), timeout=20) as s:
+        s.sendall(bytes.fromhex("0001000000060104") + struct.pack(">HH", 0, 5))
+        return struct.unpack(">5H", s.recv(300)[9:])
+end = time.monotonic() + 20
+while time.monotonic() < end:
+    try:
+        if asked()[2] == int(sys.argv[1]):
+            break
+    except OSError:
+        pass
+    time.sleep(0.1)
+print(*asked())
+"""
+
+
+def ask(machine: Machine, program: str, *args: str) -> str:
+    """What a program on the machine prints."""
+    return machine.get("/opt/palpate/bin/python", "-c", program, *args)
+
+
+def until(machine: Machine, condition: str) -> None:
+    """Wait for a shell command to succeed."""
+    done = machine.run("sh", "-c", f"for i in $(seq {2 * WAIT_S}); do {condition} && exit; sleep 0.5; done; exit 1")
+    assert done.returncode == 0, machine.get("journalctl", "-q", "-u", "palpate-bridge@*", "-o", "cat")
+
+
+@pytest.fixture
+def bridges(machine: Machine, service: Service) -> Iterator[Service]:
+    """The service, stopped; both bridges are stopped after the test."""
+    yield service
+    machine.get("systemctl", "stop", TCP, MODBUS)
+    machine.run("systemctl", "reset-failed", TCP, MODBUS)
+
+
+def test_the_unit_is_sound_hardened_and_off(machine: Machine, before: list[bool]):
+    """systemd reports no problem; the exposure is at most 1.5 of 10, as the service's; an install enables neither bridge."""
+    for unit in (TCP, MODBUS):
+        done = machine.run("systemd-analyze", "verify", f"{unit}.service")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert machine.run("systemctl", "is-enabled", unit).stdout.strip() == "disabled"
+    place = nspawn.PLACES["palpate-bridge@.service"]
+    done = machine.run("systemd-analyze", "security", "--offline=true", "--threshold=15", place)
+    print(done.stdout.splitlines()[-1])
+    assert done.returncode == 0, done.stdout
+
+
+def test_modbus_reads_the_feed_and_outlives_the_service(machine: Machine, bridges: Service):
+    """As delivered: the skin's state is read, as a user of its own; without the service the state is 0, the process goes on."""
+    bridges.start()
+    bridges.until("StatusText", STREAMS)
+    machine.get("systemctl", "start", MODBUS)
+    pid = machine.get("systemctl", "show", MODBUS, "--value", "-p", "MainPID")
+    assert ask(machine, ASK_MODBUS, "1").split()[2] == "1"
+    assert machine.get("stat", "-c", "%U", f"/proc/{pid}") == "palpate-bridge"
+    machine.get("systemctl", "stop", "palpate")
+    assert ask(machine, ASK_MODBUS, "0").split()[2] == "0"
+    machine.get("systemctl", "start", "palpate")
+    assert ask(machine, ASK_MODBUS, "1").split()[2] == "1"
+    assert machine.get("systemctl", "show", MODBUS, "--value", "-p", "MainPID") == pid
+
+
+def test_the_line_over_tcp(machine: Machine, bridges: Service):
+    """The box opens the line that the bridge makes, another user does not; commands are refused until a setting allows
+    them; a killed bridge, and a killed service, find one another again."""
+    machine.put(SITE, f'[serial]\nport = "{LINE}"\n[trigger]\nmode = "serial"\n')
+    bridges.start()
+    machine.get("systemctl", "start", TCP)
+    until(machine, f"test -L {LINE}")
+    found = json.loads(ask(machine, ASK_TCP))
+    assert found["state"] == "streaming"
+    assert len(found["labels"]) > 1
+    assert "read-only" in found["start"]
+    others = machine.run("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", "sh", "-c", f": <>{LINE}")
+    assert "Permission denied" in others.stderr
+    machine.get("systemctl", "kill", "--signal=KILL", TCP)
+    until(machine, f"systemctl is-active -q {TCP}")
+    assert json.loads(ask(machine, ASK_TCP))["state"] == "streaming"
+    bridges.kill("KILL")
+    assert json.loads(ask(machine, ASK_TCP))["state"] == "streaming"
+    machine.put(SITE, f'[serial]\nport = "{LINE}"\n[trigger]\nmode = "serial"\n[bridge]\nallow_writes = true\n')
+    machine.get("systemctl", "restart", TCP)
+    until(machine, f"test -L {LINE}")
+    assert json.loads(ask(machine, ASK_TCP))["start"] is None
+
+
+def test_settings_that_cannot_be_used(machine: Machine, bridges: Service):
+    """No line for the bridge: exit 78, no restart; the journal says what to set."""
+    machine.put(SITE, '[serial]\nport = "/dev/ttyAMA0"\n')
+    machine.get("systemctl", "start", TCP)
+    until(machine, f"systemctl is-failed -q {TCP}")
+    assert machine.get("systemctl", "show", TCP, "--value", "-p", "ExecMainStatus") == "78"
+    assert f'set serial.port = "{LINE}"' in machine.get("journalctl", "-q", "-u", TCP, "-o", "cat")
+
+
+def test_what_it_cannot_do(machine: Machine, bridges: Service):
+    """It has no capability, and reads nothing of what the service keeps."""
+    bridges.start()
+    machine.get("systemctl", "start", MODBUS)
+    ask(machine, ASK_MODBUS, "1")
+    pid = machine.get("systemctl", "show", MODBUS, "--value", "-p", "MainPID")
+    assert re.search(r"(?m)^CapBnd:\t0+$", machine.get("cat", f"/proc/{pid}/status"))
+    inside = machine.run(
+        "nsenter", "-t", pid, "-m", "setpriv", "--reuid=palpate-bridge", "--regid=palpate", "--clear-groups",
+        "ls", "/var/lib/palpate",
+    )  # fmt: skip
+    assert inside.returncode != 0
+    assert "Permission denied" in inside.stderr
