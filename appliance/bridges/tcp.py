@@ -1,5 +1,5 @@
 """The serial line over TCP: what a controller with a socket needs, URScript for one. In: a port. Out: its sentences, to
-each peer; commands of the peers go to the box.
+each peer; commands of the peers go to the box, one at a time, and the answer to a command to the peer that sent it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from appliance.core.sentences import Sentence, sentence
 
 PACE_S = 0.02
 """Time between two commands to the box, of all peers together: its loop answers each, and a flood must not reach it."""
+ANSWER_S = 2.0
+"""Longest wait for the box to answer a command."""
 QUESTIONS = ("ID", "STATE", "LABEL")
 """Commands that change nothing, and need no permission."""
 
@@ -27,7 +29,10 @@ class TcpBridge:
         self, name: str, opener: Callable[[], Any], *, writes: bool, most: int, loop: asyncio.AbstractEventLoop
     ) -> None:
         self.server = TcpServer(self.serve, most)
-        self._writes, self._loop, self._sending = writes, loop, asyncio.Lock()
+        self._writes, self._loop, self._asking = writes, loop, asyncio.Lock()
+        self._next_s = 0.0  # when the next command may go to the box
+        self._asked = ""  # the command that the box has not answered yet
+        self._answer: asyncio.Future[bytes] = loop.create_future()
         self._line = Line(opener, self._heard, lambda: None, name=name)
 
     @property
@@ -42,9 +47,14 @@ class TcpBridge:
     def _heard(self, heard: Sentence) -> None:
         """In the thread of the line: what is damaged ends here."""
         if heard.summed and not heard.error and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._pass_on, sentence(heard.kind, *heard.fields))
+            self._loop.call_soon_threadsafe(self._pass_on, heard)
 
-    def _pass_on(self, line: bytes) -> None:
+    def _pass_on(self, heard: Sentence) -> None:
+        line = sentence(heard.kind, *heard.fields)
+        if heard.kind == "ANS":  # one that comes too late, or that nobody has asked for, is for nobody
+            if heard.fields[:1] == [self._asked] and not self._answer.done():
+                self._answer.set_result(line)
+            return
         for peer in [*self.server.peers]:
             peer.write(line)
 
@@ -54,21 +64,25 @@ class TcpBridge:
         while data := await peer.read(None):
             found, rest = sentences.parse(data, rest)
             for command in found:
-                error = await self._send(command)
-                if error:
-                    peer.write(sentence("ANS", command.kind, "error", error))
+                peer.write(await self._ask(command))
 
-    async def _send(self, command: Sentence) -> str:
-        """Send a command to the box; why not, "" if it was sent."""
-        if command.error:
-            return command.error
-        if not self._writes and command.kind not in QUESTIONS:
-            return "this bridge is read-only; start it with --allow-writes"
-        async with self._sending:
-            try:
-                await asyncio.to_thread(self._line.write, sentence(command.kind, *command.fields))
-            except LinkLost as e:
-                return str(e)
-            finally:
-                await asyncio.sleep(PACE_S)
-        return ""
+    async def _ask(self, command: Sentence) -> bytes:
+        """The box's answer to a command, or one that says why it has none."""
+        why = command.error
+        if not why and not self._writes and command.kind not in QUESTIONS:
+            why = "this bridge is read-only; start it with --allow-writes"
+        if not why:
+            async with self._asking:
+                await asyncio.sleep(self._next_s - self._loop.time())
+                self._next_s = self._loop.time() + PACE_S
+                self._asked, self._answer = command.kind, self._loop.create_future()
+                try:
+                    await asyncio.to_thread(self._line.write, sentence(command.kind, *command.fields))
+                    return await asyncio.wait_for(self._answer, ANSWER_S)
+                except LinkLost as e:
+                    why = str(e)
+                except TimeoutError:
+                    why = f"the box has not answered within {ANSWER_S:g} s; see whether it is on"
+                finally:
+                    self._asked = ""
+        return sentence("ANS", command.kind, "error", why)

@@ -66,13 +66,13 @@ def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
 
 
 def test_every_peer_hears_everything_and_noise_stays_out(box: SpeakingBox):
-    """Two peers get the same sentences; what is damaged on the line is not passed on."""
+    """Two peers get the same sentences, and each the answers to its own commands alone; what is damaged on the line is
+    not passed on."""
     with bridge("tcp", "--port", box.path) as address:
         peers = [socket.create_connection(address, timeout=LONG_S) for _ in range(2)]
-        peers[1].sendall(b"$PPLP,ID\r\n")  # its answer shows that both are served
-        before = [peer.recv(4096) for peer in peers]
-        assert before[0] == before[1]
-        assert before[0].startswith(b"$PPLP,ANS,ID,ok,")
+        for peer, command in zip(peers, (b"ID", b"STATE"), strict=True):
+            peer.sendall(b"$PPLP," + command + b"\r\n")
+            assert peer.recv(4096).startswith(b"$PPLP,ANS," + command + b",ok,")  # so it is served by now
         box.say(result(1).replace(b"wood", b"wo0d"), b"\xff\xfe\r\n", state(), result(2))
         for peer in peers:
             heard = b""
@@ -109,7 +109,7 @@ def test_a_line_that_is_gone(box: SpeakingBox):
     ):
         client.wait_ready(LONG_S)
         box.unplug()
-        with pytest.raises(CommandRefused, match=r"was lost|cannot be opened"):
+        with pytest.raises(CommandRefused, match=r"was lost|cannot be opened|does not take"):
             ask_often(client)
         box.plug_in()
         assert client.wait_ready(LONG_S).ready
@@ -166,11 +166,12 @@ class DeafPort:
 def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPatch):
     """Of many commands at once one goes out, and the next after its time, whoever sent it."""
     monkeypatch.setattr(tcp, "PACE_S", 3600.0)
+    monkeypatch.setattr(tcp, "ANSWER_S", 0.01)
     port = DeafPort()
 
     async def run() -> None:
         bridge = tcp.TcpBridge("x", lambda: port, writes=True, most=9, loop=asyncio.get_running_loop())
-        flood = [asyncio.create_task(bridge._send(Sentence("STATE"))) for _ in range(200)]
+        flood = [asyncio.create_task(bridge._ask(Sentence("STATE"))) for _ in range(200)]
         while not port.written:
             await asyncio.sleep(0.01)
         await asyncio.sleep(0.1)
@@ -180,6 +181,29 @@ def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPa
 
     asyncio.run(run())
     assert port.written == [sentence("STATE")]
+
+
+def test_a_box_that_does_not_answer(monkeypatch: pytest.MonkeyPatch):
+    """The peer is told; an answer that comes too late, or to another command, is for nobody."""
+    monkeypatch.setattr(tcp, "ANSWER_S", 0.1)
+    monkeypatch.setattr(tcp, "PACE_S", 0.0)
+
+    async def run() -> list[bytes]:
+        bridge = tcp.TcpBridge("x", DeafPort, writes=True, most=9, loop=asyncio.get_running_loop())
+        said = [await bridge._ask(Sentence("START"))]
+        bridge._heard(Sentence("ANS", "START,ok", summed=True))
+        asking = asyncio.create_task(bridge._ask(Sentence("STOP")))
+        while bridge._asked != "STOP":
+            await asyncio.sleep(0)
+        bridge._heard(Sentence("ANS", "START,ok", summed=True))
+        bridge._heard(Sentence("ANS", "STOP,ok", summed=True))
+        said.append(await asking)
+        bridge.close()
+        return said
+
+    late, right = asyncio.run(run())
+    assert late.startswith(b"$PPLP,ANS,START,error,the box has not answered within 0.1 s")
+    assert right == sentence("ANS", "STOP", "ok")
 
 
 def test_a_silent_peer_makes_room():
