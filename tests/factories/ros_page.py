@@ -1,4 +1,7 @@
-"""Runs the Python of docs/robots/ros2.md, which comes on stdin, four times; prints what came of each as a JSON line."""
+"""Runs a program of docs/robots/ros2.md, which comes on stdin, four times; prints what came of each as a JSON line.
+
+Arguments: the program's class, and what `classify` gets, as JSON.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,9 @@ if __name__ == "__main__":
     rclpy.init()
     node = rclpy.create_node("cell")
     threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
-    toucher = names["Toucher"](node)
+    program, settings = names[sys.argv[1]](node), json.loads(sys.argv[2])
     for _ in range(4):
         try:
-            print(json.dumps(toucher.classify(lambda: None, timeout_s=20.0)), flush=True)
+            print(json.dumps(program.classify(lambda: None, **settings)), flush=True)
         except RuntimeError as e:
             print(json.dumps(f"RuntimeError: {e}"), flush=True)

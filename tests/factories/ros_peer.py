@@ -11,11 +11,16 @@ import threading
 import time
 
 import rclpy
+from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionClient
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.task import Future
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
@@ -23,11 +28,19 @@ TRANSITIONS = {
     "configure": Transition.TRANSITION_CONFIGURE, "activate": Transition.TRANSITION_ACTIVATE,
     "deactivate": Transition.TRANSITION_DEACTIVATE, "cleanup": Transition.TRANSITION_CLEANUP,
 }  # fmt: skip
+STATES = {
+    GoalStatus.STATUS_SUCCEEDED: "succeeded", GoalStatus.STATUS_CANCELED: "canceled", GoalStatus.STATUS_ABORTED: "aborted",
+}  # fmt: skip
+
+
+ONE_LINE = threading.Lock()
+"""Two threads tell something."""
 
 
 def tell(**fields: object) -> None:
     """Print a line."""
-    print(json.dumps(fields), flush=True)
+    with ONE_LINE:
+        print(json.dumps(fields), flush=True)
 
 
 def status(topic: str, array: DiagnosticArray) -> None:
@@ -57,10 +70,73 @@ def listen(node: Node) -> None:
     )  # fmt: skip
 
 
+def fields(message: object) -> dict:
+    """The fields of a message without others in it."""
+    return {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+
+
+class Sweeper:
+    """Sends goals to the action, and cancels the one that was accepted last."""
+
+    def __init__(self, node: Node) -> None:
+        from palpate_msgs.action import Sweep
+
+        self._goal = Sweep.Goal
+        self._client = ActionClient(node, Sweep, "/palpate/sweep")
+        self._accepted = None
+
+    def send(self, **terms: float | bool) -> None:
+        """Send a goal; what comes of it is printed."""
+        if not self._client.wait_for_server(20):
+            tell(topic="result", state="no such action")
+            return
+        sent = self._client.send_goal_async(
+            self._goal(**terms), feedback_callback=lambda m: tell(topic="feedback", **fields(m.feedback))
+        )
+        sent.add_done_callback(self._answered)
+
+    def cancel(self) -> None:
+        """Cancel a goal."""
+        self._accepted.cancel_goal_async()
+
+    def _answered(self, sent: Future) -> None:
+        goal = sent.result()
+        if not goal.accepted:
+            tell(topic="result", state="rejected")
+            return
+        self._accepted = goal
+        goal.get_result_async().add_done_callback(
+            lambda done: tell(topic="result", state=STATES[done.result().status], **fields(done.result().result))
+        )
+
+
+def allow_writes(node: Node) -> None:
+    """Try to set this parameter of the bridge."""
+    client = node.create_client(SetParameters, "/palpate/set_parameters")
+    wanted = Parameter("allow_writes", value=True).to_parameter_msg()
+    client.wait_for_service(20)
+    client.call_async(SetParameters.Request(parameters=[wanted])).add_done_callback(
+        lambda done: tell(
+            service="allow_writes", success=done.result().results[0].successful, message=done.result().results[0].reason
+        )
+    )
+
+
 def obey(node: Node) -> None:
-    """Call the services that stdin names, one after the other."""
+    """Call the services that stdin names, one after the other; a JSON object is a goal of the action."""
+    sweeper = None
     for line in sys.stdin:
         name = line.strip()
+        if name.startswith("{"):
+            sweeper = sweeper or Sweeper(node)
+            sweeper.send(**json.loads(name))
+            continue
+        if name == "cancel":
+            sweeper.cancel()
+            continue
+        if name == "allow_writes":
+            allow_writes(node)
+            continue
         if name in TRANSITIONS:
             client = node.create_client(ChangeState, "/palpate/change_state")
             request = ChangeState.Request(transition=Transition(id=TRANSITIONS[name]))

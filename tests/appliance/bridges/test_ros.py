@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import socket
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,7 +14,7 @@ import pytest
 
 from appliance.cli.main import main
 from appliance.core.sentences import sentence
-from tests.factories import ros
+from tests.factories import ros, ros_launch
 from tests.factories.bridges import LONG_S, eventually
 from tests.factories.paths import ROOT
 from tests.factories.ros import RosPeer
@@ -19,6 +22,7 @@ from tests.factories.speaking_box import SpeakingBox, result, state
 
 OK, WARN, ERROR, STALE = range(4)
 PARAMETERS = ROOT / "docs" / "robots" / "palpate.yaml"
+WRITES = ("-p", "allow_writes:=true")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -37,7 +41,7 @@ def box(tmp_path: Path) -> Iterator[SpeakingBox]:
 @pytest.fixture
 def node(box: SpeakingBox) -> Iterator[RosPeer]:
     """A node that hears the box through the bridge; its parameters come from the page's file."""
-    with ros.peer() as peer, ros.bridge("--params-file", str(PARAMETERS), "-p", f"port:={box.path}"):
+    with ros.peer() as peer, ros.bridge("--params-file", str(PARAMETERS), "-p", f"port:={box.path}", *WRITES):
         eventually(lambda: said(box, lambda: peer.on("state") != []))
         yield peer
 
@@ -177,9 +181,43 @@ def test_without_ros_the_command_says_what_to_do(capsys: pytest.CaptureFixture[s
     assert "source its setup.bash, or install the wheels with the extra [ros]" in capsys.readouterr().err
 
 
-def test_the_launch_file_is_python():
-    """It compiles, and names the parameters' file beside it; `launch` itself is no wheel, so it was not run."""
-    launch = ROOT / "docs" / "robots" / "palpate.launch.py"
-    names = compile(launch.read_text(), launch.name, "exec").co_names
-    assert "generate_launch_description" in names
-    assert PARAMETERS.name in launch.read_text()
+def test_the_launch_file(box: SpeakingBox):
+    """The process that it describes is the bridge with the parameters beside it, configured and activated; it goes through
+    its lifecycle, and ends with SIGINT, which launch sends first. `launch` itself is no wheel: it was not run."""
+    ((process, command),) = ros_launch.processes(PARAMETERS.with_name("palpate.launch.py"), port=str(box.path))
+    assert (process.respawn, process.respawn_delay, process.output) == (True, 2.0, "screen")
+    assert command[0] == "python3"
+    environment = ros.environment() | {"PATH": f"{ros.PYTHON.parent}:{os.environ['PATH']}"}
+    with (
+        ros.peer() as node,
+        subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as launched,
+    ):
+        try:
+            eventually(lambda: said(box, lambda: node.on("state") != []))
+            assert verdict(box, node, result(1))["frame_id"] == "fingertip"
+            for transition in ("deactivate", "cleanup", "configure", "activate"):
+                assert node.call(transition)["success"]
+            assert verdict(box, node, result(2))["message"] == "wood"
+            launched.send_signal(signal.SIGINT)
+            assert launched.wait(LONG_S) == 0
+            assert "Traceback" not in launched.stderr.read()
+        finally:
+            launched.kill()
+
+
+def test_the_launch_file_configures_where_it_is_told_to(box: SpeakingBox, tmp_path: Path):
+    """With autostart: false in the YAML beside it, the node waits unconfigured for a manager of its lifecycle."""
+    for name in ("palpate.launch.py", "palpate.yaml"):
+        text = (PARAMETERS.parent / name).read_text()
+        (tmp_path / name).write_text(text.replace("autostart: true", "autostart: false"))
+    ((_, command),) = ros_launch.processes(tmp_path / "palpate.launch.py", port=str(box.path))
+    environment = ros.environment() | {"PATH": f"{ros.PYTHON.parent}:{os.environ['PATH']}"}
+    with ros.peer() as node, subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as launched:
+        try:
+            assert not node.call("activate")["success"]
+            assert box.heard == []
+            for transition in ("configure", "activate"):
+                assert node.call(transition)["success"]
+            eventually(lambda: said(box, lambda: node.on("state") != []))
+        finally:
+            launched.kill()

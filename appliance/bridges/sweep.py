@@ -1,0 +1,141 @@
+"""A sweep by command, from START to its answer, for bridges that offer it as one thing. In: a Source and what it hears.
+Out: the Answer, or an error that says why there is none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from typing import Protocol
+
+from appliance.bridges.source import STALE_S, Source
+from appliance.client.answers import Answer
+from appliance.core.clock import Clock, SystemClock
+from appliance.core.errors import ApplianceError, CommandRefused, ConfigError, LinkLost, NoAnswer
+
+READY_S = 3.0
+"""Longest wait until the box is ready for START."""
+ABORTED_S = 2.0
+"""Longest wait for the answer to a sweep that was aborted."""
+TURN_S = 0.05
+"""Longest time until it is noticed that nobody wants the answer any more, or that the box is gone."""
+LONGEST_S = 3600.0
+
+
+class Terms(Protocol):
+    """What is wanted: fields as in Sweep.action."""
+
+    new_object: bool
+    slide_s: float
+    timeout_s: float
+
+
+class CommandedSweep:
+    """Carries out one sweep at a time.
+
+    canceled: whether nobody wants the answer any more. say: is called with each phase, `sliding`, `judging`, `early`, the
+    last with the answer.
+    """
+
+    def __init__(
+        self, source: Source, *, canceled: Callable[[], bool], say: Callable[[str, Answer | None], None],
+        clock: Clock | None = None,
+    ) -> None:  # fmt: skip
+        self._source, self._canceled, self._say = source, canceled, say
+        self._clock = clock or SystemClock()
+        self._answers: SimpleQueue[Answer] = SimpleQueue()
+        self._heard_ns = 0
+
+    def hear(self, news: object) -> None:
+        """Take what the source has heard; from any thread."""
+        self._heard_ns = self._clock.now_ns()
+        if isinstance(news, Answer):
+            self._answers.put(news)
+
+    def run(self, terms: Terms) -> Answer:
+        """The answer; it is `aborted` if the sweep was canceled.
+
+        Raises ConfigError for terms that cannot be, CommandRefused, NoAnswer or LinkLost; the box's sweep is then aborted
+        as far as the box can be reached.
+        """
+        check(terms)
+        self._source.wait_ready(READY_S)  # so every earlier sweep is answered, and the next answer is to this one
+        if self._canceled():
+            raise CommandRefused("the sweep was canceled before START")
+        if terms.new_object:
+            self._source.send("NEW")
+        self._forget()
+        try:
+            self._source.send("START")
+            self._say("sliding", None)
+            answer = self._answered(terms)
+        except CommandRefused:  # no sweep of ours is open
+            raise
+        except Exception:  # whatever it is, the box is not left with an open sweep
+            with suppress(ApplianceError):
+                self._source.send("ABORT")
+            raise
+        return answer or self._aborted()
+
+    def _answered(self, terms: Terms) -> Answer | None:
+        """The answer, None if the sweep was canceled; STOP is sent when it is due, or when the answer is there."""
+        begin_ns = self._clock.now_ns()
+        stop_s = terms.slide_s or math.inf
+        stopped = False
+        while not self._canceled():
+            past_s = (self._clock.now_ns() - begin_ns) / 1e9
+            if not stopped and past_s >= stop_s:
+                self._source.send("STOP")
+                stopped = True
+                self._say("judging", None)
+            answer = self._next(min(TURN_S, max(0.0, terms.timeout_s - past_s), TURN_S if stopped else stop_s - past_s))
+            if answer:
+                if answer.early:
+                    self._say("early", answer)
+                if terms.slide_s and not stopped:
+                    with suppress(ApplianceError):  # it causes no answer, and the next START would end the sweep, too
+                        self._source.send("STOP")
+                return answer
+            self._see_that_it_is_there(begin_ns)
+            if past_s >= terms.timeout_s:
+                raise NoAnswer(f"no answer within timeout_s = {terms.timeout_s:g} of START; the sweep was aborted")
+        return None
+
+    def _see_that_it_is_there(self, begin_ns: int) -> None:
+        """Raises LinkLost or NoAnswer once the box is gone."""
+        trouble = self._source.view().trouble
+        if trouble:
+            raise LinkLost(f"the box was lost during the sweep: {trouble}")
+        if self._clock.now_ns() - max(begin_ns, self._heard_ns) > STALE_S * 1e9:
+            raise NoAnswer(f"the box has said nothing for {STALE_S:g} s during the sweep; is it on?")
+
+    def _aborted(self) -> Answer:
+        with suppress(CommandRefused):  # it was answered in this moment
+            self._source.send("ABORT")
+        answer = self._next(ABORTED_S)
+        if answer is None:
+            raise NoAnswer(f"the box did not answer the aborted sweep within {ABORTED_S:g} s")
+        return answer
+
+    def _next(self, limit_s: float) -> Answer | None:
+        try:
+            return self._answers.get(timeout=max(0.0, limit_s))
+        except Empty:
+            return None
+
+    def _forget(self) -> None:
+        while self._next(0):
+            pass
+
+
+def check(terms: Terms) -> None:
+    """Raises ConfigError for times that cannot be."""
+    if not 0 <= terms.slide_s <= LONGEST_S:
+        raise ConfigError(f"slide_s = {terms.slide_s:g} is no time from START to STOP; use 0 to {LONGEST_S:g}")
+    if not terms.slide_s < terms.timeout_s <= LONGEST_S:
+        raise ConfigError(
+            f"timeout_s = {terms.timeout_s:g} is no longest time from START to the answer; use more than slide_s ="
+            f" {terms.slide_s:g}, up to {LONGEST_S:g}"
+        )
