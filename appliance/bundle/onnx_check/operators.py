@@ -70,7 +70,7 @@ OPERATORS: dict[tuple[str, str], Operator] = {
     ("", "ArgMax"): _op(shapes.highest, F, axis=INT, keepdims=INT),
     ("", "Cast"): _op(shapes.cast, ANY, to=INT),
     ("", "Clip"): _op(shapes.clip, (*F, *U8), (*F, *U8), (*F, *U8)),
-    ("", "Concat"): _op(shapes.concat, (*F, *L, "int32"), most=1000, axis=INT),
+    ("", "Concat"): _op(shapes.concat, (*F, *L, *U8, "int32"), most=1000, axis=INT),
     ("", "ConstantOfShape"): _op(shapes.filled, L, value=TENSOR),
     ("", "Conv"): _op(shapes.conv, F, F, F, least=2, strides=INTS, pads=INTS, dilations=INTS, group=INT),
     ("", "DequantizeLinear"): _op(shapes.dequantize, _STEPPED, F, _STEPPED, axis=INT),

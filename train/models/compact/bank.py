@@ -8,9 +8,8 @@ to zero over time on each taxel, so that no offset reaches it, or is free, which
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -155,18 +154,20 @@ class Pooling:
 
 def responses(
     g: GraphBuilder, form: SweepFormat, bank: Bank, x: str, step: float, int8: bool
-) -> list[tuple[str, Stage]]:
-    """Taxels [n, R * C, T] in units of `step` -> for each of `groups` its responses [n, steps, filters], with its Stage.
+) -> tuple[str, list[Stage]]:
+    """Taxels [n, R * C, T] in units of `step` -> responses [n, steps, filters], with the Stage of each of `groups`.
 
-    In int8 a response is a byte, 0 being MIDDLE and 1 the largest.
+    Long filters give fewer responses than short ones; zeros behind the window give them as many, which mean nothing. In
+    int8 a response is a byte, 0 being MIDDLE and 1 the largest.
     """
-    found = []
-    for numbers, dilation in groups(bank):
-        some, shape = bank.take(numbers), stage(form, dilation)
-        y = g("Conv", x, _taps(g, some, step, int8), dilations=[dilation], strides=[shape.stride])
+    found, stages = [], [stage(form, dilation) for _, dilation in groups(bank)]
+    shortest = min(shape.reach for shape in stages)
+    for (numbers, dilation), shape in zip(groups(bank), stages, strict=True):
+        taps, behind = _taps(g, bank.take(numbers), step, int8), [0, shape.reach - shortest]
+        y = g("Conv", x, taps, dilations=[dilation], strides=[shape.stride], pads=behind)
         y = nodes.quantized(g, y, 1 / (MIDDLE - 1), MIDDLE) if int8 else y
-        found.append((g("Transpose", y, perm=[0, 2, 1]), shape))
-    return found
+        found.append(g("Transpose", y, perm=[0, 2, 1]))
+    return nodes.side_by_side(g, found), stages
 
 
 def _taps(g: GraphBuilder, bank: Bank, step: float, int8: bool) -> str:
@@ -180,34 +181,45 @@ def _taps(g: GraphBuilder, bank: Bank, step: float, int8: bool) -> str:
 
 
 def pooled(g: GraphBuilder, form: SweepFormat, bank: Bank, x: str, step: float, how: Pooling) -> list[str]:
-    """Taxels as for `responses` -> log mean magnitudes [1 or rows, 1 or TENTHS, F], and where shares are wanted, those
-    above the thresholds in the same shape."""
-    sizes: list[str] = []
-    shares: list[str] = []
-    for (numbers, _), (y, shape) in zip(groups(bank), responses(g, form, bank, x, step, how.int8), strict=True):
-        counts = nodes.known_steps(shape, form.window, how.tenths)
-        factors = nodes.mean_factors(g, 1.0, counts, len(numbers), how.rowwise)
-        total = partial(nodes.sums, g, steps=shape.steps, counts=counts, integers=how.int8, rowwise=how.rowwise)
-        scale = g.constant(bank.reach[numbers] / (MIDDLE - 1 if how.int8 else 1))
-        mean = g("Mul", g("Mul", _magnitudes(g, y, total, how.int8), factors), scale)
-        sizes.append(g("Log", g("Add", mean, g.constant(FLOOR))))
-        if how.shares:
-            shares.append(g("Mul", _above(g, y, total, bank.limits[numbers], how.int8), factors))
-    return [g("Concat", *parts, axis=2) if len(parts) > 1 else parts[0] for parts in (sizes, shares) if parts]
+    """Taxels as for `responses` -> log mean magnitudes [1, 1 or TENTHS, F], and where shares are wanted, those above the
+    thresholds in the same shape."""
+    y, stages = responses(g, form, bank, x, step, how.int8)
+    counts = np.array([nodes.known_steps(shape, form.window, how.tenths) for shape in stages]).T
+    steps, weights = max(shape.steps for shape in stages), _of_own_group(g, bank, counts)
+
+    def mean(z: str) -> str:
+        """[n, steps, F] -> means over those that each filter has."""
+        total = nodes.sums(g, z, steps, counts, integers=how.int8, rowwise=how.rowwise)
+        total = g(
+            "Reshape", g("Cast", total, to=FLOAT) if how.int8 else total, g.constant([*counts.shape, -1], "int64")
+        )
+        return g("ReduceSum", g("Mul", total, weights), g.constant([1], "int64"))
+
+    size = g("Sub", *map(mean, _sides(g, y))) if how.int8 else mean(g("Abs", y))
+    size = g("Mul", size, g.constant(bank.reach / (MIDDLE - 1 if how.int8 else 1)))
+    found = [g("Log", g("Add", size, g.constant(FLOOR)))]
+    found += [mean(_above(g, y, bank.limits, how.int8))] if how.shares else []
+    return [g("Transpose", part, perm=[1, 0, 2]) for part in found]
 
 
-def _magnitudes(g: GraphBuilder, y: str, total: Callable[[str], str], int8: bool) -> str:
-    """Sums over time of the responses' magnitudes. Bytes are clipped to either side of MIDDLE, whose multiples cancel."""
+def _of_own_group(g: GraphBuilder, bank: Bank, counts: Array) -> str:
+    """What makes means of sums over counts [m, groups] for all filters: [m, groups, F], 0 for other groups'."""
+    number = np.concatenate([np.full(len(filters), i) for i, (filters, _) in enumerate(groups(bank))])
+    own = g("Equal", g.constant(number, "int32"), g.constant(np.arange(counts.shape[1])[:, None], "int32"))
+    factors = g.constant(1 / np.maximum(counts, 1)[:, :, None])  # where nothing is known the sum is 0 as well
+    return g("Mul", g("Cast", own, to=FLOAT), factors)
+
+
+def _sides(g: GraphBuilder, y: str) -> Iterator[str]:
+    """Bytes clipped to above MIDDLE, and to below: the difference of their means is that of magnitudes, for the multiples
+    of MIDDLE cancel."""
+    for side in ((MIDDLE, 255), (0, MIDDLE)):
+        yield g("Clip", y, *(g.constant(end, "uint8") for end in side))
+
+
+def _above(g: GraphBuilder, y: str, limits: Array, int8: bool) -> str:
+    """1 for each response above `limits` [filters], else 0."""
     if not int8:
-        return total(g("Abs", y))
-    sides = ((MIDDLE, 255), (0, MIDDLE))
-    sums = (total(g("Clip", y, *(g.constant(end, "uint8") for end in side))) for side in sides)
-    return g("Sub", *(g("Cast", x, to=FLOAT) for x in sums))
-
-
-def _above(g: GraphBuilder, y: str, total: Callable[[str], str], limits: Array, int8: bool) -> str:
-    """How many responses are above `limits` [filters]."""
-    if not int8:
-        return total(g("Cast", g("Greater", y, g.constant(limits)), to=FLOAT))
+        return g("Cast", g("Greater", y, g.constant(limits)), to=FLOAT)
     over = g("Greater", y, g.constant(np.floor(limits * (MIDDLE - 1)) + MIDDLE, "uint8"))
-    return g("Cast", total(g("Cast", over, to=TensorProto.UINT8)), to=FLOAT)
+    return g("Cast", over, to=TensorProto.UINT8)

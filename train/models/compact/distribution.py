@@ -63,24 +63,27 @@ def fitted(samples: Array, scale: float, rng: np.random.Generator) -> Levels:
     taxels = np.sort(rng.permutation(counts.shape[2])[: MOST_FEATURES // (SIGNALS * FEWEST_LEVELS)])
     x = counts[:, :, taxels].astype(np.float64) * scale
     number = int(np.clip(MOST_FEATURES // (SIGNALS * len(taxels)), FEWEST_LEVELS, MOST_LEVELS))
-    step = stride(window)
-    seen = x[:, ::step] - x[:, ::step].mean(axis=1, keepdims=True), np.diff(x, axis=1)[:, ::step]
+    hop = _looked(window).hop
+    older, newer = x[:, : window - 1 : hop], x[:, 1::hop]
+    seen = older - older.mean(axis=1, keepdims=True), newer - older
     levels = [[_levels(values[:, :, i].ravel(), number) for i in range(len(taxels))] for values in seen]
     return Levels(taxels, np.array(levels, np.float32))
 
 
 def _levels(values: Array, number: int) -> Array:
-    """Quantiles [number] of `values` [n], each moved up to the middle between two of them."""
+    """Quantiles [number] of `values` [n], each moved up to the middle between two of them, or above the largest: a taxel
+    that never moves is at none of its levels."""
     ordered = np.sort(values)
     at = np.quantile(ordered, (np.arange(number) + 0.5) / number, method="lower")
     above = np.searchsorted(ordered, at + max(APART * float(ordered.std()), 1e-12), side="right")
-    levels: Array = (at + ordered[np.minimum(above, len(ordered) - 1)]) / 2
+    levels: Array = (at + np.append(ordered, ordered[-1] + APART)[above]) / 2
     return levels
 
 
-def stride(window: int) -> int:
-    """Frames from one that is looked at to the next."""
-    return max(window // MOST_FRAMES, 1)
+def _looked(window: int) -> Stage:
+    """The frames that are looked at, each with the next one."""
+    hop = max(window // MOST_FRAMES, 1)
+    return Stage(2, hop, (window - 2) // hop + 1, 2, hop)
 
 
 def pooled(
@@ -90,26 +93,24 @@ def pooled(
     [1, 1 or TENTHS, len(some)]: of each signal, taxel and level. int8: whether frames are counted in integers."""
     if len(some.taxels) < form.channels:
         x = g("Gather", x, g.constant(some.taxels, "int64"), axis=1)
-    parts = [_shares(g, form.window, levels / step, x, lag, int8, tenths) for lag, levels in enumerate(some.levels)]
-    return g("Concat", *parts, axis=2)
-
-
-def _shares(g: GraphBuilder, window: int, levels: Array, x: str, lag: int, int8: bool, tenths: bool) -> str:
-    """Taxels [n, C, T] -> shares [1, 1 or TENTHS, C * k] of the frames above `levels` [C, k]. lag: 0 for counts about their
-    mean, 1 for differences between neighbouring frames."""
-    hop, taxels = stride(window), len(levels)
-    looked = Stage(1 + lag, hop, (window - 1 - lag) // hop + 1, 1 + lag, hop)
-    counts = nodes.known_steps(looked, window, tenths)
+    looked, taxels = _looked(form.window), len(some.taxels)
+    counts = nodes.known_steps(looked, form.window, tenths)
     total = partial(nodes.sums, g, steps=looked.steps, counts=counts, rowwise=tenths)
-    newer, older = (
-        g("Slice", x, *(g.constant([n], "int64") for n in (at, window - lag + at, 2, hop))) for at in (lag, 0)
+    older, newer = (
+        g("Slice", x, *(g.constant([n], "int64") for n in (at, form.window - 1 + at, 2, looked.hop))) for at in (0, 1)
     )
-    y = g("Transpose", g("Sub", newer, older) if lag else older, perm=[0, 2, 1])
-    if not lag:
-        y = g("Sub", y, g("Mul", total(y), nodes.mean_factors(g, 1.0, counts, taxels, tenths)))
-    above = g("Greater", g("Reshape", y, g.constant([0, 0, 0, 1], "int64")), g.constant(levels))
-    above = g("Reshape", above, g.constant([0, 0, -1], "int64"))
-    above = total(g("Cast", above, to=TensorProto.UINT8 if int8 else FLOAT), integers=int8)
+    changes, older = (g("Transpose", signal, perm=[0, 2, 1]) for signal in (g("Sub", newer, older), older))
+    if tenths:  # each tenth has means of its own
+        changes = g("Expand", changes, g.constant([TENTHS, looked.steps, taxels], "int64"))
+    about = g("Sub", older, g("Mul", total(older), nodes.mean_factors(g, 1.0, counts, taxels, tenths)))
+    y = g("Transpose", nodes.side_by_side(g, [about, changes]), perm=[0, 2, 1])
+    # a level is compared with a whole row of frames, which is four times as fast as a frame with a row of levels
+    levels = some.levels.reshape(SIGNALS * taxels, -1, 1) / step
+    above = g("Greater", g("Reshape", y, g.constant([0, 0, 1, -1], "int64")), g.constant(levels))
+    above = g(
+        "Reshape", g("Cast", above, to=TensorProto.UINT8 if int8 else FLOAT), g.constant([0, len(some), -1], "int64")
+    )
+    above = total(above, integers=int8, time_last=True)
     shares = g("Cast", above, to=FLOAT) if int8 else above
-    shares = g("Mul", shares, nodes.mean_factors(g, 1.0, counts, levels.size, tenths))
+    shares = g("Mul", shares, nodes.mean_factors(g, 1.0, counts, len(some), tenths))
     return g("Reshape", shares, g.constant([1, TENTHS, -1], "int64")) if tenths else shares

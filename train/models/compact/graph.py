@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,17 @@ from train.onnx_tools.graph_builder import GraphBuilder
 from train.onnx_tools.quantize import PERCENTILE
 
 Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Taxels as the first convolution takes them. x: their values [n, R * C, T] in units of `step`. rounded: the bytes
+    [n, T, R * C] that these come from, "" where they were not rounded; zero: the byte that stands for 0."""
+
+    x: str
+    step: float
+    rounded: str = ""
+    zero: int = 0
 
 
 @dataclass(frozen=True)
@@ -63,27 +75,27 @@ def trunk_graph(
     g, parts = GraphBuilder(), []
     raw = g("Reshape", "sweep", g.constant([1, form.window, form.channels], "int64"))
     attenuation = _attenuation(g, raw, form)
-    if architecture.channels:
-        x, step = _prepared(g, form, scale, architecture, raw, attenuation, ranges, tenths)
-        parts.append(_log_means(g, form, architecture, weights, x, step, ranges, tenths))
     own = ranges if form.dtype == "uint8" else None  # a byte does not hold wider counts, see decision 11
-    if architecture.pools or architecture.distribution:
-        x, step = _prepared(g, form, scale, architecture, raw, attenuation, own, tenths)
+    prepared = cache(lambda some: _prepared(g, form, scale, architecture, raw, attenuation, some, tenths))
+    if architecture.channels:
+        parts.append(_log_means(g, form, architecture, weights, prepared(ranges), ranges, tenths))
     if architecture.pools:
         rowwise = tenths and not architecture.zero_sum(form.window)
         asked = bank.Pooling(own is not None, architecture.pools > 1, tenths, rowwise)
-        pooled = bank.pooled(g, form, bank.Bank.of(weights), x, step, asked)
-        parts += [g("Reshape", part, g.constant([1, TENTHS, -1], "int64")) for part in pooled] if rowwise else pooled
+        parts += bank.pooled(g, form, bank.Bank.of(weights), prepared(own).x, prepared(own).step, asked)
     if architecture.distribution:
-        levels, unit = distribution.Levels.of(weights), step if own is None else 1.0
-        parts.append(distribution.pooled(g, form, levels, x, unit, own is not None, tenths))
+        taxels = prepared(own)
+        # whole numbers, whose sums are exact in floats: all machines find the same frames above a level
+        x = nodes.channels_first(g, taxels.rounded, 1.0, taxels.zero) if taxels.rounded else taxels.x
+        some = distribution.Levels.of(weights)
+        parts.append(distribution.pooled(g, form, some, x, taxels.step, own is not None, tenths))
     if keep_means:
         counts = nodes.known_steps(nodes.frames(form.window), form.window, tenths)
         parts.append(g("Mul", _levels(g, g("Cast", raw, to=FLOAT), form, counts), g.constant(scale)))
     if architecture.spectrum:
         parts.append(spectrum.nodes(g, raw, attenuation, form, scale, tenths))
     size = max(part.stop for part in layout(form, weights, architecture, keep_means).values())
-    features = g("Concat", *parts, axis=2) if len(parts) > 1 else parts[0]
+    features = nodes.side_by_side(g, parts)
     shape = [1, TENTHS, size] if tenths else [1, size]
     output = g("Reshape", features, g.constant(shape, "int64"), output="tenths" if tenths else "features")
     return g.model(form, output, *shape[1:])
@@ -105,12 +117,12 @@ def layout(
 
 
 def _log_means(
-    g: GraphBuilder, form: SweepFormat, architecture: Architecture, weights: Mapping[str, Array], x: str, step: float,
+    g: GraphBuilder, form: SweepFormat, architecture: Architecture, weights: Mapping[str, Array], taxels: Prepared,
     ranges: Ranges | None, tenths: bool,
 ) -> str:  # fmt: skip
-    """The stages on [n, R * C, T], in units of `step`: log mean responses [1, 1 or TENTHS, sum of channels]."""
+    """The stages: log mean responses [1, 1 or TENTHS, sum of channels]."""
     zero_sum, sums, factors = architecture.zero_sum(form.window), [], []
-    rowwise = tenths and not zero_sum
+    rowwise, x, step = tenths and not zero_sum, taxels.x, taxels.step
     stages, channels = architecture.stages(form.window), architecture.channels
     for i, (stage, size) in enumerate(zip(stages, channels, strict=True)):
         w, b = weights[f"convs.{i}.weight"], weights[f"convs.{i}.bias"]
@@ -122,14 +134,14 @@ def _log_means(
             step = ranges.responses[i] / 255
             response = nodes.quantized(g, y, step)
             if i < len(channels) - 1:  # after the last stage nothing would use it, and onnxruntime would still run it
-                x = g("DequantizeLinear", response, g.constant(step), g.constant(0, "uint8"))
+                x = nodes.counts_of(g, response, step)
         counts = nodes.known_steps(stage, form.window, tenths)
         over_time = g("Transpose", response, perm=[0, 2, 1])
         sums.append(nodes.sums(g, over_time, stage.steps, counts, ranges is not None, rowwise))
         factors.append(nodes.mean_factors(g, step, counts, size, rowwise))
-    total = g("Concat", *sums, axis=2)
+    total = nodes.side_by_side(g, sums)
     total = g("Cast", total, to=FLOAT) if ranges else total
-    log = g("Log", g("Add", g("Mul", total, g("Concat", *factors, axis=2)), g.constant(FLOOR)))
+    log = g("Log", g("Add", g("Mul", total, nodes.side_by_side(g, factors)), g.constant(FLOOR)))
     return g("Reshape", log, g.constant([1, TENTHS, sum(channels)], "int64")) if rowwise else log
 
 
@@ -142,27 +154,31 @@ def _prepared(
     attenuation: str,
     ranges: Ranges | None,
     tenths: bool,
-) -> tuple[str, float]:
-    """Raw counts [1, T, R * C] -> ([1, R * C, T], the factor that is left to the first convolution's weights).
+) -> Prepared:
+    """Raw counts [1, T, R * C] -> taxels in units of what is left to the first convolution's weights.
 
     Bytes stay bytes where the kernels sum to zero. From other counts the level is subtracted; where that is the mean of
     the whole window, and tenths are wanted, each tenth has a level and a row of its own: [TENTHS, R * C, T].
     """
     zero_sum = architecture.zero_sum(form.window)
     if form.dtype == "uint8" and zero_sum and ranges:
-        return nodes.channels_first(g, _attenuated_bytes(g, raw, attenuation, form, scale), scale, 0), scale
+        return _rounded(g, _attenuated_bytes(g, raw, attenuation, form, scale), scale, 0)
     x = g("Cast", raw, to=FLOAT)
     if form.dtype == "uint8" and zero_sum:
-        return g("Transpose", g("Mul", x, attenuation), perm=[0, 2, 1]), scale
+        return Prepared(g("Transpose", g("Mul", x, attenuation), perm=[0, 2, 1]), scale)
     rowwise = tenths and not zero_sum
     frames = [level_frames(form.window, architecture)]
     counts = nodes.known_steps(nodes.frames(form.window), form.window, tenths) if rowwise else frames
     x = g("Sub", x, _levels(g, x, form, counts, rowwise))
     x = g("Mul", x, g("Mul", attenuation, g.constant(scale)))
     if ranges is None:
-        return g("Transpose", x, perm=[0, 2, 1]), 1.0
+        return Prepared(g("Transpose", x, perm=[0, 2, 1]), 1.0)
     step = ranges.digits * scale / (MIDDLE - 1)
-    return nodes.channels_first(g, nodes.quantized(g, x, step, MIDDLE), step, MIDDLE), step
+    return _rounded(g, nodes.quantized(g, x, step, MIDDLE), step, MIDDLE)
+
+
+def _rounded(g: GraphBuilder, rounded: str, step: float, zero: int) -> Prepared:
+    return Prepared(nodes.channels_first(g, rounded, step, zero), step, rounded, zero)
 
 
 def _attenuation(g: GraphBuilder, raw: str, form: SweepFormat) -> str:
@@ -183,9 +199,8 @@ def _attenuated_bytes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFo
     """Bytes [1, T, R * C] times `attenuation` [1, 1, R * C], as bytes; exact where that is 1."""
     quantized = nodes.quantized(g, attenuation, 1 / 255)
     expanded = g("Expand", quantized, g.constant([1, form.window, form.channels], "int64"))
-    factors = g("DequantizeLinear", expanded, g.constant(1 / 255), g.constant(0, "uint8"))
-    counts = g("DequantizeLinear", raw, g.constant(scale), g.constant(0, "uint8"))
-    return nodes.quantized(g, g("Mul", counts, factors), scale)
+    product = g("Mul", nodes.counts_of(g, raw, scale), nodes.counts_of(g, expanded, 1 / 255))
+    return nodes.quantized(g, product, scale)
 
 
 def _levels(g: GraphBuilder, x: str, form: SweepFormat, counts: list[int], rowwise: bool = False) -> str:
@@ -204,8 +219,8 @@ def bank_responses(
     for numbers, _ in bank.groups(filters):
         g = GraphBuilder()
         raw = g("Reshape", "sweep", g.constant([1, form.window, form.channels], "int64"))
-        x, step = _prepared(g, form, scale, architecture, raw, _attenuation(g, raw, form), None, False)
-        ((y, stage),) = bank.responses(g, form, filters.take(numbers), x, step, False)
+        taxels = _prepared(g, form, scale, architecture, raw, _attenuation(g, raw, form), None, False)
+        y, (stage,) = bank.responses(g, form, filters.take(numbers), taxels.x, taxels.step, False)
         g("Identity", y, output="responses")
         yield numbers, g.model(form, "responses", stage.steps, len(numbers))
 

@@ -5,10 +5,11 @@ Integers go up to the sums over time, so that all machines give the same bits th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from onnx import TensorProto
 
 from train.models.compact import spectrum
@@ -31,9 +32,14 @@ def quantized(g: GraphBuilder, x: str, step: float, zero: int = 0) -> str:
     return g("QuantizeLinear", x, g.constant(step), g.constant(zero, "uint8"))
 
 
+def counts_of(g: GraphBuilder, x: str, step: float, zero: int = 0) -> str:
+    """The values that bytes stand for, in units of `step`."""
+    return g("DequantizeLinear", x, g.constant(step), g.constant(zero, "uint8"))
+
+
 def channels_first(g: GraphBuilder, x: str, step: float, zero: int) -> str:
     """Bytes [n, T, R * C] -> the values they stand for [n, R * C, T]."""
-    return g("DequantizeLinear", g("Transpose", x, perm=[0, 2, 1]), g.constant(step), g.constant(zero, "uint8"))
+    return counts_of(g, g("Transpose", x, perm=[0, 2, 1]), step, zero)
 
 
 def int8_weights(g: GraphBuilder, weight: Array, bias: Array, step: float, zero_sum: bool) -> tuple[str, str]:
@@ -79,18 +85,23 @@ def known_steps(stage: Stage, window: int, tenths: bool) -> list[int]:
     return [max((end - stage.reach) // stage.hop + 1, 0) for end in ends]
 
 
-def sums(g: GraphBuilder, x: str, steps: int, counts: list[int], integers: bool = False, rowwise: bool = False) -> str:
-    """[1, steps, C] -> sums over the first `counts` of them, of integers or floats: [1, len(counts), C].
+def sums(
+    g: GraphBuilder, x: str, steps: int, counts: ArrayLike, integers: bool = False, rowwise: bool = False, time_last: bool = False
+) -> str:  # fmt: skip
+    """[1, steps, C] -> sums over the first `counts` of them, of integers or floats: [1, number of counts, C].
 
-    rowwise: [len(counts), steps, C] -> [len(counts), 1, C], each over a row of its own. The matrix of ones and zeros is
-    computed from two numbers when the box loads the graph; as a constant it would be large.
+    rowwise: [m, steps, C], `counts` of m rows -> [m, counts in a row, C]. time_last: of [..., C, steps]. The matrix of ones
+    and zeros is computed from a few numbers when the box loads the graph; as a constant it would be large.
     """
     at = g("Reshape", g("Range", *(g.constant(n, "int32") for n in (0, steps, 1))), g.constant([1, steps], "int64"))
-    known = g("Less", at, g.constant(np.array(counts)[:, None], "int32"))
-    if rowwise:
-        known = g("Reshape", known, g.constant([len(counts), 1, steps], "int64"))
+    counts = np.asarray(counts)
+    known = g("Less", at, g.constant(counts.reshape((len(counts), -1, 1) if rowwise else (-1, 1)), "int32"))
     ones = g("Cast", known, to=TensorProto.UINT8 if integers else FLOAT)
-    return g("MatMulInteger" if integers else "MatMul", ones, x)
+    product = "MatMulInteger" if integers else "MatMul"
+    if not time_last:
+        return g(product, ones, x)
+    ones = g("Transpose", ones, perm=[0, 2, 1] if rowwise else [1, 0])
+    return g("Transpose", g(product, x, ones), perm=[0, 2, 1])
 
 
 def mean_factors(g: GraphBuilder, step: float, counts: list[int], size: int, rowwise: bool = False) -> str:
@@ -99,3 +110,8 @@ def mean_factors(g: GraphBuilder, step: float, counts: list[int], size: int, row
     lead = (len(counts), 1) if rowwise else (1, len(counts))
     factors = factors.reshape(*lead, 1) if len(counts) > 1 else factors[0]
     return g("Expand", g.constant(factors), g.constant([*lead, size], "int64"))
+
+
+def side_by_side(g: GraphBuilder, parts: Sequence[str]) -> str:
+    """Values [n, m, C], their C one after another."""
+    return g("Concat", *parts, axis=2) if len(parts) > 1 else parts[0]
