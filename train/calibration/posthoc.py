@@ -212,7 +212,7 @@ def assemble_model(
         # [1, D, r] -> [D, 1, r]: one head for each row
         rows = add("Slice", z, np.array([0]), np.array([count]), np.array([1]), output="head.first")
         rows = add("Transpose", rows, output="head.rows", perm=[1, 0, 2])
-        rows = add("MatMul", rows, steps.weight, output="head.steps")
+        rows = add("MatMul", rows, _sixteen_bits(add, steps.weight, "early.weight"), output="head.steps")
         add("Transpose", add("Add", rows, steps.bias[:, None], output="head.said"), output="early", perm=[1, 0, 2])
         outputs["early"] = [1, count, len(bias)]
     if known:
@@ -236,8 +236,8 @@ def _embedded(add: Callable[..., str], embedding: Embedding, x: str, axis: int, 
 
 
 def _sixteen_bits(add: Callable[..., str], matrix: Array, name: str) -> str:
-    """A matrix [F, n] in 16 bits, a step for each column: half the bytes of what is largest in a bundle. onnxruntime turns
-    it into floats once, when it opens the model."""
+    """Matrices [F, n] or [D, F, n] in 16 bits, as quantize.sixteen_bits has them: half the bytes of what is largest in a
+    bundle. onnxruntime turns them into floats once, when it opens the model."""
     whole, steps = sixteen_bits(matrix)
     return add("Mul", add("Cast", whole, output=f"{name}.whole", to=TensorProto.FLOAT), steps, output=name)
 

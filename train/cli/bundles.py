@@ -81,6 +81,8 @@ def _add_fit(add: Add) -> None:
                      help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
     command.add_argument("--stretch", type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"), metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
+    command.add_argument("--reattached", action="store_true",
+                     help="the skin will be taken off and put back after the recordings: all heads see copies that look so")  # fmt: skip
     command.add_argument(
         "--size",
         choices=[*ARCHITECTURES, "chosen"],
@@ -162,6 +164,10 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
     augmentation = replace(default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes)
     unfinished = _unfinished(args, sweeps, augmentation)
     if args.size in ARCHITECTURES:
+        if args.reattached:
+            raise FormatError(
+                f"--reattached is for the default recipe; --size {args.size} sees such copies anyway, leave it out"
+            )
         if args.steps < LEAST_STEPS:
             raise FormatError(
                 f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with --size {args.size}"
@@ -174,7 +180,7 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
         raise FormatError(
             f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default recipe removes means"
         )
-    settings = recipe.Settings(args.steps, augmentation, unfinished=unfinished)
+    settings = recipe.Settings(args.steps, augmentation, unfinished=unfinished, reattached=args.reattached)
     made = recipe.fit(sweeps, args.seed, settings, options.Log())
     print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
     return made, unfinished

@@ -21,7 +21,8 @@ PERCENTILE = 99.9
 
 
 def sixteen_bits(matrix: Array) -> tuple[Array, Array]:
-    """(int16 [F, n], steps float32 [n]) of a matrix [F, n]: a step for each column. Their product is the matrix, rounded."""
+    """(int16 [F, ...], steps float32 [...]) of a matrix [F, ...]: a step for all along the first axis. Their product is the
+    matrix, rounded."""
     steps = np.maximum(np.abs(matrix).max(axis=0) / np.iinfo(np.int16).max, np.finfo(np.float32).tiny).astype(
         np.float32
     )

@@ -204,8 +204,10 @@ def pooled(g: GraphBuilder, form: SweepFormat, bank: Bank, x: str, step: float, 
 
 def _of_own_group(g: GraphBuilder, bank: Bank, counts: Array) -> str:
     """What makes means of sums over counts [m, groups] for all filters: [m, groups, F], 0 for other groups'."""
-    number = np.concatenate([np.full(len(filters), i) for i, (filters, _) in enumerate(groups(bank))])
-    own = g("Equal", g.constant(number, "int32"), g.constant(np.arange(counts.shape[1])[:, None], "int32"))
+    ends = np.cumsum([len(numbers) for numbers, _ in groups(bank)])[:, None]
+    at = g("Range", *(g.constant(n, "int32") for n in (0, len(bank), 1)))
+    own = g("Not", g("Less", at, g.constant(np.append(0, ends[:-1])[:, None], "int32")))
+    own = g("And", own, g("Less", at, g.constant(ends, "int32")))
     factors = g.constant(1 / np.maximum(counts, 1)[:, :, None])  # where nothing is known the sum is 0 as well
     return g("Mul", g("Cast", own, to=FLOAT), factors)
 

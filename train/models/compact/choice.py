@@ -133,6 +133,7 @@ def choose(
     levels: Array,
     bands: Array,
     log: Callable[[str], None],
+    always_copies: bool = False,
 ) -> Judged:
     """The candidate with the least loss, where it is `better` than the usual one; else the usual one.
 
@@ -141,7 +142,8 @@ def choose(
     spectrum. An average is seldom worse than the better of two, and no held-out part need show which that is. Whether
     magnitudes are enough is chosen first; then whether all see the spectrum and copies, or the spectrum is enough alone.
     kinds: filters [n] of each kind. pools: the features [F] of every filter's magnitude, then of its share. levels,
-    bands: numbers of the features of the distribution and of the spectrum, which may be none.
+    bands: numbers of the features of the distribution and of the spectrum, which may be none. always_copies: only
+    candidates whose discriminants all see augmented copies are there, as held-out sweeps cannot show what these are for.
     """
 
     def judged(named: str, parts: Sequence[HeadPart]) -> Judged:
@@ -151,7 +153,7 @@ def choose(
     def best(of: Sequence[Judged]) -> Judged:
         return min(of, key=court.loss)
 
-    sizes, shares = (views(kinds, pools[:n]) for n in (1, 2))
+    sizes, shares = (views(kinds, pools[:n], always_copies) for n in (1, 2))
     usual = [*sizes, *_with(shares, bands), *(_with(sizes, np.append(levels, bands)) if len(levels) else ())]
     plain = [judged("magnitudes, shares, distribution", usual), judged("magnitudes", sizes)]
     first = best(plain).plan.parts
@@ -159,13 +161,13 @@ def choose(
     if len(bands):
         seen |= {
             "with the spectrum": _with(first, bands),
-            "the spectrum alone": [HeadPart(tuple(bands.tolist()), False)],
+            "the spectrum alone": [HeadPart(tuple(bands.tolist()), always_copies)],
         }
     more = [
         judged(f"{name}{', with copies' * copies}", [replace(part, copies=copies) for part in parts])
         for name, parts in seen.items()
-        for copies in (False, True)
-        if copies or name != "without more of the spectrum"
+        for copies in sorted({always_copies, True})
+        if copies != always_copies or name != "without more of the spectrum"
     ]
     chosen = best([*plain, *more])
     return chosen if court.better(chosen, plain[0]) else plain[0]
@@ -193,6 +195,6 @@ def fewer(court: Court, chosen: Judged, filters: Array, least: int, log: Callabl
     return chosen
 
 
-def views(kinds: Sequence[Array], pools: Sequence[Array]) -> list[HeadPart]:
+def views(kinds: Sequence[Array], pools: Sequence[Array], copies: bool = False) -> list[HeadPart]:
     """A discriminant for each of `kinds`, filters [n] that are pooled in some ways."""
-    return [HeadPart(tuple(np.concatenate([pool[filters] for pool in pools]).tolist()), False) for filters in kinds]
+    return [HeadPart(tuple(np.concatenate([pool[filters] for pool in pools]).tolist()), copies) for filters in kinds]

@@ -49,12 +49,14 @@ FIXED = Architecture((), planned=len(STAGES.channels), fewest=0)
 class Settings:
     """What a user may set. steps: of the training of stages; 0 to try none. augmentation: None for the usual one. choose:
     whether anything is chosen; else all zero-sum filters are seen by one discriminant. unfinished: a file that keeps the
-    training of stages from time to time, from which it goes on with the same bits."""
+    training of stages from time to time, from which it goes on with the same bits. reattached: the skin will be taken off
+    and put back after these recordings, so that all heads see augmented copies, which look so."""
 
     steps: int = 600
     augmentation: Augmentation | None = None
     choose: bool = True
     unfinished: Path | None = None
+    reattached: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     known, classes = _known(fixed, sweeps, changed), len(sweeps.materials)
     parts = inner_parts(sweeps)
     court = Court([known] * len(parts), parts, classes)
-    judged, stages = _choose(court, fixed, settings.choose, log), None
+    judged, stages = _choose(court, fixed, settings, log), None
     out, by = _held_out(sweeps, seed)
     train, held = (sweeps.take(~out), sweeps.take(out)) if by != "nothing" else (sweeps, sweeps)
     wanted = settings.steps and len(sweeps) >= LEAST_SWEEPS and court.accuracy(judged) < ENOUGH
@@ -106,7 +108,7 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
         weight, bias = plan.fit(_known(trunk, sweeps, changed, int8).given(), classes)
         heads |= {f"{name}.weight": weight - weight.mean(axis=0), f"{name}.bias": bias - bias.mean()}
     about = {
-        "seed": seed, "recipe": {"scene": vars(augmentation), "steps": settings.steps, "keep_means": False},
+        "seed": seed, "recipe": {"scene": vars(augmentation), "steps": settings.steps, "keep_means": False, "reattached": settings.reattached},
         "held_out_by": by, "chosen": describe(trunk, plan), "validation": _validation(court, judged),
     }  # fmt: skip
     return Fit(
@@ -143,7 +145,7 @@ def fixed_trunk(sweeps: Dataset, seed: int) -> Trunk:
     return Trunk(sweeps, scale, weights, architecture, ranges)
 
 
-def _choose(court: Court, trunk: Trunk, choosing: bool, log: Log) -> Judged:
+def _choose(court: Court, trunk: Trunk, settings: Settings, log: Log) -> Judged:
     """choice.choose for a trunk with the whole bank; the usual candidate where there is no choosing."""
     layout, filters = trunk.layout(), Bank.of(trunk.weights)
     *pools, levels, bands = (
@@ -151,9 +153,9 @@ def _choose(court: Court, trunk: Trunk, choosing: bool, log: Log) -> Judged:
         for name in ("sizes", "shares", "levels", "bands")
     )
     kinds = [which for free in (False, True) if len(which := np.flatnonzero(filters.free == free))]
-    if not choosing:
+    if not settings.choose:
         return court.judge(choice.views([np.flatnonzero(~filters.free)], pools))
-    chosen = choice.choose(court, kinds, pools, levels, bands, log)
+    chosen = choice.choose(court, kinds, pools, levels, bands, log, settings.reattached)
     number = np.full(max(part.stop for part in layout.values()), -1)
     for pool in pools:
         number[pool] = np.arange(len(pool))

@@ -114,8 +114,8 @@ def _wave_nodes(g: GraphBuilder, length: int, mains: float) -> str:
     phase = g("Cast", g("Mod", g("Mul", n, k), g.constant(2 * length, "int64")), to=TensorProto.FLOAT)
     phase = g("Mul", phase, g.constant(np.pi / length))
     waves = g("Mul", g("Concat", g("Cos", phase), g("Sin", phase), axis=1), g.constant(_window(length)))
-    unwanted = _unwanted(length, mains)
-    removed = g("MatMul", g.constant(unwanted), g("MatMul", g.constant(unwanted.T), waves))
+    unwanted = g.constant(_unwanted(length, mains))
+    removed = g("MatMul", unwanted, g("MatMul", g("Transpose", unwanted, perm=[1, 0]), waves))
     return g("Sub", waves, removed)
 
 

@@ -188,6 +188,15 @@ def test_candidates_are_what_the_features_allow():
     assert {part.columns for part in chosen.plan.parts} == {(0,), (0, 2)}
 
 
+def test_every_discriminant_sees_copies_where_these_are_wanted():
+    """Fewer candidates: none is there without."""
+    tried: list[str] = []
+    kinds, pools = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3]))
+    chosen = choice.choose(court(), kinds, pools, np.arange(0), np.array([4]), tried.append, True)
+    assert all(part.copies for part in chosen.plan.parts)
+    assert len(tried) == len(set(tried)) == 2 + 2
+
+
 def test_the_usual_one_sees_each_kind_three_times():
     """Magnitudes; with shares and the spectrum; with the distribution and the spectrum: no feature twice in one."""
     given, parts = known()

@@ -53,6 +53,27 @@ def test_the_trunk_holds_what_the_heads_see_and_no_more(fitted: Fit):
     assert not Bank.of(usual.weights).free.any()
 
 
+def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: Fit):
+    """The command's option: all discriminants see copies, which else the held-out parts of the easy set do not ask for."""
+    easy().save(tmp_path / "easy.npz")
+    fit = [
+        "fit",
+        "--set",
+        str(tmp_path / "easy.npz"),
+        "--seed",
+        "1",
+        "--steps",
+        "0",
+        "--out",
+        str(tmp_path / "fit.npz"),
+    ]
+    assert main([*fit, "--reattached"]) == 0
+    made = Fit.load(tmp_path / "fit.npz")
+    assert made.about["recipe"]["reattached"]
+    assert all(part.copies for part in made.plan.parts)
+    assert not any(part.copies for part in fitted.plan.parts)
+
+
 def test_int8_and_float_agree(fitted: Fit):
     """Each with a head of its own."""
     forms = [with_head(fitted.trunk(int8), *(fitted.weights[f"{name}.{part}"] for part in ("weight", "bias")))
