@@ -2,16 +2,14 @@
 
 import sys
 
+from appliance.core.interrupts import during_imports
+
 
 def main() -> int:
     """Run one command; its exit code."""
-    try:
-        from train.cli import main as command  # here: imports take seconds, in which Ctrl-C may come
-
-        return command.main()
-    except KeyboardInterrupt:
-        print("palpate-train: interrupted before anything was done", file=sys.stderr)
-        return 130
+    with during_imports("palpate-train"):
+        from train.cli.main import main as command  # here: imports take seconds
+    return command()
 
 
 if __name__ == "__main__":

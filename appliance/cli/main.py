@@ -9,7 +9,7 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -24,6 +24,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.interrupts import INTERRUPTED
 from appliance.core.log import to_stderr
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from appliance.sim.devices import RobotDevices, SimDevices
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; its exit code."""
     args = parser(RUNS).parse_args(argv)
     to_stderr()
@@ -48,7 +49,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"palpate: {e}", file=sys.stderr)
         return e.exit_code
     except KeyboardInterrupt:
-        return 130
+        print("palpate: interrupted", file=sys.stderr)
+        return INTERRUPTED
     except BrokenPipeError:
         # nobody reads standard output any more, so nothing must be written to it, not even at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from appliance.core.errors import ApplianceError
+from appliance.core.interrupts import INTERRUPTED, during_imports
 from train.metrics import score
 
 GROUPS = {
@@ -28,7 +29,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = argparse.Namespace()
     try:
         words = sys.argv[1:] if argv is None else list(argv)
-        args = parser(words[0] if words else "").parse_args(words)
+        with during_imports("palpate-train"):
+            known = parser(words[0] if words else "")
+        args = known.parse_args(words)
         score.provenance()  # read once, now: the code that runs is of this commit
         args.run(args)
         sys.stdout.flush()
@@ -43,11 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"palpate-train: {e.filename}: {e.strerror}", file=sys.stderr)
         return ApplianceError.exit_code
     except KeyboardInterrupt:
-        if not hasattr(args, "run"):
-            raise  # during the imports
         kept = "goes on where it was" if getattr(args, "resumes", hasattr(args, "cache")) else "begins anew"
         print(f"palpate-train: interrupted; the same command {kept}", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     return 0
 
 

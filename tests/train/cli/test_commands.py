@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -16,7 +15,6 @@ import pytest
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
 from appliance.core.errors import FormatError
-from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import easy
 from train.cli import bundles
 from train.cli.main import GROUPS, main
@@ -147,17 +145,6 @@ def test_an_interrupted_command_says_what_becomes_of_it(
     monkeypatch.setattr(pull, "pull", interrupt)
     assert main(args) == 130
     assert capsys.readouterr().err == f"palpate-train: interrupted; {message}\n"
-
-
-@pytest.mark.slow
-def test_ctrl_c_during_the_imports_is_one_line(tmp_path: Path):
-    """The first seconds of the program, before it has read its arguments."""
-    (tmp_path / "torch.py").write_text("raise KeyboardInterrupt\n")
-    (tmp_path / "sklearn.py").write_text("raise KeyboardInterrupt\n")
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    command = [sys.executable, "-m", "train", "methods"]
-    done = subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (130, "palpate-train: interrupted before anything was done\n")
 
 
 @pytest.mark.parametrize(("labels", "told"), [(15, False), (16, True)])
