@@ -32,9 +32,10 @@ RETRY_NS = 1_000_000_000
 
 
 class Port(Protocol):
-    """A line to the robot controller: verdicts and other sentences out, commands in. dropped: sentences that were not
-    sent. trouble: why the line does not work, "" where it does."""
+    """A line to the robot controller: verdicts and other sentences out, commands in. name: of the port, for a person.
+    dropped: sentences that were not sent. trouble: why the line does not work, "" where it does."""
 
+    name: str
     dropped: int
     trouble: str
 
@@ -105,7 +106,7 @@ class StdoutPort:
     """
 
     def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
-        self.dropped, self.trouble, self._source, self._commands = 0, "", source, commands
+        self.name, self.dropped, self.trouble, self._source, self._commands = "standard output", 0, "", source, commands
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
         """Print a verdict's sentence."""
@@ -134,8 +135,7 @@ class SerialSink:
     def __init__(
         self, config: SerialConfig, clock: Clock, source: str, opener: Callable[..., Any] = serial.Serial
     ) -> None:
-        self.dropped = 0
-        self.trouble = ""
+        self.name, self.dropped, self.trouble = config.port, 0, ""
         self._config, self._clock, self._source, self._opener = config, clock, source, opener
         self._port: Any = None
         self._retry_ns = clock.now_ns()

@@ -37,11 +37,14 @@ TARGET = 10
 """Sweeps that are wanted of each material at each position, where nothing else is asked for."""
 MOST_CHANGES = 1024
 """Number of label changes that are kept until the sweeps before them are answered; far more than a person makes."""
-_KEPT = re.compile(rf"sweep-([0-9]+)\.(?:npy|json)({re.escape(storage.PART)})?")
+DISCARDED = ".discarded"
+"""Suffix of what is left of a discarded sweep, so that its number is not used again: its sidecar under another name, since
+a rename needs no space. It goes when a later number is in use."""
+_KEPT = re.compile(rf"sweep-([0-9]+)(\.npy|\.json|{re.escape(DISCARDED)})({re.escape(storage.PART)})?")
 
 
 class SweepFolder:
-    """A folder of sweeps with their verdicts. Numbers continue after a restart; no file is overwritten.
+    """A folder of sweeps with their verdicts. Numbers continue after a restart, and none is used twice.
 
     Unfinished files of a program that was killed are removed. One program at a time uses the folder; its lock ends with
     the program. numbers: of the sweeps in the folder, in order. run: the number of this run's sweep 0; sidecars hold
@@ -66,11 +69,18 @@ class SweepFolder:
         self.numbers.append(number)
         return number
 
-    def remove(self, number: int) -> None:
-        """Remove a sweep, its .npy first, so that none is ever without its sidecar. Raises OSError."""
+    def remove(self, number: int, *, reserve: bool = False) -> None:
+        """Remove a sweep, its .npy first, so that none is ever without its sidecar. Raises OSError.
+
+        reserve: its number is not used again after a restart, although it was the highest.
+        """
         path = self.path(number)
         path.unlink(missing_ok=True)
-        path.with_suffix(".json").unlink(missing_ok=True)
+        with suppress(FileNotFoundError):
+            if reserve:
+                path.with_suffix(".json").replace(path.with_suffix(DISCARDED))
+            else:
+                path.with_suffix(".json").unlink()
         storage.sync(self.folder)
         self.numbers.remove(number)
 
@@ -88,11 +98,12 @@ class SweepFolder:
         except BlockingIOError as e:
             raise BlockingIOError(e.errno, "another program keeps sweeps there", str(self.folder)) from e
         names = [name for path in self.folder.iterdir() if (name := _KEPT.fullmatch(path.name))]
-        for unfinished in (name for name in names if name[2]):
-            (self.folder / unfinished[0]).unlink()
-        self.numbers = sorted({int(name[1]) for name in names if not name[2]})
         # an unfinished sweep was never reported as stored, but its number is not used again
         self.run = max((int(name[1]) for name in names), default=0)
+        self.numbers = sorted({int(name[1]) for name in names if name[2] != DISCARDED and not name[3]})
+        for name in names:
+            if name[3] or (name[2] == DISCARDED and int(name[1]) < self.run):
+                (self.folder / name[0]).unlink()
 
 
 def _make(folder: Path) -> None:
@@ -249,7 +260,7 @@ class RecordingSession(Observer):
             raise ApplianceError("no sweep of this run is left to discard")
         number, labels, status = self._stored[-1]
         try:
-            self._folder.remove(number)
+            self._folder.remove(number, reserve=True)
         except OSError as e:
             raise ApplianceError(f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}") from e
         self._stored.pop()

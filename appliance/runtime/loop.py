@@ -114,7 +114,7 @@ class Box:
         self._decided = False
         self._next_state_ns = clock.now_ns()
         self._skin_log = TroubleLog("skin", end="skin: streaming", known=False)
-        self._port_log = TroubleLog("serial", end="serial: open", known=False)
+        self._port_log = TroubleLog("serial", end=f"serial: {port.name} open" if port else "", known=False)
 
     @property
     def counters(self) -> SensorCounters:

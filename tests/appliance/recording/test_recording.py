@@ -221,7 +221,8 @@ def test_labels_that_cannot_be_sent(tmp_path: Path, text: str):
 
 
 def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
-    """Down to the first sweep of this run; those of an earlier run stay, and no number is given twice."""
+    """Down to the first sweep of this run; those of an earlier run stay, and no number is given twice, after a restart
+    neither."""
     before = Desk(tmp_path)
     before.sweep(1)
     before.recording.close()
@@ -230,12 +231,18 @@ def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
         desk.sweep(n)
     desk.sweep(4, status=Status.SHORT)
     assert desk.do("DISCARD") == [3, 2, "sweep-000004"]
-    assert names(tmp_path) == pairs(1, 2, 3)
+    assert names(tmp_path) == [*pairs(1, 2, 3), "sweep-000004.discarded"]
     assert desk.sweep(5) == ["5", "stored", "3", "wood", "", "", "sweep-000006"]
     assert [desk.do("DISCARD")[0] for _ in range(3)] == [5, 2, 1]
     with pytest.raises(ApplianceError, match="no sweep of this run"):
         desk.do("DISCARD")
-    assert names(tmp_path) == pairs(1)
+    desk.recording.close()
+    again = Desk(tmp_path)
+    assert names(tmp_path) == [*pairs(1), "sweep-000006.discarded"]
+    assert again.sweep(1)[6] == "sweep-000007"
+    again.recording.close()
+    Desk(tmp_path).recording.close()
+    assert names(tmp_path) == pairs(1, 7)
 
 
 def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
@@ -283,21 +290,21 @@ def test_discard_that_fails_can_be_repeated(tmp_path: Path, monkeypatch: pytest.
     desk = Desk(tmp_path)
     desk.sweep(1)
     with monkeypatch.context() as broken:
-        broken.setattr(Path, "unlink", failing(Path.unlink, ".json"))
+        broken.setattr(Path, "replace", failing(Path.replace, ".json"))
         with pytest.raises(ApplianceError, match="sweep 1 cannot be discarded: Input/output error"):
             desk.do("DISCARD")
     assert names(tmp_path) == ["sweep-000001.json"]
     assert desk.do("DISCARD") == [1, 0, "sweep-000001"]
-    assert names(tmp_path) == []
+    assert names(tmp_path) == ["sweep-000001.discarded"]
 
 
-def failing(unlink: Callable[..., None], suffix: str) -> Callable[..., None]:
-    """A `Path.unlink` that fails for names with this ending."""
+def failing(replace: Callable[..., Path], suffix: str) -> Callable[..., Path]:
+    """A `Path.replace` that fails for names with this ending."""
 
-    def broken(path: Path, missing_ok: bool = False) -> None:
+    def broken(path: Path, target: Path) -> Path:
         if path.suffix == suffix:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
-        unlink(path, missing_ok)
+        return replace(path, target)
 
     return broken
 
