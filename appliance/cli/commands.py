@@ -51,8 +51,9 @@ OpenDevices = Callable[[Callable[[], SweepFormat] | None], Devices]
 def load_settings(args: argparse.Namespace) -> Config:
     """The settings that a command's options ask for. --every and --sweep are settings of the trigger by the clock."""
     sets = list(args.set)
-    if getattr(args, "skin", None):
-        sets.append(f"sensor.skin={args.skin}")
+    for key, option in (("skin", "skin"), ("port", "skin_port")):
+        if value := getattr(args, option, None):
+            sets.append(f"sensor.{key}={value}")
     every, sweep = getattr(args, "every", None), getattr(args, "sweep", None)
     mode = getattr(args, "trigger", None)
     if every is not None or sweep is not None:

@@ -38,7 +38,11 @@ def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argpars
         metavar="skin[:MATERIAL]|rest|replay:FILE",
         help="simulated tubes, one of them, a finger at rest on one, or a sweep set, instead of the devices",
     )
-    devices.add_argument("--skin", metavar="NAME", help="profile of the skin (sensor.skin); with --sim an emulated one")
+    devices.add_argument(
+        "--skin", metavar="NAME",
+        help="profile of the skin, or the file of one (sensor.skin); with --sim the name of an emulated one",
+    )  # fmt: skip
+    devices.add_argument("--port", dest="skin_port", metavar="PATH", help="serial port of the skin (sensor.port)")
     devices.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
     devices.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
     answers = argparse.ArgumentParser(add_help=False)
@@ -63,6 +67,17 @@ def _count(text: str) -> int:
     if not text.isdecimal() or not 1 <= (number := int(text)) <= 1_000_000_000:
         raise argparse.ArgumentTypeError(f"{text} is no number of sweeps; use a whole number from 1 on")
     return number
+
+
+def _seconds(text: str, least: float = 1.0) -> float:
+    """A length of time, for argparse."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not least <= seconds <= 3600:
+        raise argparse.ArgumentTypeError(f"{text} is no number of seconds that will do; use {least:g} to 3600")
+    return seconds
 
 
 def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.ArgumentParser:
@@ -123,7 +138,12 @@ def _service_commands(
     record.add_argument(
         "--format", metavar="RxC:TYPE:HZ", help="what the skin sends, e.g. 5x3:float32:100 (default: what it announces)"
     )
-    record.add_argument("--window", type=float, metavar="S", help="seconds of each sweep that are kept (default 2)")
+    record.add_argument(
+        "--window",
+        type=partial(_seconds, least=0.01),
+        metavar="S",
+        help="seconds of each sweep that are kept (default 2)",
+    )
     record.add_argument(
         "--target", type=_count, default=10, metavar="N", help="sweeps wanted per material and position (default 10)"
     )
@@ -205,17 +225,6 @@ def _skin_commands(add: Callable[..., Any], devices: argparse.ArgumentParser) ->
     new.add_argument("--seconds", type=_seconds, default=3.0, metavar="S", help="how long it listens (default 3)")
     new.add_argument("--out", type=Path, metavar="DIR", help="folder of the profile (default: /etc/palpate/skins)")
     new.add_argument("--replace", action="store_true", help="replace a profile of this name")
-
-
-def _seconds(text: str) -> float:
-    """A length of time, for argparse."""
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if not 1 <= seconds <= 3600:
-        raise argparse.ArgumentTypeError(f"{text} is no time to listen; use 1 to 3600 seconds")
-    return seconds
 
 
 def _bundle_commands(add: Callable[..., Any]) -> None:

@@ -6,10 +6,13 @@ In: arguments, and a way to the devices, which `main` chooses. Out: lines on sta
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from functools import partial
+from pathlib import Path
 
 from appliance.cli.commands import OpenDevices, load_settings, local_page, stop_flag
 from appliance.core import storage
@@ -114,6 +117,8 @@ def run_new(args: argparse.Namespace) -> int:
 
     settings = load_settings(args)
     path = (args.out or skins.OWN) / f"{_new_name(args, settings)}.toml"
+    if args.grid:
+        _make(path.parent)  # before a user has listened in vain
     port, clock = args.port, SystemClock()
     bauds = (settings.sensor.baud,) if settings.sensor.baud else skin_new.BAUDS
     heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, args.seconds, clock)
@@ -126,12 +131,20 @@ def run_new(args: argparse.Namespace) -> int:
     there = next((one for one in serial_port.ports() if one.path == port), PortInfo(port))
     text = skin_new.profile(chosen, grid, heard.baud, there)
     frames, garbage = skin_new.decoded(text, heard.reads)
-    path.parent.mkdir(parents=True, exist_ok=True)
     storage.put_all({path: text.encode()}, mode=0o644)
-    print(
-        f'{path}: {frames} frames of what was heard, {garbage} bytes in none; use it with sensor.skin = "{path.stem}"'
-    )
+    use = f"--skin {shlex.quote(str(path))}" if args.out else f'--skin {path.stem} (sensor.skin = "{path.stem}")'
+    print(f"{path}: {frames} frames of what was heard, {garbage} bytes in none; use it with {use}")
     return 0
+
+
+def _make(folder: Path) -> None:
+    """Make the folder of a profile. Raises ConfigError where it cannot be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ConfigError(f"{folder} cannot be made: {str(e.strerror).lower()}; name a folder with --out") from e
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(f"{folder} may not be written by this user; name another folder with --out")
 
 
 def _new_name(args: argparse.Namespace, settings: Config) -> str:

@@ -18,6 +18,7 @@ from typing import Self
 from appliance.core.clock import Clock
 from appliance.core.config import TriggerConfig
 from appliance.core.errors import ConfigError, PortError
+from appliance.core.health import Health
 from appliance.core.observer import Observer
 from appliance.core.types import Edge, EdgeKind, Verdict
 from appliance.io.trigger import EdgeCounters
@@ -133,7 +134,10 @@ class KeyTrigger(LinelessTrigger):
 
 class TimedTrigger(LinelessTrigger):
     """Starts a sweep of `sweep_s` every `every_s` by the clock, and announces it. Raises ConfigError if one does not
-    fit into the other."""
+    fit into the other.
+
+    held: no sweep is started, and the pause before one begins again when this ends.
+    """
 
     def __init__(self, config: TriggerConfig, clock: Clock, say: Say) -> None:
         super().__init__("timed", "clock of the box")
@@ -146,9 +150,13 @@ class TimedTrigger(LinelessTrigger):
         self._say = say
         self._due_ns = clock.now_ns() + self._every_ns - self._sweep_ns
         self._sweeping, self._announced = False, COUNTDOWN + 1
+        self.held = False
 
     def edges(self, now_ns: int) -> list[Edge]:
         """START and STOP that are due, with the time at which they were."""
+        if self.held and not self._sweeping:
+            self._due_ns, self._announced = now_ns + self._every_ns - self._sweep_ns, COUNTDOWN + 1
+            return super().edges(now_ns)
         if (
             not self._sweeping and now_ns - self._due_ns > self._every_ns
         ):  # after a pause of the program none is made up
@@ -160,7 +168,7 @@ class TimedTrigger(LinelessTrigger):
             self._sweeping, self._announced = not self._sweeping, COUNTDOWN + 1
             self._say(f"{kind}: slide for {self._sweep_ns / 1e9:g} s" if self._sweeping else str(kind))
         left = -(-(self._due_ns - now_ns) // SECOND)
-        if not self._sweeping and left < self._announced:
+        if not (self._sweeping or self.held) and left < self._announced:
             self._announced = left
             self._say(f"start in {left} s")
         return super().edges(now_ns)
@@ -175,6 +183,18 @@ class AnswerWatch(Observer):
     def answered(self, verdict: Verdict) -> None:
         """Tell it."""
         self._trigger.over(verdict.sweep)
+
+
+class StreamWatch(Observer):
+    """Holds a TimedTrigger while the skin sends nothing: nobody need slide a finger in vain."""
+
+    def __init__(self, trigger: TimedTrigger) -> None:
+        self._trigger = trigger
+        trigger.held = True
+
+    def turn(self, health: Health) -> None:
+        """Hold it, or no longer."""
+        self._trigger.held = not health.streams
 
 
 def standard_input() -> int:

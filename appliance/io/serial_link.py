@@ -117,7 +117,7 @@ def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[Por
     number = f" and serial number {serial_number}" if serial_number else ""
     there = ", ".join(map(str, ports)) or "none"
     raise SensorAbsent(
-        f"no serial port {wanted}{number}; there are: {there}; plug the skin in, or name its port with sensor.port"
+        f"no serial port {wanted}{number}; there are: {there}; plug the skin in, or name its port with --port (sensor.port)"
     )
 
 
@@ -140,7 +140,7 @@ def _refused(path: str, e: Exception) -> SensorError:
     if code == errno.EACCES:
         return SensorDenied(f"{path} may not be opened by this user (errno 13); add the user to group dialout")
     if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        return SensorAbsent(f"no port {path} (errno {code}); plug the skin in, or correct sensor.port")
+        return SensorAbsent(f"no port {path} (errno {code}); plug the skin in, or correct --port (sensor.port)")
     return SensorLost(f"{path} cannot be opened: {e}; check sensor.port and the baud rate of its profile")
 
 

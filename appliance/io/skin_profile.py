@@ -185,11 +185,12 @@ PALPATE = SkinProfile()
 
 
 def load(name: str, folders: Sequence[Path]) -> SkinProfile:
-    """The profile NAME.toml in the first of the folders that has one; that of DEFAULT needs no file.
+    """The profile NAME.toml in the first of the folders that has one; that of DEFAULT needs no file. A name that ends in
+    .toml is a file.
 
     Raises ConfigError naming the file, the key, the value and what is allowed.
     """
-    there = names(folders)
+    there = {name: Path(name)} if name.endswith(".toml") else names(folders)
     if name == DEFAULT and name not in there:
         return PALPATE
     if name not in there:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from appliance.core.config import SITE, Config, SensorConfig
 from appliance.core.devices import Devices
-from appliance.core.errors import ConfigError, FormatError, SensorMismatch
+from appliance.core.errors import ConfigError, FormatError, SensorAbsent, SensorMismatch
 from appliance.core.types import SweepFormat
 from appliance.io import skin_profile
 from appliance.io.link import SkinLink
@@ -68,7 +68,11 @@ def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = N
     if chosen.codec != "palpate":
         settable = wanted and wanted.rate_hz in chosen.rates_hz
         return replace(chosen, rate_hz=wanted.rate_hz).format if wanted and settable else chosen.format
-    with closing(open_board(settings, devices)) as board:
+    try:
+        board = open_board(settings, devices)
+    except SensorAbsent as e:
+        raise SensorAbsent(f"{e}, or name another skin with --skin; `palpate skin detect` says which") from e
+    with closing(board):
         skin = ask(board)[1]
     try:
         return skin_profile.with_window(skin.rows, skin.cols, skin.rate_hz, skin.dtype, skin.axes)

@@ -21,7 +21,14 @@ from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.io import skins
 from appliance.io.gpio_lines import Lines
-from appliance.io.lineless_triggers import AnswerWatch, CommandTrigger, KeyTrigger, TimedTrigger, standard_input
+from appliance.io.lineless_triggers import (
+    AnswerWatch,
+    CommandTrigger,
+    KeyTrigger,
+    StreamWatch,
+    TimedTrigger,
+    standard_input,
+)
 from appliance.io.robot_link import Port, SerialSink, StdoutPort
 from appliance.io.trigger import GpioTrigger, Trigger
 from appliance.io.verdict_lines import LineSink, check_bits
@@ -71,6 +78,8 @@ def _assembled(
     trigger = _trigger(settings.trigger, answerer.format, devices, port, stack)
     if isinstance(trigger, KeyTrigger):
         watching.append(AnswerWatch(trigger))
+    if isinstance(trigger, TimedTrigger):
+        watching.append(StreamWatch(trigger))
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
     lines = _outputs(settings, devices, stack)

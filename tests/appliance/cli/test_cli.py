@@ -342,11 +342,17 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (["replay", "/nowhere.npy"], FormatError, "not a recorded sweep"),
         (["record", "--sim", "skin", "--virtual", "--out", "/proc/x"], ConfigError, "--out /proc/x"),
         (["record", "--material", "wood"], SensorError, "or say what it sends, with --format 4x4:uint8:750"),
+        (["skin", "show"], SensorError, "or name another skin with --skin; `palpate skin detect` says which"),
+        (["skin", "show", "--skin", "no.toml"], ConfigError, "no.toml: cannot be read: no such file or directory"),
         (["record", "--format", "4x4:uint8:750", "--out", "OUT"], ConfigError, "--trigger serial, key or timed"),
         (["record", "--format", "4:uint8"], ConfigError, "--format 4:uint8: not understood; give rows x columns"),
         (["record", "--format", "4x4:uint9:10"], ConfigError, "--format 4x4:uint9:10: data type 'uint9' is unknown"),
         (["record", "--format", "4x4:uint8:10", "--window", "13"], ConfigError, "use a shorter --window"),
-        (["record", "--sim", "skin", "--virtual", "--window", "0"], FormatError, "a window of 0 frames is empty"),
+        (
+            ["record", "--sim", "skin", "--virtual", "--skin", "anyskin", "--window", "0.01"],
+            FormatError,
+            "a window of 0 frames is empty",
+        ),
         (["record", "--sim", "skin", "--format", "2x2:uint8:10"], FormatError, "2x2 uint8 at 10 Hz"),
         (["run", "--trigger", "serial"], ConfigError, "serial.port names none"),
         (["run", "--trigger", "key"], ConfigError, "standard input is no terminal"),
@@ -368,6 +374,17 @@ def test_exit_codes(
     err = [line for line in capsys.readouterr().err.splitlines() if ": record: 4x4" not in line]
     assert hint in err[0]
     assert len(err) == 1
+
+
+@pytest.mark.parametrize("text", ["0", "-2", "nan", "inf", "long"])
+def test_a_window_is_a_length_of_time(text: str, capsys: pytest.CaptureFixture[str]):
+    """Anything else is refused with the arguments."""
+    with pytest.raises(SystemExit) as ended:
+        main(["record", "--sim", "skin", "--virtual", "--window", text])
+    assert ended.value.code == 2
+    assert (
+        f"argument --window: {text} is no number of seconds that will do; use 0.01 to 3600" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize("key", ["samples", "labels", "materials", "rate_hz"])
@@ -437,8 +454,8 @@ def test_skin_check_fails_with_a_part(monkeypatch: pytest.MonkeyPatch, capsys: p
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
-        (["--seconds", "0"], 2, "0 is no time to listen; use 1 to 3600 seconds"),
-        (["--seconds", "long"], 2, "long is no time to listen"),
+        (["--seconds", "0"], 2, "0 is no number of seconds that will do; use 1 to 3600"),
+        (["--seconds", "long"], 2, "long is no number of seconds"),
         (["--set", "sensor.link=serial", "--set", "sensor.port=/dev/none"], 69, "no port /dev/none"),
         (["--set", "sensor.skin=anyskin"], 78, 'sensor.skin = "anyskin" sends what its maker defines (codec "fixed")'),
     ],

@@ -203,6 +203,35 @@ def test_no_sweep_is_made_up_for_a_pause_of_the_program():
     assert trigger.edges(60 * SECOND) == [Edge(START, 60 * SECOND)]
 
 
+def test_no_sweep_is_started_while_it_is_held():
+    """The pause and its countdown begin again afterwards; a sweep that has begun is stopped in time."""
+    trigger, _, said = timed()
+    trigger.held = True
+    assert trigger.edges(9 * SECOND) == []
+    trigger.held = False
+    assert trigger.edges(10 * SECOND) == []
+    assert trigger.edges(11 * SECOND) == [Edge(START, 11 * SECOND)]
+    trigger.held = True
+    assert trigger.edges(14 * SECOND) == [Edge(STOP, 14 * SECOND)]
+    assert trigger.edges(60 * SECOND) == []
+    assert said == ["start in 1 s", "start: slide for 3 s", "stop"]
+
+
+def test_nobody_slides_for_a_skin_that_is_away(rigged: Callable[..., Rigged]):
+    """The whole box: it is waited for the skin at the start and after an unplugging, and no sweep is `not-ready`."""
+    off = np.zeros((60 * 750, 4, 4), np.uint8)
+    simulated = devices.build(skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim")
+    simulated.backend.unplug()
+    box = rigged(simulated, sets=("trigger.mode=timed", "trigger.every_s=4"))
+    box.seconds(10)
+    assert box.kept == []
+    simulated.backend.plug()
+    box.seconds(6)
+    simulated.backend.unplug()
+    box.seconds(10)
+    assert [s.status for s in box.kept] == [Status.OK, Status.SENSOR_LOST]
+
+
 def test_a_sweep_must_leave_a_pause():
     """One as long as the period is refused."""
     with pytest.raises(ConfigError, match="a sweep of 3 s every 3 s leaves no pause"):

@@ -74,13 +74,17 @@ def test_a_wrong_file(tmp_path: Path, text: str, hint: str):
 
 
 def test_names(tmp_path: Path):
-    """A misspelt name, a name that leads out of the folder, none at all; the first folder wins; palpate needs no file."""
+    """A misspelt name, a name that leads out of the folder, none at all; the first folder wins; palpate needs no file; a
+    file is named by its ending."""
     folder = written(tmp_path, GOOD)
     with pytest.raises(ConfigError, match=r"sensor\.skin = 'oven' has no profile in .*did you mean own"):
         load("oven", [folder])
-    for name in ("../own", "", "own.toml"):
+    for name in ("../own", ""):
         with pytest.raises(ConfigError, match="has no profile"):
             load(name, [folder])
+    with pytest.raises(ConfigError, match=r"own\.toml: cannot be read: no such file"):
+        load("own.toml", [folder])
+    assert load(str(folder / "own.toml"), []) == load("own", [folder])
     (folder / "flexitac.toml").write_text(GOOD)
     assert load("flexitac", [folder, FOLDER]).about == "a"
     assert load("palpate", [folder]) == SkinProfile()

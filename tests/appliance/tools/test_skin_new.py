@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from appliance.cli.main import main
+from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ConfigError, SensorMismatch, SensorSilent
-from appliance.io import skin_codecs, skin_profile
+from appliance.io import skin_codecs, skin_profile, skins
 from appliance.io.serial_port import PortInfo
 from appliance.sim.rig import VirtualClock
 from appliance.tools import skin_new
@@ -146,6 +147,9 @@ def test_emulated_skins_are_described_and_read_again(
     written = skin_profile.load("mine", [tmp_path])
     assert written.rate_hz == pytest.approx(Numbered(name).rate_hz, rel=0.25)
     out, err = capsys.readouterr()
+    path = tmp_path / "mine.toml"
+    assert out.splitlines()[-1].endswith(f"use it with --skin {path}")
+    assert skins.profile(config.load(None, [f"sensor.skin={path}"])) == written
     frames = int(re.search(r"mine.toml: (\d+) frames", out)[1])
     assert frames > 0.5 * 2 * Numbered(name).rate_hz
     assert "already" in err
@@ -158,12 +162,18 @@ def test_emulated_skins_are_described_and_read_again(
     [
         (["Mine", "--port", "p"], "'Mine' cannot name a profile"),
         (["matrix", "--port", "/dev/null"], "there is a profile matrix already"),
-        (["mine", "--port", "/dev/no-such-port", "--grid", "4x4"], "no port /dev/no-such-port"),
+        (["mine", "--port", "/dev/no-such-port", "--grid", "4x4", "--out", "OUT"], "no port /dev/no-such-port"),
+        (
+            ["mine", "--port", "/dev/no-such-port", "--grid", "4x4", "--out", "/proc/x"],
+            "/proc/x cannot be made: no such",
+        ),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(options: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """What cannot be is said in one line."""
-    assert main(["skin", "new", *options]) in (69, 78)
+def test_what_cannot_be_is_said_in_one_line(
+    options: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What cannot be is said in one line; a folder that cannot be written, before anything is listened to."""
+    assert main(["skin", "new", *(str(tmp_path) if option == "OUT" else option for option in options)]) in (69, 78)
     assert text in capsys.readouterr().err
 
 
