@@ -138,12 +138,8 @@ def _service_commands(
     record.add_argument(
         "--format", metavar="RxC:TYPE:HZ", help="what the skin sends, e.g. 5x3:float32:100 (default: what it announces)"
     )
-    record.add_argument(
-        "--window",
-        type=partial(_seconds, least=0.01),
-        metavar="S",
-        help="seconds of each sweep that are kept (default 2)",
-    )
+    window = partial(_seconds, least=0.01)
+    record.add_argument("--window", type=window, metavar="S", help="seconds of each sweep that are kept (default 2)")
     record.add_argument(
         "--target", type=_count, default=10, metavar="N", help="sweeps wanted per material and position (default 10)"
     )
