@@ -48,19 +48,20 @@ class Line:
         self._opener, self._heard, self._changed, self._name = opener, heard, changed, name
         self._clock = clock or SystemClock()
         self._port: Any = self._open()
+        self._writing = threading.Lock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="palpate-line")
         self._thread.start()
 
     def write(self, line: bytes) -> None:
         """Send bytes. Raises LinkLost if the port is not open or does not take them."""
-        port = self._port
-        if port is None:
-            raise LinkLost(self.trouble)
-        try:
-            port.write(line)
-        except (OSError, ValueError) as e:  # ValueError: closed meanwhile
-            raise LinkLost(f"{self._name} does not take anything: {e}; check its cable") from e
+        with self._writing:
+            if self._port is None:
+                raise LinkLost(self.trouble)
+            try:
+                self._port.write(line)
+            except (OSError, ValueError) as e:
+                raise LinkLost(f"{self._name} does not take anything: {e}; check its cable") from e
 
     def close(self) -> None:
         """End the thread and close the port."""
@@ -82,11 +83,14 @@ class Line:
             if self._port is not None:
                 self._changed()
                 why = self._read(self._port)
-                port, self._port = self._port, None
                 self.trouble = f"{self._name} was lost: {why}; it is opened again when it is back"
-                self.losses += 1
-                with contextlib.suppress(OSError):
+                with (
+                    self._writing,
+                    contextlib.suppress(OSError),
+                ):  # pyserial fails otherwise if it is closed while it writes
+                    port, self._port = self._port, None
                     port.close()
+                self.losses += 1
                 self._changed()
             if not self._ending.wait(RETRY_S):
                 self._port = self._open()

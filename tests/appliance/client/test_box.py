@@ -207,6 +207,34 @@ def test_unplugging_ends_every_wait(speaking: SpeakingBox, box: Palpate, job: Ca
     eventually(lambda: box.trouble == "")
 
 
+def test_a_port_is_not_closed_while_a_command_is_written():
+    """The thread that reads finds it lost meanwhile: it closes the port when the command is out, which then fails as lost."""
+    began, closed, early = threading.Event(), threading.Event(), []
+
+    class FailingPort:
+        """It is lost as soon as something is written to it."""
+
+        port, in_waiting = "/dev/none", 0
+
+        def read(self, n: int) -> bytes:
+            if began.wait(0.01):
+                raise OSError("unplugged")
+            return b""
+
+        def write(self, data: bytes) -> None:
+            began.set()
+            early.append(closed.wait(0.2))
+
+        def close(self) -> None:
+            closed.set()
+
+    with Palpate("/dev/none", opener=FailingPort) as box:
+        with pytest.raises(LinkLost, match="unplugged"):
+            box.ask("TEST", timeout_s=LONG_S)
+        eventually(closed.is_set)
+    assert early[0] is False
+
+
 def test_a_port_that_is_not_there(tmp_path: Path):
     """It is waited for: commands fail at once and name it, `wait_ready` fails at its deadline."""
     with Palpate(str(tmp_path / "ttyUSB0")) as box:
