@@ -36,6 +36,23 @@ def until(done: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
+COLOURS = """() => {
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number), found = [];
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let node = walk.nextNode(); node; node = walk.nextNode()) {
+    const one = node.parentElement, style = getComputedStyle(one);
+    if (!node.textContent.trim() || !one.checkVisibility() || ["SCRIPT", "TITLE", "title"].includes(one.tagName)) continue;
+    if (one.closest("svg .skin, .spoken") || one.classList.contains("count")) continue;
+    let behind = one;
+    while (behind && (rgb(getComputedStyle(behind).backgroundColor)[3] ?? 1) === 0) behind = behind.parentElement;
+    const text = one instanceof SVGElement ? style.fill : style.color;
+    found.push([node.textContent.trim(), rgb(text).slice(0, 3), rgb(getComputedStyle(behind ?? document.body).backgroundColor).slice(0, 3)]);
+  }
+  return found;
+}"""
+"""Each text that is seen, with its colour and that behind it; but counts of taxels, whose colour changes."""
+
+
 class BrowsedPage:
     """The page as a person sees it. errors: messages of the browser. requests: addresses that it asked for."""
 
@@ -53,6 +70,11 @@ class BrowsedPage:
     def text(self, where: str) -> str:
         """The text of an element, with plain spaces."""
         return str(self.page.inner_text(where)).replace("\xa0", " ")
+
+    def legibility(self) -> tuple[int, list[tuple[str, float]]]:
+        """The number of texts, and those whose contrast is below 4.5 (WCAG 2.1, 1.4.3), with it."""
+        texts = [(text, round(contrast(front, back), 2)) for text, front, back in self.page.evaluate(COLOURS)]
+        return len(texts), [(text, ratio) for text, ratio in texts if ratio < 4.5]
 
 
 def luminance(colour: Sequence[float]) -> float:
