@@ -41,6 +41,7 @@ PATHS = {
     "docs/manual": "/usr/share/doc/palpate/manual",
     "docs/alignment/page.png": "/usr/share/doc/palpate/alignment/page.png",
     "docs/watch/page.png": "/usr/share/doc/palpate/watch/page.png",
+    "docs/watch/record.png": "/usr/share/doc/palpate/watch/record.png",
     "firmware_config/PROTOCOL.md": "/usr/share/doc/palpate/PROTOCOL.md",
 }
 """Files of this checkout, and their paths on a box."""

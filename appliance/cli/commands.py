@@ -27,7 +27,7 @@ from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.io import skin_profile, skins
-from appliance.io.robot_link import Port
+from appliance.io.robot_link import Command, Port
 from appliance.io.usb_sensor import fits
 from appliance.recording.capture import CaptureWriter
 from appliance.runtime import assembly
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from appliance.deployment.shadow import Shadow
     from appliance.recording.recording import RecordingSession
     from appliance.runtime.loop import Box
+    from appliance.watch.record import RecordPage
     from appliance.watch.server import PageServer
 
 Facts = Mapping[str, Callable[[], object]]
@@ -124,6 +125,7 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         folder = args.out or Path(settings.store.folder) / "sweeps"
         recording = RecordingSession(folder, fmt, labels, devices.clock, _sentences(port), args.target)
         stack.callback(recording.close)
+        page = _record_page(args, settings, fmt, devices, recording, lambda command: box.obey(command))
         log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:g} s")
         if slow := skin_profile.warning(fmt):
             log.warning(f"record: {slow}")
@@ -134,9 +136,13 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         feed = _feed(settings, fmt, devices.source, {"bundle": "", "labels": []}, facts)
         box = assembly.recorder(
             settings, fmt, devices, port, stack, capture=_capture(args, settings, fmt, stack),
-            observers=[Notifier(SystemClock()), recording, *_printer(fmt, recording), *_status(settings, facts), *feed],
-            commands=recording.commands,
+            observers=[
+                Notifier(SystemClock()), recording, *_printer(fmt, recording), *_status(settings, facts), *feed, *page,
+            ],
+            commands=recording.commands, ordered=bool(page),
         )  # fmt: skip
+        for shown in page:
+            stack.enter_context(shown)
         box.run(_done(args, box, devices, stopped))
     return 0
 
@@ -148,6 +154,22 @@ def _printer(fmt: SweepFormat, recording: RecordingSession) -> list[Observer]:
     from appliance.watch.sweep_text import SweepPrinter
 
     return [SweepPrinter(sys.stdout, fmt.rate_hz, recording.about)]
+
+
+def _record_page(
+    args: argparse.Namespace, settings: Config, fmt: SweepFormat, devices: Devices, recording: RecordingSession,
+    obey: Callable[[Command], list[object]],
+) -> list[RecordPage]:  # fmt: skip
+    """The page on which a person sees the recording and sets its labels, where one is asked for."""
+    if args.web is None:
+        return []
+    from appliance.watch.access import Access
+    from appliance.watch.record import RecordPage
+
+    access = Access.configured(settings.watch, args.web)
+    page = RecordPage(access, fmt, devices.source, devices.wire(settings).trigger, recording.about, obey, SystemClock())
+    log.info(f"page: {page.server.address}")
+    return [page]
 
 
 def _announced(settings: Config, devices: Devices) -> SweepFormat:

@@ -143,6 +143,10 @@ def _service_commands(
     record.add_argument(
         "--target", type=_count, default=10, metavar="N", help="sweeps wanted per material and position (default 10)"
     )
+    record.add_argument(
+        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        help=f"also as a page, on which the labels are set (default port {WEB_PORT}); watch.address opens it to the network",
+    )  # fmt: skip
     enrol = add(
         "enrol", "learn one more material from a few sweeps, without training; write a new bundle", devices, trigger
     )

@@ -12,7 +12,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -153,6 +153,7 @@ class RecordingSession(Observer):
         self._labels = deque([(0, labels)], MOST_CHANGES)
         self._answered = False
         self._stored: list[tuple[int, Labels, Status]] = []
+        self._last: dict[str, Any] | None = None
         self._log = TroubleLog("record")
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
             "MATERIAL": partial(self._change, "material"), "POSITION": partial(self._change, "position"),
@@ -166,11 +167,12 @@ class RecordingSession(Observer):
 
     def about(self) -> dict[str, Any]:
         """How far the recording has got, for JSON: labels that hold now, sweeps of this run, what there is of each
-        material and position, how many are wanted of each, and what is missing in words."""
-        labels = self._labels[-1][1]
+        material and position, how many are wanted of each, and what is missing in words; what became of the last sweep,
+        as in REC, and the number of the one that DISCARD would remove (None: there is none)."""
         return {
-            "material": labels.material, "position": labels.position, "session": labels.session, "stored": self.stored,
-            "counts": self._progress.counts, "target": self._progress.target, "missing": self._progress.missing(),
+            **asdict(self._labels[-1][1]), "stored": self.stored, "counts": self._progress.counts,
+            "target": self._progress.target, "missing": self._progress.missing(), "last": self._last,
+            "discard": self._stored[-1][0] - self._folder.run if self._stored else None,
         }  # fmt: skip
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
@@ -184,6 +186,7 @@ class RecordingSession(Observer):
             trouble = "" if outcome == "stored" else outcome
             self._log.update(trouble, _report(outcome, sweep.id, detail, self._folder.folder))
         self._tell(verdict, outcome, labels)
+        self._last = {"sweep": sweep.id, "outcome": outcome, "detail": detail, **asdict(labels)}
         self._say(
             sentence("REC", sweep.id, outcome, self.stored, labels.material, labels.position, labels.session, detail)
         )
@@ -254,17 +257,24 @@ class RecordingSession(Observer):
             raise ApplianceError(f"position {position!r} has no next one; begin with PPLP POSITION 1")
         return self._change("position", str(int(position) + 1).zfill(len(position)))
 
-    def _discard(self, _: str) -> list[object]:
-        """Remove the last stored sweep of this run; returns its number, how many are left, and its file name."""
+    def _discard(self, which: str) -> list[object]:
+        """Remove the last stored sweep of this run; returns its number, how many are left, and its file name.
+
+        which: its number, from who has seen it and means no later one; "" for whichever it is.
+        """
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
         number, labels, status = self._stored[-1]
+        if which and which != str(number - self._folder.run):
+            raise ApplianceError(f"the last stored sweep is {number - self._folder.run}, not {which}; look at it first")
         try:
             self._folder.remove(number, reserve=True)
         except OSError as e:
             raise ApplianceError(f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}") from e
         self._stored.pop()
         self._count(labels, status, -1)
+        if self._last and self._last["sweep"] == number - self._folder.run:
+            self._last["outcome"] = "discarded"
         return [number - self._folder.run, self.stored, self._folder.path(number).stem]
 
 

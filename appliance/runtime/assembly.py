@@ -59,23 +59,24 @@ def box(
 def recorder(
     settings: Config, fmt: SweepFormat, devices: Devices, port: Port | None, stack: ExitStack, *,
     capture: CaptureWriter | None = None, observers: Iterable[Observer] = (),
-    commands: Mapping[str, CommandHandler] = NO_COMMANDS,
+    commands: Mapping[str, CommandHandler] = NO_COMMANDS, ordered: bool = False,
 ) -> Box:  # fmt: skip
-    """The box that records sweeps of a form and needs no bundle; the class bits stay 0. Other parameters as for `box`."""
+    """The box that records sweeps of a form and needs no bundle; the class bits stay 0. ordered: commands come from elsewhere
+    than the port, too. Other parameters as for `box`."""
     check = SweepCheck(fmt, devices.clock)
     watching = [check, *observers]
-    return _assembled(devices.wire(settings), check, devices, port, stack, capture, watching, commands)
+    return _assembled(devices.wire(settings), check, devices, port, stack, capture, watching, commands, ordered=ordered)
 
 
 def _assembled(
     settings: Config, answerer: Answerer, devices: Devices, port: Port | None, stack: ExitStack,
     capture: CaptureWriter | None, observers: Iterable[Observer], commands: Mapping[str, CommandHandler], *,
-    codes: tuple[str, ...] = (), early: Decider | None = None,
+    codes: tuple[str, ...] = (), early: Decider | None = None, ordered: bool = False,
 ) -> Box:  # fmt: skip
     """Put the components together. codes: labels that the class bits hold."""
     watching = [*observers, *([capture] if capture else [])]
     commands = {**commands, "LABEL": partial(_label, codes)}
-    trigger = _trigger(settings.trigger, answerer.format, devices, port, stack)
+    trigger = _trigger(settings.trigger, answerer.format, devices, port, stack, ordered=ordered)
     if isinstance(trigger, KeyTrigger):
         watching.append(AnswerWatch(trigger))
     if isinstance(trigger, TimedTrigger):
@@ -96,13 +97,15 @@ def _assembled(
     )  # fmt: skip
 
 
-def _trigger(config: TriggerConfig, fmt: SweepFormat, devices: Devices, port: Port | None, stack: ExitStack) -> Trigger:
+def _trigger(
+    config: TriggerConfig, fmt: SweepFormat, devices: Devices, port: Port | None, stack: ExitStack, *, ordered: bool
+) -> Trigger:
     """What starts and stops sweeps. Raises ConfigError where the settings leave nothing that could."""
     if config.mode == "serial":
-        if port is None or isinstance(port, StdoutPort):
+        if not ordered and (port is None or isinstance(port, StdoutPort)):
             raise ConfigError(
                 'trigger.mode = "serial" takes START and STOP from the serial line, but serial.port names none; '
-                "set it, or use --trigger key"
+                "set it, or use --trigger key, or the page of palpate record --web"
             )
         return CommandTrigger(devices.clock)
     if config.mode == "key":

@@ -112,7 +112,7 @@ class Box:
         self._on_turn = [o.turn for o in observers if type(o).turn is not Observer.turn]
         self._on_stopping = [o.stopping for o in observers if type(o).stopping is not Observer.stopping]
         self._decided = False
-        self._next_state_ns = clock.now_ns()
+        self._next_state_ns = self._turn_ns = clock.now_ns()
         self._skin_log = TroubleLog("skin", end="skin: streaming", known=False)
         self._port_log = TroubleLog("serial", end=f"serial: {port.name} open" if port else "", known=False)
 
@@ -143,7 +143,7 @@ class Box:
     def step(self) -> list[Verdict]:
         """One turn; takes at most the sensor's timeout. The verdicts that were sent."""
         frames = self._sensor.read()
-        now = self._clock.now_ns()
+        now = self._turn_ns = self._clock.now_ns()
         self._cutter.put(frames, now)
         if len(frames):
             for come in self._on_frames:
@@ -220,9 +220,6 @@ class Box:
         if not self._port:
             return
         for command in self._port.commands():
-            if not command.error:
-                for note in self._on_command:
-                    note(now_ns, command.line)
             self._port.say(self._answer_to(command))
         self._port_log.update(self._port.trouble)
         if now_ns >= self._next_state_ns:
@@ -274,11 +271,15 @@ class Box:
         if command.error:
             return sentence("ANS", command.name, "error", command.error)
         try:
-            return sentence("ANS", command.name, "ok", *self._carried_out(command))
+            return sentence("ANS", command.name, "ok", *self.obey(command))
         except ApplianceError as e:
             return sentence("ANS", command.name, "error", e)
 
-    def _carried_out(self, command: Command) -> list[object]:
+    def obey(self, command: Command) -> list[object]:
+        """Carry out a command, wherever it comes from; the fields of its answer. Only between two turns or in an observer's
+        `turn`. Raises ApplianceError with the reason where it is refused."""
+        for note in self._on_command:
+            note(self._turn_ns, command.line)
         if command.name in self._commands:
             return self._commands[command.name](command.text)
         if command.name in ("START", "STOP"):

@@ -1,24 +1,28 @@
-"""Serves a page and the events that it shows, with tornado. In: events of the program. Out: both, to browsers, read-only.
+"""Serves a page and the events that it shows, with tornado. In: events of the program. Out: both, to browsers; orders of its
+page, where the program takes any.
 
 The server runs in a thread of its own, so that no browser keeps the program waiting. It answers GET of the paths it was
 given; of a request nothing beyond the head is read. A browser that connects gets the events that are kept, then the new
-ones (server-sent events); one that comes back gets what it has missed.
+ones (server-sent events); one that comes back gets what it has missed. What a program takes orders for, it alone decides:
+without any there is no way in (docs/decisions/0016-labels-from-the-page.md).
 """
 
 from __future__ import annotations
 
 import asyncio
+import hmac
 import json
 import logging
 import secrets
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from heapq import merge
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from appliance.core.errors import ConfigError
+from appliance.core.errors import ApplianceError, ConfigError, FormatError, NoAnswer
 from appliance.core.log import TroubleLog
 from appliance.watch.access import Access
 
@@ -58,13 +62,21 @@ MOST_OPEN, MOST_OF_ONE = 64, 24
 """Most connections at a time, and of one address; a further one is closed at once. A browser opens up to six."""
 MOST_WAITING = 100
 """Events that wait for one browser. Who is further behind is cut off, and gets what is kept when it comes back."""
+MOST_ORDER = 1024
+"""Bytes of an order."""
+DONE_S = 3.0
+"""Longest wait until the program has carried an order out."""
 WRONG_S = 1.0
 """A wrong token is answered after this time."""
 COOKIE = "__Host-palpate"
+KEY = "X-Palpate-Key"
+"""Header of an order: the key that the page got with its events, which no other site can read."""
 DAY = 86_400
 
 Answer = Callable[[str], object | None]
 """Content for JSON, by the last part of a path; None where there is none."""
+Orders = Callable[[bytes], Future[Any]]
+"""Takes what a page has sent, without waiting; gives what becomes of it, for JSON, or an ApplianceError where it is refused."""
 
 
 class State(Protocol):
@@ -107,16 +119,20 @@ class PageServer:
     """Serves the page `name` of FOLDER and the other files there, at `access`. kept: as for EventLog.
 
     now_ns: the clock by which events are stamped. answers: what is computed on request, by the first part of its path.
-    Raises ConfigError where the address cannot be used.
+    orders: takes what the page POSTs to /order; None: the page is read-only. Raises ConfigError where the address cannot be
+    used.
     """
 
     def __init__(
         self, name: str, access: Access, now_ns: Callable[[], int], kept: Mapping[str, int] | None = None,
-        answers: Mapping[str, Answer] | None = None,
+        answers: Mapping[str, Answer] | None = None, orders: Orders | None = None,
     ) -> None:  # fmt: skip
-        self.access, self.now_ns, self.answers = access, now_ns, answers or {}
-        self.events = EventLog(kept or {})
+        self.access, self.now_ns, self.answers, self.orders = access, now_ns, answers or {}, orders
+        self.events, self.key = EventLog(kept or {}), secrets.token_urlsafe()
+        if orders:
+            self.events.add("key", self.key)
         self.queues: set[asyncio.Queue[bytes]] = set()
+        self.answering: set[asyncio.Task[Any]] = set()
         self.wrong = TroubleLog("page")
         self.files = {f"/{f.name}": (KINDS[f.suffix], f.read_bytes()) for f in FOLDER.iterdir() if f.suffix in KINDS}
         self.files["/"] = self.files[f"/{name}"]
@@ -166,18 +182,22 @@ class PageServer:
                 queue.put_nowait(event)
 
     async def _serve(self) -> None:
+        routes = [(r"/events", EventsHandler), (r"/(\w+)/(\d{1,9})", AnswerHandler)]
+        routes += [(r"/order", OrderHandler)] if self.orders else []
         application = Application(
-            [(r"/events", EventsHandler, {"page": self}), (r"/(\w+)/(\d{1,9})", AnswerHandler, {"page": self})],
+            [(path, handler, {"page": self}) for path, handler in routes],
             default_handler_class=FileHandler, default_handler_args={"page": self}, log_function=lambda handler: None,
         )  # fmt: skip
         server = LimitedServer(
-            application, ssl_options=self._tls, max_header_size=MOST_HEAD, max_body_size=0, max_buffer_size=1 << 16,
-            idle_connection_timeout=HEAD_S, chunk_size=MOST_HEAD,
+            application, ssl_options=self._tls, max_header_size=MOST_HEAD, max_body_size=MOST_ORDER if self.orders else 0,
+            max_buffer_size=1 << 16, idle_connection_timeout=HEAD_S, body_timeout=HEAD_S, chunk_size=MOST_HEAD,
         )  # fmt: skip
         server.add_sockets(self._sockets)
         tick = PeriodicCallback(server.drop_those_who_take_nothing, 1000)
         tick.start()
         await self._stop.wait()
+        if self.answering:
+            await asyncio.wait(self.answering, timeout=DONE_S)
         tick.stop()
         server.stop()
         await server.close_all_connections()
@@ -304,6 +324,50 @@ class AnswerHandler(_Handler):
             raise HTTPError(404)
         self.set_header("Content-Type", "application/json")
         self.finish(json.dumps(content, allow_nan=False, separators=(",", ":")))
+
+
+class OrderHandler(_Handler):
+    """What the page wants done."""
+
+    SUPPORTED_METHODS = ("POST",)
+
+    async def prepare(self) -> None:
+        """Refuse what the page itself did not send: another site has not its origin, and cannot read its key."""
+        await super().prepare()
+        headers, own = self.request.headers, f"{self.request.protocol}://{self.request.headers['Host']}"
+        if headers.get("Origin") != own or not hmac.compare_digest(
+            headers.get(KEY, "").encode(), self.page.key.encode()
+        ):
+            raise HTTPError(403)
+        if headers.get("Content-Type") != "application/json":
+            raise HTTPError(415)
+
+    async def post(self) -> None:
+        """Answer with what has become of it, as JSON; else with the reason as a line."""
+        task = asyncio.current_task()
+        assert task
+        self.page.answering.add(task)
+        task.add_done_callback(self.page.answering.discard)
+        try:
+            content = json.dumps(await self._done())
+            self.set_header("Content-Type", "application/json")
+            self.finish(content)
+        except ApplianceError as e:
+            self.set_status(400 if isinstance(e, FormatError) else 503 if isinstance(e, NoAnswer) else 409)
+            self.set_header("Content-Type", "text/plain; charset=utf-8")
+            self.finish(str(e))
+
+    async def _done(self) -> Any:
+        """What has become of the order. Raises ApplianceError where it is refused; NoAnswer where nobody takes it up."""
+        assert self.page.orders
+        order = self.page.orders(self.request.body)
+        try:
+            return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(order)), DONE_S)
+        except TimeoutError as e:
+            known = (
+                "it was not carried out; try again" if order.cancel() else "it may still be carried out; wait for it"
+            )
+            raise NoAnswer(f"no answer within {DONE_S:g} s; {known}") from e
 
 
 class EventsHandler(_Handler):

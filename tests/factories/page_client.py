@@ -45,11 +45,13 @@ def received_by(one: socket.socket) -> bytes:
 
 def ask(
     page: Page, path: str = "/", method: str = "GET", host: str = "localhost", more: str = "",
-    tls: ssl.SSLContext | None = None,
+    tls: ssl.SSLContext | None = None, body: bytes = b"",
 ) -> bytes:  # fmt: skip
     """Its answer to one request, head and body."""
     with connected(page, tls) as one:
-        one.sendall(f"{method} {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n{more}\r\n".encode())
+        head = f"{method} {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n{more}\r\n"
+        with suppress(BrokenPipeError, ConnectionResetError):  # it may refuse what it has not read to the end
+            one.sendall(head.encode() + body)
         return received_by(one)
 
 

@@ -1,11 +1,10 @@
 /* The page of `palpate skin show`: every axis of a skin, its noise and its faults. */
 import {listen} from "/events.js";
+import {byId, put} from "/parts.js";
 import {shades} from "/skin.js";
 
-const NUMBERED = 8, byId = (id) => document.getElementById(id);
+const NUMBERED = 8;
 let built = "", tiles = [];
-
-function put(id, text) { if (byId(id).textContent !== text) byId(id).textContent = text; }
 
 function build([rows, cols, axes]) {
   byId("maps").replaceChildren();

@@ -1,11 +1,11 @@
 /* The page beside the robot: the box's last verdict first, then the skin, the sweep, the shift, and the box itself. */
 
 import {listen} from "/events.js";
+import {ago, byId, clock, count, made, mark, percent, put} from "/parts.js";
 import {SkinPicture, wayBack} from "/skin.js";
 import {course, signal, spectrogram} from "/plots.js";
 
-const byId = (id) => document.getElementById(id), SPOKEN_MS = 3000, SHOWN = 200, KEPT = 5000, PICTURES = 20;
-const TONES = {ok: "good", recorded: "good", unsure: "warn", undecided: "warn", unknown: "warn", aborted: "plain"};
+const SPOKEN_MS = 3000, SHOWN = 200, KEPT = 5000, PICTURES = 20;
 const SKIN = new SkinPicture(document.createElement("div"));
 let known; // what the box has said; see begin()
 let reached = null, answers = true, wallMs = 0, dirty = true, spokenAt = -Infinity, showAll = false, statuses = new Set(), drawnRows = "";
@@ -16,31 +16,9 @@ function begin() {
 }
 begin();
 
-function put(id, text) { if (byId(id).textContent !== text) byId(id).textContent = text; }
-function made(name, classes, text, parent) {
-  const one = document.createElement(name);
-  if (classes) one.className = classes;
-  if (text !== undefined) one.textContent = text;
-  parent?.append(one);
-  return one;
-}
-
 /* Times. The box counts nanoseconds since its start; `wallMs` is what this device's clock showed then. */
 function wall(ns) { return wallMs + ns / 1e6; }
-function clock(ms) { return new Date(ms).toLocaleTimeString("en-GB"); }
-function ago(ms) {
-  const s = Math.max(0, Math.round(ms / 1000));
-  if (s < 60) return `${s} s`;
-  if (s < 3600) return `${Math.floor(s / 60)} min ${String(s % 60).padStart(2, "0")} s`;
-  return s < 86400 ? `${Math.floor(s / 3600)} h ${Math.floor(s / 60) % 60} min` : `${Math.floor(s / 86400)} d ${Math.floor(s / 3600) % 24} h`;
-}
-function percent(p) { return `${(100 * p).toFixed(1)} %`; }
-function count(n) { return n.toLocaleString("en"); }
 function key(one) { return `${one.pid}-${one.sweep}`; }
-function mark(chip, status) {
-  chip.textContent = status;
-  chip.dataset.tone = TONES[status] ?? "bad";
-}
 
 /* Events, as appliance/watch/board.py sends them. */
 const HEARD = {

@@ -245,6 +245,32 @@ def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
     assert names(tmp_path) == pairs(1, 7)
 
 
+def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
+    """With a number it removes the last stored sweep alone if it is this one: not one that has come since then."""
+    desk = Desk(tmp_path)
+    for n in (1, 2):
+        desk.sweep(n)
+    for other in ("1", "3", "02"):
+        with pytest.raises(ApplianceError, match=f"the last stored sweep is 2, not {other}"):
+            desk.do("DISCARD", other)
+    assert desk.do("DISCARD", "2") == [2, 1, "sweep-000002"]
+    assert names(tmp_path) == pairs(1)
+
+
+def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path):
+    """For who shows the recording: as in REC, and which sweep DISCARD would remove."""
+    desk = Desk(tmp_path, Labels("wood", "3", "a"))
+    assert [desk.recording.about()[name] for name in ("last", "discard")] == [None, None]
+    desk.sweep(1)
+    desk.sweep(2, status=Status.SHORT)
+    last = {"sweep": 2, "outcome": "skipped", "detail": "short", "material": "wood", "position": "3", "session": "a"}
+    assert [desk.recording.about()[name] for name in ("last", "discard")] == [last, 1]
+    desk.sweep(3)
+    desk.do("DISCARD")
+    about = desk.recording.about()
+    assert (about["last"]["sweep"], about["last"]["outcome"], about["discard"]) == (3, "discarded", 1)
+
+
 def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
     """After each sweep, per material and position, with those of earlier runs; a faulty window does not count."""
     before = Desk(tmp_path, Labels("wood", "1"), target=2)

@@ -133,7 +133,7 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     )
 
 
-FILES = {"/", "/page.css", "/watch.js", "/events.js", "/skin.js", "/plots.js", "/events", "data:,"}
+FILES = {"/", "/page.css", "/watch.js", "/events.js", "/parts.js", "/skin.js", "/plots.js", "/events", "data:,"}
 FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number))"
 
 

@@ -129,6 +129,8 @@ def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
         ("//evil.example/", "GET", "localhost", 404),
         ("/", "HEAD", "localhost", 405),
         ("/", "POST", "localhost", 405),
+        ("/order", "POST", "localhost", 405),
+        ("/order", "GET", "localhost", 404),
         ("/events", "PUT", "localhost", 405),
         ("/sweep/7", "DELETE", "localhost", 405),
         ("/", "OPTIONS", "localhost", 405),
@@ -292,11 +294,13 @@ def test_the_pages_hold_everything_they_show():
         assert {path for path in re.findall(r'(?:src|href|from) ?=? ?"/([\w.]+)"', text)} <= names, file
 
 
-def test_without_tornado_it_says_what_to_install():
+@pytest.mark.parametrize("command", [["align", "--sim", "rest"], ["record", "--sim", "skin", "--virtual"]])
+def test_without_tornado_it_says_what_to_install(tmp_path: Path, command: list[str]):
     """One line that names the extra; nothing else of the box needs it."""
+    command += ["--out", str(tmp_path)] if "record" in command else []
     code = (
         "import sys; sys.modules['tornado'] = None; from appliance.__main__ import main;"
-        "sys.exit(main(['align', '--sim', 'rest', '--web', '0']))"
+        f"sys.exit(main({[*command, '--web', '0']}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == ConfigError.exit_code

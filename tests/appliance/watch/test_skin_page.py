@@ -43,7 +43,7 @@ def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
     faulty = seen.page.eval_on_selector_all(".taxel.faulty", "all => all.map(e => e.title)")
     assert [title.split(":")[0] for title in faulty] == ["taxel 2.1 axis 1", "taxel 1.2 axis 3"]
     asked = {request.removeprefix(page.address).split("?")[0] for request in seen.requests}
-    assert asked <= {"/", "/page.css", "/skin_show.js", "/events.js", "/skin.js", "/events", "data:,"}
+    assert asked <= {"/", "/page.css", "/skin_show.js", "/events.js", "/parts.js", "/skin.js", "/events", "data:,"}
     assert not seen.errors
     seen.page.close()
 

@@ -1,0 +1,34 @@
+/* What the pages' scripts share: elements, and figures in words. */
+
+const TONES = {ok: "good", recorded: "good", unsure: "warn", undecided: "warn", unknown: "warn", aborted: "plain"};
+
+export const byId = (id) => document.getElementById(id);
+
+export function put(id, text) { if (byId(id).textContent !== text) byId(id).textContent = text; }
+
+export function made(name, classes, text, parent) {
+  const one = document.createElement(name);
+  if (classes) one.className = classes;
+  if (text !== undefined) one.textContent = text;
+  parent?.append(one);
+  return one;
+}
+
+/* Writes a sweep's status, in the colour of what it means. */
+export function mark(chip, status) {
+  chip.textContent = status;
+  chip.dataset.tone = TONES[status] ?? "bad";
+}
+
+export function clock(ms) { return new Date(ms).toLocaleTimeString("en-GB"); }
+
+export function ago(ms) {
+  const s = Math.max(0, Math.round(ms / 1000));
+  if (s < 60) return `${s} s`;
+  if (s < 3600) return `${Math.floor(s / 60)} min ${String(s % 60).padStart(2, "0")} s`;
+  return s < 86400 ? `${Math.floor(s / 3600)} h ${Math.floor(s / 60) % 60} min` : `${Math.floor(s / 86400)} d ${Math.floor(s / 3600) % 24} h`;
+}
+
+export function percent(p) { return `${(100 * p).toFixed(1)} %`; }
+
+export function count(n) { return n.toLocaleString("en"); }

@@ -1,0 +1,192 @@
+"""The page of `palpate record --web`. In: what happens in the loop; orders of the page. Out: events of the page, and commands
+that the loop carries out between two turns, as it does those of the serial line.
+
+The loop hands over numbers and takes up one command a turn; nothing of a browser is waited for.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from queue import Empty, Full, Queue
+from typing import Any, Self
+
+from appliance.alignment.live import VIEW_NS, ContactTracker, Expected
+from appliance.core.clock import Clock
+from appliance.core.config import TriggerConfig
+from appliance.core.errors import ApplianceError, FormatError, NoAnswer
+from appliance.core.health import Health
+from appliance.core.observer import Observer
+from appliance.core.status import REASONS
+from appliance.core.types import Frames, Sweep, SweepFormat, Verdict
+from appliance.io.robot_link import Command
+from appliance.recording.recording import Labels
+from appliance.watch.access import Access
+from appliance.watch.server import PageServer
+from appliance.watch.sweep_picture import Window, picture
+
+MOST_WAITING = 16
+"""Commands that wait for the loop; a further one is refused at once."""
+PERIOD_NS = 1_000_000_000
+"""From one state of the recording to the next, where nothing changes."""
+LABELS = tuple(name.upper() for name in Labels.__slots__)
+TRIGGERS = {
+    "two-lines": "the robot's lines START and STOP",
+    "one-line": "the robot's line START",
+    "serial": "START and STOP, here or on the serial line",
+    "key": "the space bar in the terminal of palpate record",
+}
+"""What starts and stops sweeps, for a person."""
+
+Obey = Callable[[Command], list[object]]
+"""Carries out a command: the fields of its answer. Raises ApplianceError."""
+
+
+def order(body: bytes, allowed: Sequence[str]) -> Command:
+    """The command in what a page has sent: `{"command": "MATERIAL", "text": "wood"}`. allowed: names of commands.
+
+    Raises FormatError where it is none; ConfigError, as the command itself would, for a label that cannot be used.
+    """
+    try:
+        asked = json.loads(body)
+    except (ValueError, RecursionError) as e:
+        raise FormatError('an order is not json; send {"command": "MATERIAL", "text": "wood"}') from e
+    if not isinstance(asked, dict) or not asked.keys() <= {"command", "text"}:
+        raise FormatError('an order holds "command" and "text" and nothing else')
+    name, text = str(asked.get("command")), asked.get("text", "")
+    if name not in allowed or not isinstance(text, str):
+        raise FormatError(f"no order that the page has; its commands are {' '.join(allowed)}, each with a text or none")
+    if name in LABELS:
+        Labels(**{name.lower(): text.strip()})  # before a capture notes it
+    elif text and not (name == "DISCARD" and text.isascii() and text.isdecimal()):
+        raise FormatError(f"{name} takes no text, but for DISCARD the number of a sweep; leave it out")
+    return Command(name, text)
+
+
+class CommandQueue:
+    """Commands on their way from the server's thread to the loop, and their answers on the way back."""
+
+    def __init__(self) -> None:
+        self._waiting: Queue[tuple[Command, Future[list[object]]]] = Queue(MOST_WAITING)
+
+    def put(self, command: Command) -> Future[list[object]]:
+        """Have a command carried out; its answer. Raises NoAnswer where too many wait."""
+        answer: Future[list[object]] = Future()
+        try:
+            self._waiting.put_nowait((command, answer))
+        except Full:
+            raise NoAnswer(f"{MOST_WAITING} commands wait already; try again when they are carried out") from None
+        return answer
+
+    def carry_out(self, obey: Obey) -> bool:
+        """Carry out the next command that is still wanted, in the loop's thread; whether there was one."""
+        try:
+            while not (waiting := self._waiting.get_nowait())[1].set_running_or_notify_cancel():
+                pass
+        except Empty:
+            return False
+        command, answer = waiting
+        try:
+            answer.set_result(obey(command))
+        except ApplianceError as e:
+            answer.set_exception(e)
+        return True
+
+    def refuse(self) -> None:
+        """Answer whoever still waits."""
+        while self.carry_out(_ended):
+            pass
+
+
+def _ended(_: Command) -> list[object]:
+    raise NoAnswer("the recording has ended; this was not carried out")
+
+
+class RecordPage(Observer):
+    """The page of a recording at `access`; it is served while this is entered.
+
+    fmt: of the sweeps. source: where the frames come from. trigger: what starts and stops sweeps. about: see
+    RecordingSession.about. obey: carries out what the page orders, in the loop's thread. clock: the host's real one.
+    Raises ConfigError where the address cannot be used.
+    """
+
+    def __init__(
+        self, access: Access, fmt: SweepFormat, source: str, trigger: TriggerConfig, about: Callable[[], Mapping[str, Any]],
+        obey: Obey, clock: Clock,
+    ) -> None:  # fmt: skip
+        self._about, self._obey, self._clock = about, obey, clock
+        self._tracker = ContactTracker(Expected(fmt), source)
+        self._rate_hz = fmt.rate_hz
+        self._commands = (*LABELS, "NEXT", "DISCARD", *(("START", "STOP") if trigger.mode == "serial" else ()))
+        self._known = {
+            "source": source, "form": str(fmt), "trigger": trigger_words(trigger), "commands": self._commands,
+        }  # fmt: skip
+        self._queue = CommandQueue()
+        self._window: Window | None = None
+        self._drawn: tuple[Window, dict[str, Any]] | None = None
+        self._enumerations = 0
+        self._state: tuple[object, ...] = ()
+        self._state_ns = self._view_ns = clock.now_ns()
+        self.server = PageServer("record.html", access, clock.now_ns, {}, {"sweep": self._shown}, self._ordered)
+
+    def __enter__(self) -> Self:
+        self.server.__enter__()
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._queue.refuse()
+        self.server.__exit__(*reason)
+
+    def frames(self, frames: Frames) -> None:
+        """Keep the newest for the picture of the skin, while somebody looks at it."""
+        if self.server.watched:
+            self._tracker.put(frames.taxels)
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Show what a sweep has given. It comes after the recording has stored it."""
+        self._window = Window(sweep.id, self._rate_hz, sweep.frames.taxels) if len(sweep.frames) else None
+        self.server.publish("sweep", {
+            "sweep": sweep.id, "time_ns": self._clock.now_ns(), "status": verdict.status, "signal": bool(self._window),
+            "reason": REASONS.get(verdict.status, ""), "detail": verdict.detail, "lost": verdict.lost, "faulty": verdict.status.faulty,
+        })  # fmt: skip
+        self._state = ()
+
+    def turn(self, health: Health) -> None:
+        """Take up one command; show what has changed."""
+        if self._queue.carry_out(self._obey):
+            self._state = ()
+        now_ns = self._clock.now_ns()
+        if health.enumerations != self._enumerations:
+            self._enumerations = health.enumerations
+            self._tracker.reset()
+        state = health.skin, health.trouble, health.sweeping, health.ready
+        if state != self._state or now_ns - self._state_ns >= PERIOD_NS:
+            self._state, self._state_ns = state, now_ns
+            self.server.publish("recording", {
+                **self._known, **self._about(), "time_ns": now_ns, "skin": health.skin, "trouble": health.trouble,
+                "sweeping": health.sweeping, "ready": health.ready, "frames": health.frames,
+                "lost_frames": health.lost_frames if health.loss_known else None,
+            })  # fmt: skip
+        if self.server.watched and now_ns - self._view_ns >= VIEW_NS:
+            self._view_ns = now_ns
+            self.server.show(self._tracker.view(health.skin, health.trouble))
+
+    def _ordered(self, body: bytes) -> Future[list[object]]:
+        return self._queue.put(order(body, self._commands))
+
+    def _shown(self, which: str) -> dict[str, Any] | None:
+        """The picture of the last sweep, where it is this one; computed once, whoever asks and however often."""
+        window = self._window
+        if not window or window.sweep != int(which):
+            return None
+        if not self._drawn or self._drawn[0] is not window:
+            self._drawn = window, picture(window)
+        return self._drawn[1]
+
+
+def trigger_words(trigger: TriggerConfig) -> str:
+    """What starts and stops sweeps, for a person."""
+    if trigger.mode == "timed":
+        return f"the clock: {trigger.sweep_s:g} s in every {trigger.every_s:g} s"
+    return TRIGGERS[trigger.mode]

@@ -1,0 +1,114 @@
+"""A page of a recording whose turns a test takes, or a thread does; and what a browser sends to it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from appliance.core.clock import SystemClock
+from appliance.core.config import TriggerConfig
+from appliance.core.types import Frames, Status, Sweep, Verdict
+from appliance.io.robot_link import Command
+from appliance.recording.recording import Labels, RecordingSession
+from appliance.sim import skin
+from appliance.watch.access import Access
+from appliance.watch.record import RecordPage
+from tests.factories.feed_lines import load
+from tests.factories.feeds import HEALTH, OK, cut
+from tests.factories.page_client import EventReader, Page, ask, port
+
+KIND = "application/json"
+
+
+def ordered(page: Page, key: str, body: bytes | Mapping[str, str], **changed: str | None) -> bytes:
+    """The answer to an order as the page sends it, with other headers where a test changes them (None: without)."""
+    content = body if isinstance(body, bytes) else json.dumps(body).encode()
+    headers = {
+        "Origin": f"http://localhost:{port(page)}", "Content-Type": KIND, "X-Palpate-Key": key,
+        "Content-Length": str(len(content)), **{name.replace("_", "-"): value for name, value in changed.items()},
+    }  # fmt: skip
+    head = "".join(f"{name}: {value}\r\n" for name, value in headers.items() if value is not None)
+    return ask(page, "/order", "POST", f"localhost:{port(page)}", head, body=content)
+
+
+def key_of(page: Page) -> str:
+    """The key that a page gets with its events."""
+    reader = EventReader(page)
+    key = reader.until("key")
+    reader.socket.close()
+    return str(key)
+
+
+class RecordedPage:
+    """A recording in `folder` and its page, without a box: `turn` is a turn of the loop, which `going` takes by itself."""
+
+    def __init__(self, folder: Path, labels: Labels, target: int = 3, access: Access | None = None) -> None:
+        clock = SystemClock()
+        self.health, self.sweeps = replace(HEALTH, bundle="", source="sim"), 0
+        self.recording = RecordingSession(folder, skin.FORMAT, labels, clock, lambda line: None, target)
+        self.done: list[str] = []
+        self.page = RecordPage(
+            access or Access(0),
+            skin.FORMAT,
+            "sim",
+            TriggerConfig(mode="serial"),
+            self.recording.about,
+            self.obey,
+            clock,
+        )
+        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._going = threading.Thread(target=self._go)
+
+    def obey(self, command: Command) -> list[object]:
+        """Carry out a command of the recording; START and STOP change the state alone."""
+        self.done.append(command.line)
+        if command.name in ("START", "STOP"):
+            sweeping = command.name == "START"
+            self.health = replace(self.health, sweeping=sweeping, ready=not sweeping)
+            return []
+        return self.recording.commands[command.name](command.text)
+
+    def turn(self) -> None:
+        """One turn, with frames of a finger that rests on the skin."""
+        with self._lock:
+            n = np.arange(20)
+            taxels = np.broadcast_to(load(1.5, 1.5), (20, 4, 4)).astype(np.uint8)
+            self.page.frames(Frames(n, n, taxels))
+            self.page.turn(self.health)
+
+    def sweep(self, status: Status = Status.RECORDED, detail: str = "") -> int:
+        """A sweep is answered; its number."""
+        with self._lock:
+            answered = self.answered(status, detail)
+            for observer in (self.recording, self.page):
+                observer.sweep(*answered, {})
+        return self.sweeps
+
+    def answered(self, status: Status, detail: str = "") -> tuple[Sweep, Verdict]:
+        """The next sweep, with a window if the status has one, and what it is answered."""
+        self.sweeps += 1
+        frames = Frames.empty(skin.FORMAT) if status in (Status.SHORT, Status.GAP) else cut().frames
+        one = replace(cut(), id=self.sweeps, start_ns=SystemClock().now_ns(), frames=frames)
+        return one, replace(OK, sweep=self.sweeps, status=status, label="", detail=detail, scores=np.empty(0))
+
+    def __enter__(self) -> Self:
+        """Serve the page, and take turns."""
+        self.page.__enter__()
+        self._going.start()
+        return self
+
+    def __exit__(self, *reason: Any) -> None:
+        self._ended.set()
+        self._going.join()
+        self.page.__exit__(*reason)
+        self.recording.close()
+
+    def _go(self) -> None:
+        while not self._ended.wait(0.02):
+            self.turn()
