@@ -16,6 +16,8 @@ from appliance.bridges.sweep import CommandedSweep
 from appliance.client.answers import Answer
 from appliance.core.errors import ApplianceError
 
+LOG_S = 5.0
+"""At most one line of the log about rejected goals in this time."""
 END_S = 10.0
 """Longest wait for a sweep that was interrupted: it may be asking the box."""
 
@@ -49,7 +51,7 @@ class SweepAction:
     def _admit(self, goal: Any) -> GoalResponse:
         if self._busy.acquire(blocking=False):
             return GoalResponse.ACCEPT
-        self._log.warning("~/sweep: a goal was rejected, another one is under way")
+        self._log.warning("~/sweep: a goal was rejected, another one is under way", throttle_duration_sec=LOG_S)
         return GoalResponse.REJECT
 
     def _execute(self, goal: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,9 @@ from typing import Any
 import pytest
 
 from appliance.core.sentences import Sentence
+from appliance.core.status import Status
 from tests.factories import ros
-from tests.factories.bridges import LONG_S, eventually
+from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.ros import RosPeer
 from tests.factories.speaking_box import SpeakingBox, obeying, result, state
 
@@ -239,6 +241,46 @@ def test_with_the_messages_nothing_is_said_of_them(box: SpeakingBox, tmp_path: P
     ):  # fmt: skip
         ready(box, peer)
     assert b"~/sweep is not offered" not in (tmp_path / "log").read_bytes()
+
+
+@pytest.mark.slow
+def test_with_the_box_itself(tmp_path: Path):
+    """The box's program on a simulated skin, a bridge on its line, another node: sweeps are numbered, timed and answered by
+    it, whatever the simulated finger did; a second START is what the box makes of it."""
+    quiet = ["--set", "feed.socket=", "--set", "store.status=", "--set", "store.folder=/nonexistent"]
+    line = tmp_path / "line"
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "run",
+        "--sim",
+        "skin",
+        "--trigger",
+        "serial",
+        "--set",
+        f"serial.port={line}",
+    ]
+    with (
+        bridge("tcp", "--link", line, "--allow-writes") as address,
+        subprocess.Popen([*command, *quiet], cwd=ros.ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run,
+        ros.peer() as peer,
+        ros.bridge("-p", f"port:=socket://{address[0]}:{address[1]}", *WRITES),
+    ):
+        try:
+            eventually(lambda: peer.on("state") != [])
+            for number in (1, 2):
+                found = swept(peer, slide_s=2.5, timeout_s=LONG_S)
+                assert (found["sweep"], found["share"]) == (number, 1)
+                status = Status(found["status"])
+                answered = status.classified or status is Status.UNKNOWN
+                assert found["state"] == ("succeeded" if answered else "aborted")
+            begun(peer)
+            assert peer.call("start")["success"]
+            ended = later(peer, 2)
+            assert (ended["state"], ended["status"]) == ("aborted", "no-stop")
+        finally:
+            run.terminate()
 
 
 def test_the_definition_is_what_was_built():
