@@ -25,6 +25,7 @@ from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.moved import AugmentedCopies, MovedFit, displaced, fit_moved
 from train.calibration.novelty import Embedding
 from train.calibration.temperature import fit_temperature
+from train.models.compact.augment import Augmentation
 from train.models.compact.copies import COPIES, copies
 from train.models.compact.fitted import Fit
 from train.models.compact.heads import HeadPart, HeadPlan
@@ -32,8 +33,14 @@ from train.onnx_tools.graph_builder import joined, run
 from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
-HELD_COPIES_SEED = 1
-"""Added to a fit's seed for the copies of its held-out sweeps."""
+HELD_COPIES_SEED, DISTURBED_SEED = 1, 2
+"""Added to a fit's seed for the copies of its held-out sweeps, and for disturbed ones."""
+DISTURBED = Augmentation(
+    moved=0.0, gain=0.1, gains=0.05, silent=0.06, damped=0.0, colour=0.0, noise=0.4, hum=0.3, drift=0.1
+)
+"""What may happen to a known material in service: a worse amplifier, the mains, a taxel that fails."""
+ONE_IN = 10
+"""One in so many training sweeps is disturbed so; docs/decisions/0006 has what other shares gave."""
 DIRECTIONS, TURN, OFFSET = "embedding.axes", "embedding.turn", "embedding.offset"
 """Names of a model's matrices; see novelty.Embedding."""
 
@@ -112,19 +119,23 @@ def calibrate(fit: Fit) -> Posthoc:
     return fit_posthoc(*posthoc_inputs(fit))
 
 
-def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies, HeadPlan]:
-    """The arguments of `fit_posthoc`: what the int8 trunk gives for the sweeps that were trained on and held out, in this
-    order, and for augmented copies of both; those of the training sweeps are the ones that its head was fitted to, those of
-    the others judge what a moved skin does.
+def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies, HeadPlan, Array]:
+    """The arguments of `fit_posthoc`: what the int8 trunk gives for the sweeps that were trained on, held out and disturbed,
+    in this order, and for augmented copies of the first two; those of the training sweeps are the ones that its head was
+    fitted to, those of the others judge what a moved skin does.
 
     Raises FormatError where none was held out: nothing could judge.
     """
     train, held, by = fit.train, fit.held, fit.about["held_out_by"]
     if by == "nothing":
         raise FormatError(f"{train.source}: too few groups to hold some out; record more positions")
-    tenths = run(fit.trunk(tenths=True), np.concatenate([train.samples, held.samples]))
-    labels, groups = np.append(train.labels, held.labels), np.append(train.group(by), held.group(by))
     trunk, features, seed = fit.trunk(), [], fit.about["seed"]
+    some = train.take(np.random.default_rng(seed + DISTURBED_SEED).permutation(len(train))[::ONE_IN])
+    (disturbed,) = copies(some, DISTURBED, seed + DISTURBED_SEED, 1)
+    of_all = train, held, disturbed
+    tenths = run(fit.trunk(tenths=True), np.concatenate([sweeps.samples for sweeps in of_all]))
+    labels, groups = (np.concatenate(part) for part in zip(*((s.labels, s.group(by)) for s in of_all), strict=True))
+    role = np.repeat(np.arange(3), [len(sweeps) for sweeps in of_all])
     judging = displaced(fit.augmentation)
     for sweeps, change, drawn in ((train, fit.augmentation, seed), (held, judging, seed + HELD_COPIES_SEED)):
         features += [run(trunk, copy.samples) for copy in copies(sweeps, change, drawn, COPIES)]
@@ -132,27 +143,30 @@ def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, Augmented
     copied_groups = np.append(np.tile(train.group(by), COPIES), np.tile(held.group(by), COPIES))
     is_held = np.repeat([False, True], [len(side) for side in sides])
     copied = AugmentedCopies(np.concatenate(features), np.concatenate(sides), copied_groups, is_held)
-    return tenths, labels, groups, np.arange(len(labels)) >= len(train), fit.bands, copied, fit.plan
+    return tenths, labels, groups, role == 1, fit.bands, copied, fit.plan, role == 2
 
 
 def fit_posthoc(
     tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, copied: AugmentedCopies | None = None,
-    plan: HeadPlan | None = None,
+    plan: HeadPlan | None = None, disturbed: Array | None = None,
 ) -> Posthoc:  # fmt: skip
     """Fit all of it to features [N, D + 1, F] of sweeps with labels [N] from 0 to K - 1, of groups [N].
 
     judged: bool [N], sweeps that the trunk did not see. Only these find temperatures and rule, each with heads that did
     not see its group. fixed: so many features, the last ones, were not trained; see novelty.embed. Where there are some,
     most of a distance is in them, and all sweeps find its limit: of more positions, so that it is less a matter of chance.
-    plan: of the head that names the material; None for one discriminant that sees everything.
+    plan: of the head that names the material; None for one discriminant that sees everything. disturbed: bool [N], sweeps
+    that only show how far known materials scatter when something is wrong: the head does not see them, and they judge nothing.
     Raises FormatError as novelty.embed, and where there is only one group or nothing to judge by.
     """
     whole, classes, every = tenths[:, -1], int(labels.max()) + 1, np.ones(len(labels), bool)
+    sound = every if disturbed is None else ~disturbed
     more = copied or AugmentedCopies(whole[:0], labels[:0], groups[:0], every[:0])
     plan = plan or HeadPlan((HeadPart(tuple(range(whole.shape[1])), copies=True),))
 
     def naming_head(fit: Array) -> tuple[Array, Array]:
         """The head fitted to the groups in `fit`, bool [N]."""
+        fit = fit & sound
         also = more.take(np.isin(more.groups, groups[fit]) & ~more.held)
         weight, bias = plan.fit((whole[fit], labels[fit], also.features, also.labels), classes)
         return weight.T, bias
@@ -169,7 +183,7 @@ def fit_posthoc(
     rule = early_exit.find_rule(p, labels[numbers])
     embedding, last = novelty.embed(whole, labels, fixed), float(temperatures[-1])
     steps = early_exit.heads(embedding(tenths), labels, classes).cooled(temperatures[:-1])
-    distances = novelty.cross_fitted_distances(whole, labels, groups, judged | (fixed > 0), fixed)
+    distances = novelty.cross_fitted_distances(whole, labels, groups, (judged | (fixed > 0)) & sound, fixed)
     limit = novelty.limit(distances)
     held = HeldOut(numbers, p[:, -1], distances[numbers] <= limit)
     moved = None

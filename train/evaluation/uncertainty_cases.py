@@ -59,6 +59,7 @@ class Case:
     0 on without the one left out; seen_groups [N]: positions or recordings; judged: bool [N], those that the trunk did
     not see, which may judge. copied: features [M, F] of augmented copies, of copied_labels, copied_groups and
     copied_held [M]; see AugmentedCopies.
+    disturbed: bool [N] of the seen sweeps; see posthoc.fit_posthoc.
     new, labels, places: features of test sweeps, the set's labels, and where the skin sat. plan: HeadPlan.json as text.
     """
 
@@ -76,6 +77,7 @@ class Case:
     new: Array
     labels: Array
     places: Array
+    disturbed: Array
     plan: str = ""
 
     def known(self) -> Array:
@@ -87,7 +89,9 @@ class Case:
         """What is fitted on the trunk of this training."""
         copies = AugmentedCopies(self.copied, self.copied_labels, self.copied_groups, self.copied_held)
         plan = HeadPlan.read(json.loads(self.plan)) if self.plan else None
-        return fit_posthoc(self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies, plan)
+        return fit_posthoc(
+            self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies, plan, self.disturbed
+        )
 
     def numbered(self) -> Array:
         """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out mean nothing."""
@@ -112,12 +116,12 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).fit  # type: ignore[attr-defined]
-    seen, seen_labels, seen_groups, judged, fixed, copies, plan = posthoc_inputs(made)
+    seen, seen_labels, seen_groups, judged, fixed, copies, plan, disturbed = posthoc_inputs(made)
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
         task.left_out, task.fold, fixed, seen, seen_labels, seen_groups, judged, copies.features, copies.labels, copies.groups,
         copies.held, run_graph(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
-        json.dumps(plan.json()),
+        disturbed, json.dumps(plan.json()),
     )  # fmt: skip
 
 

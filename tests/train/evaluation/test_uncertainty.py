@@ -42,7 +42,7 @@ def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, place
     x, y, at = x[keep], y[keep], at[keep]
     seen = at % 2 == 1
     copied = x[:, -1] + np.random.default_rng(9).normal(0, 0.1, (len(x), 4))
-    return Case(left_out, fold, 2, x, y, at, ~seen, copied, y, at, ~seen, new, labels, there)
+    return Case(left_out, fold, 2, x, y, at, ~seen, copied, y, at, ~seen, new, labels, there, np.zeros(len(y), bool))
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,8 @@ def test_of_two_materials_none_is_left_out():
     two, test = one.seen_labels < 2, one.labels < 2
     also = one.copied_labels < 2
     one = Case(NONE_LEFT_OUT, 0, 2, one.seen[two], one.seen_labels[two], one.seen_groups[two], one.judged[two], one.copied[also],
-               one.copied_labels[also], one.copied_groups[also], one.copied_held[also], one.new[test], one.labels[test], one.places[test])  # fmt: skip
+               one.copied_labels[also], one.copied_groups[also], one.copied_held[also], one.new[test], one.labels[test], one.places[test],
+               one.disturbed[two])  # fmt: skip
     figures = uncertainty.figures([one], NAMES[:2], 1)
     assert set(figures) == {"calibration", "sequence", "early"}
     html, pictures = uncertainty_report.render(figures | dict.fromkeys(ABOUT, "x"))

@@ -1,0 +1,52 @@
+"""What is fitted after training: what disturbed sweeps are for, and what they must not touch."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.factories.sweep_sets import easy
+from train.calibration.posthoc import ONE_IN, fit_posthoc, posthoc_inputs
+from train.models.compact import recipe
+
+NOISE = np.array([0.0, 0.0, 0.0, 12.0])
+"""What disturbs: in the last feature, where no material differs from another."""
+
+
+def world(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Features [N, 10, 4] of three materials at eight places, labels [N], places [N]."""
+    labels, places = np.tile(np.repeat(np.arange(3), n), 8), np.repeat(np.arange(8), 3 * n)
+    means = 9 * np.eye(3, 4)
+    x = means[labels][:, None] + np.random.default_rng(1).standard_normal((len(labels), 1, 4)) + np.zeros((1, 10, 1))
+    return x, labels, places
+
+
+def test_a_disturbed_sweep_of_a_known_material_stays_known():
+    """One in ten of the sweeps is disturbed: then others are no longer unknown. A third material still is, and head, temperature and
+    what judges are as they were."""
+    x, y, at = world()
+    known = y < 2
+    one = np.arange(known.sum()) % ONE_IN == 0
+    factors = np.random.default_rng(2).uniform(-1, 1, (one.sum(), 1, 1))
+    more = [np.concatenate([of[known], of[known][one]]) for of in (x, y, at)]
+    more[0][known.sum() :] += factors * NOISE
+    disturbed = np.arange(len(more[0])) >= known.sum()
+    plain = fit_posthoc(x[known], y[known], at[known], np.ones(known.sum(), bool), 1)
+    sturdy = fit_posthoc(*more, ~disturbed, 1, disturbed=disturbed)
+    shaken = x[known][:, -1] + NOISE / 3
+    kept = [np.mean(done.embedding.novelty(shaken) <= done.limit) for done in (plain, sturdy)]
+    assert kept[0] < 0.3
+    assert kept[1] > 0.8
+    assert np.mean(sturdy.embedding.novelty(x[~known][:, -1]) <= sturdy.limit) < 0.05
+    np.testing.assert_array_equal(sturdy.weight * sturdy.temperature, plain.weight * plain.temperature)
+    assert (sturdy.held.numbers < known.sum()).all()
+
+
+def test_disturbed_sweeps_are_of_those_that_were_trained_on():
+    """One in ten of them, changed, of the same materials and groups; none judges."""
+    fit = recipe.fit(easy(), 1, recipe.Settings(steps=0))
+    tenths, labels, groups, judged, _, _, _, disturbed = posthoc_inputs(fit)
+    assert len(tenths) == len(labels) == len(groups) == len(fit.train) + len(fit.held) + disturbed.sum()
+    assert disturbed.sum() == -(-len(fit.train) // ONE_IN)
+    assert not (judged & disturbed).any()
+    assert not set(groups[disturbed]) & set(groups[judged])
+    assert not any((tenths[~disturbed] == row).all(axis=(1, 2)).any() for row in tenths[disturbed])
