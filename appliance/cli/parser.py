@@ -128,6 +128,22 @@ def _service_commands(
     record = add("record", "keep each sweep with its label, for training; needs no bundle", devices, answers, trigger)
     for command in (run, record):
         command.add_argument("--capture", type=Path, metavar="FILE", help="write all input to FILE, for replay")
+    _record_options(record)
+    enrol = add(
+        "enrol", "learn one more material from a few sweeps, without training; write a new bundle", devices, trigger
+    )
+    enrol.add_argument("label", metavar="LABEL", help="its name; all sweeps from now on are of this material")
+    enrol.add_argument("--out", type=Path, required=True, metavar="DIR", help="the new bundle's folder")
+    enrol.add_argument("--replace", action="store_true", help="replace a bundle at DIR")
+    enrol.add_argument(
+        "--sweeps", type=int, choices=range(1, MOST_SWEEPS + 1), default=5, dest="good", metavar="N",
+        help=f"how many good sweeps it takes, 1 to {MOST_SWEEPS} (default 5)",
+    )  # fmt: skip
+    enrol.add_argument("--scattered", action="store_true", help="even if the sweeps are unlike one another")
+
+
+def _record_options(record: argparse.ArgumentParser) -> None:
+    """What `record` alone takes."""
     record.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the sweeps (default: sweeps/ in the store's folder)"
     )
@@ -147,17 +163,6 @@ def _service_commands(
         "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
         help=f"also as a page, on which the labels are set (default port {WEB_PORT}); watch.address opens it to the network",
     )  # fmt: skip
-    enrol = add(
-        "enrol", "learn one more material from a few sweeps, without training; write a new bundle", devices, trigger
-    )
-    enrol.add_argument("label", metavar="LABEL", help="its name; all sweeps from now on are of this material")
-    enrol.add_argument("--out", type=Path, required=True, metavar="DIR", help="the new bundle's folder")
-    enrol.add_argument("--replace", action="store_true", help="replace a bundle at DIR")
-    enrol.add_argument(
-        "--sweeps", type=int, choices=range(1, MOST_SWEEPS + 1), default=5, dest="good", metavar="N",
-        help=f"how many good sweeps it takes, 1 to {MOST_SWEEPS} (default 5)",
-    )  # fmt: skip
-    enrol.add_argument("--scattered", action="store_true", help="even if the sweeps are unlike one another")
     enrol.set_defaults(sweeps=None)
 
 
