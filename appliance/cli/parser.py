@@ -140,6 +140,7 @@ def _service_commands(
         help=f"how many good sweeps it takes, 1 to {MOST_SWEEPS} (default 5)",
     )  # fmt: skip
     enrol.add_argument("--scattered", action="store_true", help="even if the sweeps are unlike one another")
+    enrol.set_defaults(sweeps=None)
 
 
 def _record_options(record: argparse.ArgumentParser) -> None:
@@ -163,7 +164,6 @@ def _record_options(record: argparse.ArgumentParser) -> None:
         "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
         help=f"also as a page, on which the labels are set (default port {WEB_PORT}); watch.address opens it to the network",
     )  # fmt: skip
-    enrol.set_defaults(sweeps=None)
 
 
 def _local_commands(
