@@ -35,6 +35,12 @@ from appliance.service.status import Report
 MOST_READERS = 64
 QUEUE_BYTES = 64 * 1024
 """What waits for one reader; lines that several readers wait for are held once."""
+SWEEP_BYTES = 640 * 1024
+"""Most of a line with a window. Of those that are larger than a queue there is one at a time, held once for all readers."""
+TAKE_NS = 5_000_000_000
+"""When the next of these comes, a reader that has not taken the last one within this time is closed."""
+HEAD_BYTES = 512
+"""At most what stands beside the data in a line with a window."""
 MOST_REQUEST = 1024
 """Bytes of a request."""
 MOST_HZ = 20.0
@@ -110,6 +116,19 @@ def encode(kind: str, content: Mapping[str, Any]) -> bytes:
     return text.encode() + b"\n"
 
 
+def _sweep_line(sweep: Sweep) -> bytes:
+    """The line with a sweep's window; its data are copied as few times as possible."""
+    taxels = sweep.frames.taxels
+    about = {"sweep": sweep.id, "start_ns": sweep.start_ns, "shape": taxels.shape, "dtype": str(taxels.dtype)}
+    data = b2a_base64(taxels.astype(taxels.dtype.newbyteorder("<"), order="C", copy=False), newline=False)
+    return b"".join((encode("sweep", about)[:-2], b', "data": "', data, b'"}\n'))
+
+
+def _weight(line: bytes) -> int:
+    """What a line takes of a reader's queue: one that is larger than it is not the reader's own."""
+    return len(line) if len(line) <= QUEUE_BYTES else 0
+
+
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _finite(v) for name, v in value.items()}
@@ -138,19 +157,23 @@ class Reader:
     def put(self, line: bytes) -> None:
         """Queue a line; the oldest that were not begun give way to it."""
         self._queue.append(line)
-        self._size += len(line)
+        self._size += _weight(line)
         first = 1 if self._begun else 0
         while self._size > QUEUE_BYTES and len(self._queue) > first:
-            self._size -= len(self._queue[first])
+            self._size -= _weight(self._queue[first])
             del self._queue[first]
             self._lost += 1
 
     def put_or_miss(self, line: bytes | None) -> None:
-        """Queue a line where there is room, else count it as lost. None: it is larger than any room."""
-        if line is None or self._size + len(line) > QUEUE_BYTES:
+        """Queue a line where there is room, else count it as lost. None: there is no room for it with anybody."""
+        if line is None or self._size + _weight(line) > QUEUE_BYTES:
             self._lost += 1
         else:
             self.put(line)
+
+    def takes(self, line: bytes) -> bool:
+        """Whether this line waits, or was begun."""
+        return any(one is line for one in self._queue)
 
     def send(self) -> None:
         """Send what the reader takes now; between two lines it first gets to know how many it has lost.
@@ -188,9 +211,9 @@ class Reader:
         """Send what it takes at once, and why it is closed; a line that was begun is not cut by another."""
         with suppress(OSError):
             while self.waits:
-                before = self._size
+                before = len(self._queue)
                 self.send()
-                if self._size == before:
+                if len(self._queue) == before:
                     break
             if why and not self.waits:
                 self.connection.send(encode("closed", {"why": why}))
@@ -198,10 +221,10 @@ class Reader:
 
     def _prepend(self, line: bytes) -> None:
         self._queue.appendleft(line)
-        self._size += len(line)
+        self._size += _weight(line)
 
     def _drop_first(self) -> None:
-        self._size -= len(self._queue.popleft())
+        self._size -= _weight(self._queue.popleft())
 
 
 class FeedServer(Observer):
@@ -226,6 +249,7 @@ class FeedServer(Observer):
         self._readers: dict[int, Reader] = {}
         self._due: deque[Reader] = deque()  # those with something to send, in the order in which they get their turn
         self._newest: Frames | None = None
+        self._large, self._large_ns = b"", 0  # the last line that was larger than a queue, and when it came
         self._retry_ns = self._health_ns = self._next_ns = clock.now_ns()
         self._tick, self._fresh = 0, False
         self._state: tuple[object, ...] = ()
@@ -244,17 +268,18 @@ class FeedServer(Observer):
             self._fresh = True
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Have the window of a sweep sent to those who asked for it; one larger than a queue is lost to them."""
+        """Have the window of a sweep sent to those who asked for it; one for which there is no room is lost to them."""
         asked = [reader for reader in self._readers.values() if reader.sweeps]
         if not (asked and len(sweep.frames)):
             return
-        taxels, line = sweep.frames.taxels, None
-        if taxels.nbytes * 4 // 3 < QUEUE_BYTES:
-            line = encode("sweep", {
-                "sweep": sweep.id, "start_ns": sweep.start_ns, "shape": taxels.shape, "dtype": str(taxels.dtype),
-                "data": b2a_base64(taxels.astype(taxels.dtype.newbyteorder("<"), copy=False).tobytes(), newline=False).decode(),
-            })  # fmt: skip
+        size = sweep.frames.taxels.nbytes * 4 // 3 + HEAD_BYTES
+        small, now_ns = size <= QUEUE_BYTES, self._clock.now_ns()
+        line = _sweep_line(sweep) if small or (size <= SWEEP_BYTES and self._last_is_taken(now_ns)) else None
+        if line and not small:
+            self._large, self._large_ns = line, now_ns
         for reader in asked:
+            if reader.connection.fileno() < 0:  # closed for the sake of this one
+                continue
             reader.put_or_miss(line)
             self._let_wait(reader)
 
@@ -296,6 +321,16 @@ class FeedServer(Observer):
             self._listener = None
             with suppress(OSError):
                 self._path.unlink()
+
+    def _last_is_taken(self, now_ns: int) -> bool:
+        """Whether no reader takes the last large line any more; who has had its time for that is closed."""
+        taking = [reader for reader in self._readers.values() if reader.takes(self._large)]
+        if taking and now_ns < self._large_ns + TAKE_NS:
+            return False
+        for reader in taking:
+            self._close(reader, f"it has not taken a sweep within {TAKE_NS / 1e9:g} s; read without pause")
+        self._large = b""
+        return True
 
     def _offer(self, now_ns: int) -> socket.socket | None:
         """Bind the socket where it is time to try; None where it is not bound."""

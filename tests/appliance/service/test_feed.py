@@ -167,9 +167,95 @@ def test_the_window_of_a_sweep_comes_bit_for_bit(offered: Offered) -> None:
     assert "sweep" not in kinds(other.lines())
 
 
+LARGE = SweepFormat(16, 32, 100.0, 200, "uint8")
+"""A large skin: 102,400 counts in a window, 137 kB as text."""
+
+
+@pytest.fixture
+def large(tmp_path: Path) -> Iterator[Offered]:
+    """The feed of a large skin that has taken its first turn."""
+    one = Offered(tmp_path / "large.sock", LARGE)
+    one.turns()
+    yield one
+    one.feed.stopping()
+
+
+def asking(offered: Offered) -> FeedPeer:
+    """A reader that was heard asking for sweeps."""
+    peer = offered.peer()
+    peer.ask('{"sweeps": true}')
+    offered.turns(2)
+    peer.lines()
+    return peer
+
+
+def test_the_window_of_a_large_skin_comes_bit_for_bit(large: Offered) -> None:
+    """Over 64 kB, in pieces as the readers take them, with other lines in their order; it is held once for both."""
+    peers = [asking(large), asking(large)]
+    sweep = cut(LARGE)
+    large.feed.answered(OK)
+    large.feed.sweep(sweep, OK, {})
+    large.feed.answered(replace(OK, sweep=8))
+    one, other = large.feed._readers.values()
+    assert one.takes(large.feed._large)
+    assert other.takes(large.feed._large)
+    got: list[list[dict[str, Any]]] = [[], []]
+    for _ in range(20):
+        large.turns()
+        for lines, peer in zip(got, peers, strict=True):
+            lines += peer.lines()
+    for lines in got:
+        assert [kind for kind in kinds(lines) if kind != "health"] == ["verdict", "sweep", "verdict"]
+        (line,) = (line for line in lines if line["type"] == "sweep")
+        assert (line["sweep"], line["start_ns"], line["shape"], line["dtype"]) == (7, 5, [200, 16, 32], "uint8")
+        assert b64decode(line["data"]) == sweep.frames.taxels.tobytes()
+    assert not any(reader.takes(large.feed._large) for reader in (one, other))
+
+
+def test_one_large_window_is_on_its_way_at_a_time(large: Offered) -> None:
+    """While a reader takes none, the next one is lost to all; after five seconds the reader is closed, and told why when it
+    reads in the end; the other one gets the third."""
+    slow, quick = asking(large), asking(large)
+    got: list[dict[str, Any]] = []
+
+    def turns(n: int) -> None:
+        for _ in range(n):
+            large.turns()
+            got.extend(quick.lines())
+
+    for wait in (20, 200, 20):
+        large.feed.sweep(cut(LARGE), OK, {})
+        turns(wait)
+    assert [kind for kind in kinds(got) if kind != "health"] == ["sweep", "lost", "sweep"]
+    assert len(large.feed._readers) == 1
+    assert "sweep" not in kinds(slow.lines())
+    assert slow.ended
+
+
+def test_readers_that_never_read_hold_one_large_window(large: Offered) -> None:
+    """Sixty-four of them, and a sweep a second: the box holds less than 2 MiB more, and goes on serving who reads."""
+    peers = [asking(large) for _ in range(MOST_READERS - 1)]
+    quick = asking(large)
+    quick.lines()
+    got: list[str] = []
+    gc.collect()
+    tracemalloc.start()
+    for _ in range(12):
+        large.feed.sweep(cut(LARGE), OK, {})
+        for _ in range(34):
+            large.turns()
+            got += kinds(quick.lines())
+    held, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 2 << 20
+    assert held < 1 << 20
+    assert got.count("sweep") > 3
+    assert len(large.feed._readers) < len(peers)
+
+
 def test_a_window_that_is_too_large_is_counted(tmp_path: Path) -> None:
-    """128 kB of counts do not fit into a queue of 64 kB: the reader is told of one line that it has lost."""
-    fmt = SweepFormat(8, 8, 500.0, 1000, "uint16")
+    """Over 640 kB: the reader is told of one line that it has lost."""
+    fmt = SweepFormat(32, 32, 100.0, 250, "uint16")
     offered = Offered(tmp_path / "feed.sock", fmt)
     peer = offered.peer()
     peer.ask('{"sweeps": true}')
