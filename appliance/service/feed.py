@@ -120,7 +120,7 @@ def _sweep_line(sweep: Sweep) -> bytes:
     """The line with a sweep's window; its data are copied as few times as possible."""
     taxels = sweep.frames.taxels
     about = {"sweep": sweep.id, "start_ns": sweep.start_ns, "shape": taxels.shape, "dtype": str(taxels.dtype)}
-    data = b2a_base64(taxels.astype(taxels.dtype.newbyteorder("<"), order="C", copy=False), newline=False)
+    data = b2a_base64(taxels.astype(taxels.dtype.newbyteorder("<"), order="C", copy=False).data, newline=False)
     return b"".join((encode("sweep", about)[:-2], b', "data": "', data, b'"}\n'))
 
 
