@@ -15,7 +15,8 @@ from appliance.core.errors import LinkLost
 from appliance.core.sentences import Sentence, sentence
 
 PACE_S = 0.02
-"""Time between two commands to the box, of all peers together: its loop answers each, and a flood must not reach it."""
+"""Time between two commands to the box, of all peers together: its loop answers each, and a flood must not reach it. Also
+between two of one peer, refused ones too, so that a peer that floods leaves the others their turn."""
 ANSWER_S = 2.0
 """Longest wait for the box to answer a command."""
 QUESTIONS = ("ID", "STATE", "LABEL")
@@ -65,6 +66,7 @@ class TcpBridge:
             found, rest = sentences.parse(data, rest)
             for command in found:
                 peer.write(await self._ask(command))
+                await asyncio.sleep(PACE_S)
 
     async def _ask(self, command: Sentence) -> bytes:
         """The box's answer to a command, or one that says why it has none."""

@@ -118,33 +118,41 @@ def sluggish(path: str, seen: Counter[str]) -> Act:
     return act
 
 
-def talker(path: Address, seen: Counter[str], said: Callable[[], bytes]) -> Act:
-    """One that sends without end, and comes again when it is closed."""
+def talker(path: Address, seen: Counter[str], said: Callable[[], bytes], *, reads: bool = False) -> Act:
+    """One that sends without end, and comes again when it is closed. reads: takes what it gets."""
     held: list[socket.socket] = []
+
+    def goes_on() -> bool:
+        if reads and select.select(held, [], [], 0)[0]:
+            with suppress(OSError):
+                return bool(held[0].recv(1 << 16)) and send(held[0], said())
+            return False
+        return send(held[0], said())
 
     def act() -> None:
         if not held:
             one = connected(path)
             held.extend([one] if one else [])
             seen["attempts"] += len(held)
-        elif not send(held[0], said()):
+        elif not goes_on():
             held.pop().close()
 
     return act
 
 
-def storm(path: Address, seen: Counter[str]) -> Act:
-    """Connections by the hundred: as many as the box lets wait, held until there are STORM; the oldest then go."""
+def storm(path: Address, seen: Counter[str], half: bytes = b'{"fra', burst: int = 20) -> Act:
+    """Connections by the hundred: as many as the box lets wait, held until there are STORM; the oldest then go. half: what
+    some of them say, and no more. burst: connections of a round."""
     held: list[socket.socket] = []
 
     def act() -> None:
-        for _ in range(20):
+        for _ in range(burst):
             one = connected(path)
             if one is None:
                 break
             seen["attempts"] += 1
             if random.random() < 0.3:
-                send(one, b'{"fra')
+                send(one, half)
             held.append(one)
             if len(held) > STORM:
                 held.pop(0).close()

@@ -209,11 +209,15 @@ class ThisMachine:
     def _read(self, wait_s: float) -> list[tuple[float, str]]:
         if not select.select([self._far], [], [], wait_s)[0]:
             return []
-        *lines, self._rest = (self._rest + os.read(self._far, 65536)).split(b"\r\n")
+        *lines, self._rest = (self._rest + self._said()).split(b"\r\n")
         found = [(time.monotonic(), line.decode("ascii", "replace")) for line in lines]
         for at_s, line in found:
             self._robot.hear(at_s, line)
         return found
+
+    def _said(self) -> bytes:
+        """What the box has sent."""
+        return os.read(self._far, 65536)
 
     def _log_text(self) -> str:
         return self._log.read_text(errors="replace").strip()[-300:]

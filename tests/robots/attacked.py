@@ -1,9 +1,9 @@
 """What bridges cost the box, and bridges under attack: `python -m tests.robots.attacked --minutes 2`. In: minutes for each
 case. Out: a table, docs/robots/attacked.json; exit code 1 if a frame, a sentence or an answer was lost.
 
-One box (`palpate run --sim skin`, in real time) meets all cases in turns of SLOT_S, so that all had the same machine: no bridge,
-Modbus and ROS 2 on its feed, the same with peers that flood the Modbus bridge with requests, noise and connections. Box and
-listener run with real-time priority where `chrt` may be used.
+One box (`palpate run --sim skin`, in real time) meets all cases in turns of SLOT_S, so that all had the same machine: no bridge;
+Modbus and ROS 2 on its feed and TCP on its line; the same with peers that flood Modbus and TCP bridge with requests, noise and
+connections. Box and listener run with real-time priority where `chrt` may be used.
 """
 
 from __future__ import annotations
@@ -23,23 +23,38 @@ from tests.campaigns.feed_load import REAL_TIME, SETTLE_S, SLOT_S, Kind, Latency
 from tests.factories import ros
 from tests.factories.bridges import bridge
 from tests.factories.paths import ROOT
-from tests.rig.soak_boxes import Script, ThisMachine
+from tests.rig.soak_boxes import Script
 from tests.robots import page
+from tests.robots.shared_line import SharedLine
 
-CASES = {"0": "no bridge", "bridges": "Modbus and ROS 2 on the feed", "attacked": "the same, Modbus attacked"}
+CASES = {
+    "0": "no bridge", "bridges": "Modbus and ROS 2 on the feed, TCP on the line", "attacked": "the same, Modbus and TCP attacked",
+}  # fmt: skip
 
 
-def slot(name: str, feed: Path, box: ThisMachine, listener: LatencyListener, kind: Kind) -> None:
+def attack(stack: ExitStack, kind: str, port: int) -> subprocess.Popen[bytes]:
+    """Peers that mean it ill; they end with their input, and say what they did."""
+    command, pipe = [sys.executable, "-m", "tests.robots.attackers", kind, str(port)], subprocess.PIPE
+    return stack.enter_context(subprocess.Popen(command, stdin=pipe, stdout=pipe, cwd=ROOT))
+
+
+def said(attackers: subprocess.Popen[bytes]) -> dict[str, int]:
+    """End them; what they count."""
+    return dict(json.loads(attackers.communicate(b"\n", timeout=30)[0]))
+
+
+def slot(name: str, feed: Path, box: SharedLine, listener: LatencyListener, kind: Kind) -> None:
     """One turn of a case: bridges and peers come, the box is watched, they go."""
     with ExitStack() as stack:
-        attackers = None
+        attackers = []
         if name != "0":
-            _, port = stack.enter_context(bridge("modbus", "--feed", feed))
+            ports = {
+                "modbus": stack.enter_context(bridge("modbus", "--feed", feed))[1],
+                "tcp": stack.enter_context(bridge("tcp", "--port", box.line))[1],
+            }
             stack.enter_context(ros.bridge("-p", f"feed:={feed}", "-p", "frames_hz:=10.0"))
             if name == "attacked":
-                command = [sys.executable, "-m", "tests.robots.attackers", str(port)]
-                pipe = subprocess.PIPE
-                attackers = stack.enter_context(subprocess.Popen(command, stdin=pipe, stdout=pipe, cwd=ROOT))
+                attackers = [attack(stack, one, port) for one, port in ports.items()]
         listener.listen(SETTLE_S, Kind())
         before_s = box.process()[2]
         listener.listen(SLOT_S, kind)
@@ -47,8 +62,8 @@ def slot(name: str, feed: Path, box: ThisMachine, listener: LatencyListener, kin
         kind.wall_s, kind.cpu_s = kind.wall_s + SLOT_S, kind.cpu_s + used_s
         kind.shares.append(used_s / SLOT_S)
         kind.rss_kib.append(box.process()[0])
-        if attackers:
-            kind.seen.update(json.loads(attackers.communicate(b"\n", timeout=30)[0]))
+        for one in attackers:
+            kind.seen.update(said(one))
     listener.listen(SETTLE_S, Kind())
 
 
@@ -57,7 +72,7 @@ def measure(minutes: float, before: list[str]) -> dict[str, Any]:
     kinds = {name: Kind() for name in CASES}
     with ExitStack() as stack:
         feed = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
-        box, sweeps = ThisMachine(before, [f"feed.socket={feed}"]), Script(1)
+        box, sweeps = SharedLine(before, [f"feed.socket={feed}"]), Script(1)
         stack.callback(box.close)
         box.start(1, sweeps)
         listener = LatencyListener(box, sweeps)
@@ -79,7 +94,9 @@ def table(figures: dict[str, Any]) -> str:
     rows.append("|---|---|---|---|---|---|---|")
     for name, one in figures.items():
         late, within, peers = one["late_ms"], one["latency_ms"], one["lines"]
-        bore = f"{peers['connections']} connections, {peers['bytes'] / 1e6:.1f} MB" if peers else ""
+        bore = (
+            f"{peers['attempts']} connections, {peers['answers of the bridge']} answers to good ones" if peers else ""
+        )
         rows.append(
             f"| {CASES[name]} | {100 * one['share']:.2f} % | {late['p50']:.1f} / {late['p99']:.1f} ms | {within['p50']:.2f} / "
             f"{within['p99']:.2f} ms | {one['answers']} | {one['frames_lost']} | {bore} |"

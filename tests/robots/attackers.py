@@ -1,5 +1,5 @@
-"""Peers that mean a bridge ill: `python -m tests.robots.attackers PORT` until its input ends. In: where the bridge listens on
-loopback. Out: one line of JSON, how many connections and requests it had to bear.
+"""Peers that mean a bridge or the page ill: `python -m tests.robots.attackers KIND PORT` until its input ends. In: modbus, tcp or
+page, and where it listens on loopback. Out: one line of JSON, how many connections it had to bear, and what a good peer got.
 
 All are in one process of low priority, which pauses between its rounds, so that it takes less than a core.
 """
@@ -10,80 +10,71 @@ import json
 import os
 import random
 import select
-import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from functools import partial
 
-PAUSE_S = 0.002
-HELD = 1000
-"""Connections that are held open, nearly all of which the bridge has closed."""
+from appliance.core.sentences import sentence
+from tests.campaigns.feed_readers import PAUSE_S, Act, Address, asker, connected, send, storm, talker
+
 READ = bytes.fromhex("000100000006ff0400000028")
 """A request of Modbus TCP for all registers."""
+ASK = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
+FLOODS = {
+    "modbus": (READ * 50, b"\0\1\0\0\0\xff"),
+    "tcp": (sentence("STATE") * 20, sentence("START") * 20 + sentence("ABORT") * 20, b"x" * 300, b"$PPLP,START*00\r\n" * 20),
+    "page": (
+        ASK + b"\r\n", ASK.replace(b"/", b"/../../etc/passwd", 1) + b"\r\n", ASK + b"X: " + b"y" * 2000,
+        ASK.replace(b"/", b"/events", 1) + b"Authorization: Bearer wrong\r\n\r\n",
+    ),
+}  # fmt: skip
+"""What is sent without end: requests, refused ones, endless ones, wrong ones."""
+HALVES = {"modbus": READ[:7], "tcp": b"$PPLP,STA", "page": ASK[:20]}
+GOOD = {"modbus": READ, "tcp": sentence("ID"), "page": ASK + b"\r\n"}
+BURST = 2
 
 
-def connected(port: int, seen: Counter[str]) -> socket.socket | None:
-    """A connection that does not wait, None where there is no room for it now."""
-    try:
-        one = socket.create_connection(("127.0.0.1", port), timeout=0.2)
-    except OSError:
-        return None
-    one.setblocking(False)
-    seen["connections"] += 1
-    return one
-
-
-def talker(port: int, seen: Counter[str], said: Callable[[], bytes], *, reads: bool) -> Callable[[], None]:
-    """One that sends without end, and comes again when it is closed. reads: takes the replies."""
-    held: list[socket.socket] = []
+def deaf(there: Address, ask: bytes) -> Act:
+    """One that asks and never reads; it comes again when it is closed."""
+    held = [connected(there)]
 
     def act() -> None:
-        if not held:
-            one = connected(port, seen)
-            held.extend([one] if one else [])
-            return
-        try:
-            if reads and select.select(held, [], [], 0)[0] and not held[0].recv(1 << 16):
-                raise ConnectionResetError
-            seen["bytes"] += held[0].send(said())
-        except BlockingIOError:
-            return
-        except OSError:
-            held.pop().close()
+        if held[0] is None or not send(held[0], ask):
+            if held[0]:
+                held[0].close()
+            held[0] = connected(there)
 
     return act
 
 
-def storm(port: int, seen: Counter[str]) -> Callable[[], None]:
-    """Connections without end, with half a request now and then."""
-    held: list[socket.socket] = []
+def acts(kind: str, there: Address, seen: Counter[str]) -> list[Act]:
+    """A good peer, and all that is bad."""
+    bad: Counter[str] = Counter()
+    floods = [
+        talker(there, bad, partial(bytes, said), reads=reads) for said in FLOODS[kind] for reads in (True, True, False)
+    ]
+    noise = [talker(there, bad, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(3)]
 
-    def act() -> None:
-        one = connected(port, seen)
-        if one:
-            if random.random() < 0.3:
-                one.send(READ[:7])
-            held.append(one)
-        if len(held) > HELD:
-            held.pop(0).close()
+    def note() -> None:
+        seen["attempts"] = bad["attempts"]
 
-    return act
+    good = asker(there, seen, GOOD[kind])
+    return [good, *floods, *noise, deaf(there, GOOD[kind]), storm(there, bad, HALVES[kind], BURST), note]
 
 
-def main(port: int) -> None:
+def main(kind: str, port: int) -> None:
     """Until standard input ends."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(19)
     seen: Counter[str] = Counter()
-    acts = [talker(port, seen, lambda: READ * 50, reads=reads) for reads in (True, True, True, False, False)]
-    acts += [talker(port, seen, lambda: random.randbytes(random.randrange(1, 3000)), reads=False) for _ in range(5)]
-    acts.append(storm(port, seen))
+    all_acts = acts(kind, ("127.0.0.1", port), seen)
     while not select.select([sys.stdin], [], [], 0)[0]:
-        for act in acts:
+        for act in all_acts:
             act()
         time.sleep(PAUSE_S)
     print(json.dumps(seen))
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(sys.argv[1], int(sys.argv[2]))

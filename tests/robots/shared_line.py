@@ -1,0 +1,39 @@
+"""A box whose serial line is heard here and by a bridge. In: the script of sweeps. Out: as ThisMachine, and the bridge's end.
+
+The box's sentences are noted here first, in a process of real-time priority where that is allowed, and then passed on: what is
+measured of the box with a bridge on its line is measured as without one.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+from contextlib import suppress
+
+from appliance.tools import pseudo_terminal
+from tests.rig.soak_boxes import Script, ThisMachine
+
+
+class SharedLine(ThisMachine):
+    """line: what `bridge tcp --port` opens, once the box is started."""
+
+    line = ""
+
+    def start(self, seed: int, sweeps: Script) -> None:
+        """As BoxUnderTest."""
+        self._bridge, self.line = self._stack.enter_context(pseudo_terminal.pair())
+        super().start(seed, sweeps)
+
+    def heard(self, wait_s: float) -> list[tuple[float, str]]:
+        """As BoxUnderTest; passes on commands of the bridge meanwhile."""
+        ready = select.select([self._far, self._bridge], [], [], wait_s)[0]
+        if self._bridge in ready:
+            with suppress(BlockingIOError):
+                os.write(self._far, os.read(self._bridge, 4096))
+        return super().heard(0)
+
+    def _said(self) -> bytes:
+        data = super()._said()
+        with suppress(BlockingIOError):  # nobody has opened its end yet
+            os.write(self._bridge, data)
+        return data

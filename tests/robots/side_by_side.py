@@ -1,0 +1,244 @@
+"""A box with everything attached and attacked, beside one with nothing: `python -m tests.robots.side_by_side --minutes 5`. In:
+minutes. Out: docs/robots/side-by-side.json and the table of docs/robots/README.md; exit code 1 if the one was worse off.
+
+Both are `palpate run --sim skin` with the same sweeps, in real time, at the same time on this machine. At the one are the page,
+the TCP bridge (on its line), the Modbus bridge and readers (on its feed), and at each of these four peers that mean it ill.
+Boxes and listeners run with real-time priority where that is allowed, all else does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appliance.core import storage
+from appliance.core.provenance import commit
+from tests.campaigns.feed_load import LATE_MS, REAL_TIME, Kind, LatencyListener, lateness
+from tests.factories.bridges import bridge
+from tests.factories.paths import ROOT
+from tests.rig.soak_boxes import Script, ThisMachine
+from tests.robots import page
+from tests.robots.attacked import attack, said
+from tests.robots.shared_line import SharedLine
+from tests.skins.load import BOX, hurry
+
+START_S, COME_S, LOOK_S = 20.0, 10.0, 10.0
+"""Time for the boxes to start, for what is attached to come, and between two looks at the processes."""
+RESULTS = ROOT / "docs" / "robots" / "side-by-side.json"
+SHARE = 0.02
+"""Most additional share of a core: one hundredth for the feed's readers, one for the questions over TCP."""
+MIB = 2.0
+
+
+@dataclass
+class Side:
+    """One of the two boxes, and what was measured of it. looks: (seconds, processor seconds, KiB resident)."""
+
+    box: ThisMachine
+    listener: LatencyListener
+    kind: Kind = field(default_factory=Kind)
+    looks: list[tuple[float, float, int]] = field(default_factory=list)
+    before_kib: int = 0
+
+    def look(self) -> None:
+        """Note what the process has used."""
+        used = self.box.process()
+        self.looks.append((time.monotonic(), used[2], used[0]))
+
+    def figures(self) -> dict[str, Any]:
+        """late_ms: see `lateness`. latency_ms: in the box. way_ms: from the verdict to the robot's end of the line."""
+        kind, late = self.kind, lateness({"": self.kind})[""]
+        seconds, cpu_s, kib = (np.array(values) for values in zip(*self.looks, strict=True))
+        shares = np.diff(cpu_s) / np.diff(seconds)
+        return {
+            "seconds": round(float(seconds[-1] - seconds[0])), "answers": len(kind.answers),
+            "share": round(float((cpu_s[-1] - cpu_s[0]) / (seconds[-1] - seconds[0])), 5),
+            "shares": [round(float(share), 4) for share in shares],
+            "before_mib": round(self.before_kib / 1024, 1), "most_mib": round(int(kib.max()) / 1024, 1),
+            **{f"{name}_ms": spread(values) for name, values in
+               (("late", late), ("latency", kind.latency_ms), ("way", kind.way_ms))},
+            "frames_lost": kind.lost, "sentences_dropped": kind.dropped,
+            "faults": {name: n for name, n in kind.faults.items() if n},
+        }  # fmt: skip
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, 99th percentile and the largest."""
+    return {name: round(float(np.percentile(values, q)), 2) for name, q in (("p50", 50), ("p99", 99), ("max", 100))}
+
+
+def sides(stack: ExitStack, feed: Path, seed: int, before: Sequence[str]) -> dict[str, Side]:
+    """Both boxes, started."""
+    found = {}
+    for name, box in (
+        ("alone", ThisMachine(before, ["feed.socket="])),
+        ("attacked", SharedLine(before, [f"feed.socket={feed}"])),
+    ):
+        sweeps = Script(seed)
+        stack.callback(box.close)
+        box.start(seed, sweeps)
+        found[name] = Side(box, LatencyListener(box, sweeps))
+    return found
+
+
+def listen(both: dict[str, Side], seconds: float, *, measured: bool) -> None:
+    """Hear both boxes so long, each in a thread that goes before all else; look at their processes meanwhile."""
+    failed: list[BaseException] = []
+
+    def one(side: Side) -> None:
+        hurry(BOX)
+        try:
+            side.listener.listen(seconds, side.kind if measured else Kind())
+        except BaseException as e:  # to be raised where it is waited for
+            failed.append(e)
+
+    threads = [threading.Thread(target=one, args=(side,), daemon=True) for side in both.values()]
+    for thread in threads:
+        thread.start()
+    while measured and any(thread.is_alive() for thread in threads) and not failed:
+        for side in both.values():
+            side.look()
+        threads[0].join(LOOK_S)
+    for thread in threads:
+        thread.join()
+    if failed:
+        raise failed[0]
+
+
+@contextmanager
+def page_of(feed: Path) -> Iterator[int]:
+    """The page of the box with this feed; its port."""
+    command = [sys.executable, "-m", "appliance", "watch", "--web", "0", "--set", f"feed.socket={feed}"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        try:
+            line = process.stderr.readline()  # type: ignore[union-attr]
+            yield int(re.findall(r":(\d+)", line)[-1])
+        finally:
+            process.terminate()
+
+
+@contextmanager
+def readers(feed: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Good and bad readers of the feed."""
+    command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(feed), "attacked"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
+    """Both boxes' figures, what the peers did, and what box and machine these are."""
+    with ExitStack() as stack:
+        feed = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
+        both = sides(stack, feed, seed, before)
+        listen(both, START_S, measured=False)
+        for side in both.values():
+            side.before_kib = side.box.process()[0]
+        attached = stack.enter_context(ExitStack())
+        line = both["attacked"].box
+        assert isinstance(line, SharedLine)
+        ports = {
+            "tcp": attached.enter_context(bridge("tcp", "--port", line.line))[1],
+            "modbus": attached.enter_context(bridge("modbus", "--feed", feed))[1],
+            "page": attached.enter_context(page_of(feed)),
+        }
+        peers = {kind: attack(attached, kind, port) for kind, port in ports.items()}
+        peers["feed"] = attached.enter_context(readers(feed))
+        print(f"attached: {', '.join(peers)}", flush=True)
+        listen(both, COME_S, measured=False)
+        listen(both, 60 * minutes, measured=True)
+        seen = {kind: said(process) for kind, process in peers.items()}
+        return {**line.about(), "peers": seen, "boxes": {name: side.figures() for name, side in both.items()}}
+
+
+def worse(boxes: dict[str, Any]) -> list[str]:
+    """In what the attacked box was worse off, in words."""
+    alone, one = boxes["alone"], boxes["attacked"]
+    checks = {
+        f"{one['frames_lost']} frames lost, alone {alone['frames_lost']}": one["frames_lost"] > alone["frames_lost"],
+        f"{one['sentences_dropped']} sentences dropped": one["sentences_dropped"] > alone["sentences_dropped"],
+        f"{one['faults']}, alone {alone['faults']}": bool(one["faults"].keys() - alone["faults"].keys()),
+        f"{100 * one['share']:.2f} % of a core, alone {100 * alone['share']:.2f} %": one["share"]
+        > alone["share"] + SHARE,
+        f"{one['most_mib']} MiB, before {one['before_mib']}": one["most_mib"] - one["before_mib"] > MIB,
+    } | {
+        f"{name} {one[name]['p50']} ms, alone {alone[name]['p50']}": one[name]["p50"] > alone[name]["p50"] + LATE_MS
+        for name in ("latency_ms", "way_ms")
+    }
+    return [text for text, bad in checks.items() if bad]
+
+
+NAMES = {"alone": "nothing attached", "attacked": "page, TCP, Modbus and feed, all attacked"}
+
+
+def table(content: dict[str, Any]) -> str:
+    """What was measured, in Markdown."""
+    boxes, peers = content["boxes"], content["peers"]
+    rows = [
+        f"Measured by `python -m tests.robots.side_by_side`, both boxes at the same time for {boxes['alone']['seconds']} s, on "
+        f"{content['machine']}{', with real-time priority' * content['real_time']};",
+        f"load average {content['load']:.1f}; commit {content['commit'][:12]}.",
+        "",
+        "| box | frames lost | answers | in the box, p50 / p99 / most | verdict to line, p50 / p99 / most | after the quickest, p50 / p99 / most | share of a core | memory: before, most |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, one in boxes.items():
+        late, within, way = (
+            "{p50:.1f} / {p99:.1f} / {max:.1f} ms".format(**one[f"{kind}_ms"]) for kind in ("late", "latency", "way")
+        )
+        rows.append(
+            f"| {NAMES[name]} | {one['frames_lost']} | {one['answers']} | {within} | {way} | {late} | {100 * one['share']:.2f} % | "
+            f"{one['before_mib']}, {one['most_mib']} MiB |"
+        )
+    bore = [f"{kind} {seen['attempts']:,}" for kind, seen in peers.items()]
+    good = [
+        f"{kind} {seen['answers of the bridge']:,}" for kind, seen in peers.items() if "answers of the bridge" in seen
+    ]
+    rows += [
+        "",
+        f"Hostile connections: {', '.join(bore)}. Meanwhile one good peer of each got answers: {', '.join(good)}.",
+    ]
+    return "\n".join(rows)
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=5.0, help="for both boxes at once (%(default)s)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--out", type=Path, default=RESULTS, help="the table goes into README.md beside it, if there is one"
+    )
+    args = parser.parse_args()
+    real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    load = round(os.getloadavg()[2], 1)
+    found = measure(args.minutes, args.seed, REAL_TIME if real_time else ())
+    content = {"commit": commit(), "seed": args.seed, "real_time": real_time, "load": load, **found}
+    storage.put(args.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
+    readme = args.out.with_name("README.md")
+    if readme.exists():
+        page.write(readme, "side-by-side", table(content))
+    print(table(content))
+    for text in (bad := worse(content["boxes"])):
+        print(f"FAIL {text}")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
