@@ -9,7 +9,7 @@ DESKTOP := $(VENV)/desktop.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins chart paper ros rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak fuzz hostile flips cuts \
+.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins chart paper ros rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak attacked fuzz hostile flips cuts \
   deploy install wheel lock clean
 
 help: ## this list
@@ -50,6 +50,9 @@ soak: rig-tools ## sweep without pause for HOURS (default 1), on the virtual box
 	$(BIN)/python -m tests.rig.soak --hours $(or $(HOURS),1) --out docs/soak $(SOAK)
 
 ros: build/ros/ready ## ROS 2 as wheels into build/ros (280 MB), with the action's messages, for the tests of `palpate bridge ros`
+
+attacked: $(DESKTOP) ## a box with page, bridges and feed attached and attacked, beside one without, for MINUTES (default 5): docs/robots/
+	$(BIN)/python -m tests.robots.side_by_side --minutes $(or $(MINUTES),5)
 
 test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/board-checklist.md)
 	$(PIP) install -e '.[board]'

@@ -117,6 +117,8 @@ def listen(both: dict[str, Side], seconds: float, *, measured: bool) -> None:
         thread.join()
     if failed:
         raise failed[0]
+    for side in both.values() if measured else ():
+        side.look()
 
 
 @contextmanager
