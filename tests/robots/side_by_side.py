@@ -45,7 +45,7 @@ MIB = 2.0
 
 
 @dataclass
-class Side:
+class BoxSide:
     """One of the two boxes, and what was measured of it. looks: (seconds, processor seconds, KiB resident)."""
 
     box: ThisMachine
@@ -81,7 +81,7 @@ def spread(values: Sequence[float]) -> dict[str, float]:
     return {name: round(float(np.percentile(values, q)), 2) for name, q in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
-def sides(stack: ExitStack, feed: Path, seed: int, before: Sequence[str]) -> dict[str, Side]:
+def sides(stack: ExitStack, feed: Path, seed: int, before: Sequence[str]) -> dict[str, BoxSide]:
     """Both boxes, started."""
     found = {}
     for name, box in (
@@ -91,15 +91,15 @@ def sides(stack: ExitStack, feed: Path, seed: int, before: Sequence[str]) -> dic
         sweeps = Script(seed)
         stack.callback(box.close)
         box.start(seed, sweeps)
-        found[name] = Side(box, LatencyListener(box, sweeps))
+        found[name] = BoxSide(box, LatencyListener(box, sweeps))
     return found
 
 
-def listen(both: dict[str, Side], seconds: float, *, measured: bool) -> None:
+def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
     """Hear both boxes so long, each in a thread that goes before all else; look at their processes meanwhile."""
     failed: list[BaseException] = []
 
-    def one(side: Side) -> None:
+    def one(side: BoxSide) -> None:
         hurry(BOX)
         try:
             side.listener.listen(seconds, side.kind if measured else Kind())
