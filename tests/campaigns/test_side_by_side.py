@@ -87,7 +87,7 @@ def test_attackers_attack_and_the_good_one_is_served(kind: str, tmp_path: Path):
     seen: Counter[str] = Counter()
     with SpeakingBox(tmp_path / "line") as box, bridge(kind, "--port", box.path) as address:
         acts = attackers.acts(kind, address, seen)
-        for _ in range(10_000):
+        for _ in range(100_000):
             for act in acts:
                 act()
             threading.Event().wait(PAUSE_S)
