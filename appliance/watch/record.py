@@ -57,8 +57,9 @@ def order(body: bytes, allowed: Sequence[str]) -> Command:
     name, text = str(asked.get("command")), asked.get("text", "")
     if name not in allowed or not isinstance(text, str):
         raise FormatError(f"no order that the page has; its commands are {' '.join(allowed)}, each with a text or none")
+    text = text.strip()
     if name in LABELS:
-        Labels(**{name.lower(): text.strip()})  # before a capture notes it
+        Labels(**{name.lower(): text})  # before a capture notes it
     elif text and not (name == "DISCARD" and text.isascii() and text.isdecimal()):
         raise FormatError(f"{name} takes no text, but for DISCARD the number of a sweep; leave it out")
     return Command(name, text)

@@ -72,7 +72,8 @@ def waiting(recorded: RecordedPage) -> int:
 @pytest.mark.parametrize(
     ("body", "command"),
     [
-        (b'{"command": "MATERIAL", "text": " plastic rough "}', Command("MATERIAL", " plastic rough ")),
+        (b'{"command": "MATERIAL", "text": " plastic rough "}', Command("MATERIAL", "plastic rough")),
+        (b'{"command": "POSITION", "text": "\\n7\\t"}', Command("POSITION", "7")),
         (b'{"command": "SESSION", "text": ""}', Command("SESSION")),
         (b'{"command": "NEXT"}', Command("NEXT")),
         (b'{"command": "DISCARD", "text": "7"}', Command("DISCARD", "7")),
