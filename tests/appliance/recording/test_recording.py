@@ -254,7 +254,7 @@ def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
         with pytest.raises(ApplianceError, match=f"the last stored sweep is 2, not {other}"):
             desk.do("DISCARD", other)
     assert desk.do("DISCARD", "2") == [2, 1, "sweep-000002"]
-    assert names(tmp_path) == pairs(1)
+    assert names(tmp_path) == [*pairs(1), "sweep-000002.discarded"]
 
 
 def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path):

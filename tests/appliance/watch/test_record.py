@@ -147,7 +147,7 @@ def test_labels_from_the_page_are_those_of_the_stored_sweep(rigged: Callable[...
         about = sidecar(tmp_path / "sweep-000001.npy")
         assert (about["material"], about["position"], about["session"]) == ("plastic rough", "10", "monday")
         assert by_page("DISCARD", "1") == [1, 0, "sweep-000001"]
-        assert [*tmp_path.iterdir()] == []
+        assert not (tmp_path / "sweep-000001.npy").exists()
     assert not any(",ANS,START" in line or ",ANS,NEXT" in line for line in box.heard)
 
 
