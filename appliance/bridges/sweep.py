@@ -14,6 +14,7 @@ from appliance.bridges.source import STALE_S, Source
 from appliance.client.answers import Answer
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.errors import ApplianceError, CommandRefused, ConfigError, LinkLost, NoAnswer
+from appliance.core.status import Status
 
 READY_S = 3.0
 """Longest wait until the box is ready for START."""
@@ -95,13 +96,18 @@ class CommandedSweep:
                 if answer.early:
                     self._say("early", answer)
                 if terms.slide_s and not stopped:
-                    with suppress(ApplianceError):  # it causes no answer, and the next START would end the sweep, too
-                        self._source.send("STOP")
+                    self._close(answer)
                 return answer
             self._see_that_it_is_there(begin_ns)
             if past_s >= terms.timeout_s:
                 raise NoAnswer(f"no answer within timeout_s = {terms.timeout_s:g} of START; the sweep was aborted")
         return None
+
+    def _close(self, answer: Answer) -> None:
+        """Send STOP for a sweep that was answered before: it causes no answer, and without it the next START does the same."""
+        if answer.status is not Status.NO_STOP:  # else another's START has closed it, and the STOP is the other's
+            with suppress(ApplianceError):
+                self._source.send("STOP")
 
     def _see_that_it_is_there(self, begin_ns: int) -> None:
         """Raises LinkLost or NoAnswer once the box is gone."""

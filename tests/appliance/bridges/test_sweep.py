@@ -118,6 +118,14 @@ def test_a_fault_ends_the_slide(swept: Swept):
     assert swept.has_heard("START", "STOP")
 
 
+def test_a_sweep_of_another_is_not_stopped(swept: Swept):
+    """Another's START ends the sweep, which is answered `no-stop`: the STOP is the other's."""
+    swept.box.script = saying(START=result(1, "no-stop", ""))
+    assert swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S).status is Status.NO_STOP
+    assert swept.source.send("TARE")
+    assert swept.has_heard("START", "TARE")
+
+
 def test_an_answer_counts_although_stop_fails(swept: Swept):
     """The line is lost after an early answer: the answer holds."""
     swept.box.script = saying(START=result(1, share="0.40"))
