@@ -13,7 +13,7 @@ from appliance.bundle import bundle
 from appliance.cli.main import main as palpate
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
-from appliance.inference.classifier import Classifier
+from appliance.inference.classifier import Classifier, softmax
 from tests.factories.sweep_sets import tones
 from train.cli.main import main
 from train.export import pack
@@ -63,8 +63,9 @@ def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.Cap
     assert palpate(["demo", *chosen, "--sweeps", "2"]) == 0
 
 
-def test_golden_sweeps_of_float32_are_rounded():
-    """They keep what is more than half of a usual change, take less room, and their logits are those of the rounded sweeps."""
+def test_golden_sweeps_are_rounded():
+    """To steps of at most COARSEST usual changes; they take less room, and their logits are those of the rounded sweeps,
+    whose probabilities are near those of the exact ones."""
     content = pack.trained(METHODS["L-gauss"], tones(), 1)
     rng = np.random.default_rng(1)
     noisy = content.train.samples + rng.normal(0, 0.3, content.train.samples.shape)
@@ -73,14 +74,30 @@ def test_golden_sweeps_of_float32_are_rounded():
     logits = pack.run(content.model, pack.model_inputs(content.input, train))
     golden = pack.golden_sweeps(train, logits, logits)
     data = pack.golden_file(content, golden)
-    assert len(data) < 0.6 * len(bundle.golden_file(golden.samples, logits[:2]))
+    assert len(data) < 0.4 * len(bundle.golden_file(golden.samples, logits[:2]))
     arrays = SimpleNamespace(format=train.format, labels=train.materials)
     samples, stored = bundle._golden(data, arrays)
     usual = np.median(np.abs(np.diff(golden.samples, axis=1)))
-    assert 0 < np.abs(samples - golden.samples).max() <= usual / 4
+    assert 0 < np.abs(samples - golden.samples).max() <= usual * pack.COARSEST / 2
     again = pack.run(content.model, pack.model_inputs(content.input, replace(golden, samples=samples)))
     assert np.array_equal(stored, again.astype(np.float32))
     assert stored.argmax(1).tolist() == golden.labels.tolist()
+    exact = pack.run(content.model, pack.model_inputs(content.input, golden))
+    assert np.abs(softmax(stored) - softmax(exact)).max() <= pack.NEAR
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
+def test_rounded_sweeps_keep_their_type(dtype: str):
+    """Each coarser than the next, none beyond what the type holds, whole numbers in steps of 2 or more; constant ones stay."""
+    rng = np.random.default_rng(1)
+    top = 255 if dtype == "float32" else np.iinfo(dtype).max
+    samples = (top - rng.integers(0, 40, (2, 50, 3, 3))).astype(dtype)
+    made = list(pack._rounded(samples))
+    assert {rounded.dtype for rounded in made} == {samples.dtype}
+    away = [float(np.abs(rounded.astype(np.float64) - samples).max()) for rounded in made]
+    assert away == sorted(away, reverse=True)
+    assert away[-1] > 0
+    assert list(pack._rounded(np.full_like(samples, 7))) == []
 
 
 def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
