@@ -116,8 +116,9 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
         directions, turn = white.apply(axes), np.linalg.inv(mixed)
     else:
         directions, turn = white.apply(orthonormal), np.eye(orthonormal.shape[1])
-    whole, steps = sixteen_bits(directions)  # as a bundle's graph holds it
-    bare = Embedding(whole * steps, turn.astype(np.float32), *[np.empty(0)] * 3)
+    # as a bundle's graph holds them
+    (whole, steps), (turn, sizes) = sixteen_bits(directions), sixteen_bits(turn)
+    bare = Embedding(whole * steps, turn * sizes, *[np.empty(0)] * 3)
     projection = bare.projection
     means = (means @ projection).astype(np.float32)
     own = min(fixed, projection.shape[1])

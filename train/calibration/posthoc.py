@@ -218,8 +218,9 @@ def assemble_model(
     embedded = partial(_embedded, add, embedding)
     if known or steps is not None:
         _sixteen_bits(add, embedding.directions, DIRECTIONS)
-        for name, constant in ((TURN, embedding.turn), (OFFSET, embedding.offset))[not embedding.selected :]:
-            model.graph.initializer.append(numpy_helper.from_array(constant, name))
+        if embedding.selected:
+            _sixteen_bits(add, embedding.turn, TURN)
+        model.graph.initializer.append(numpy_helper.from_array(embedding.offset, OFFSET))
     if steps is not None:
         count = len(steps.weight)
         z = embedded(tenths[0], axis=2, output="head.each")
