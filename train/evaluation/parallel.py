@@ -16,6 +16,7 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from appliance.core.errors import FormatError
+from train.models.methods import spoken
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -95,8 +96,3 @@ class Progress:
         self._done += 1
         left = (time.monotonic() - self._start) / self._done * (self._total - self._done)
         self._log(f"{self._done}/{self._total} done, {spoken(left)} left ({what})")
-
-
-def spoken(seconds: float) -> str:
-    """A duration for a person: in s, or in min from 100 s on."""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

@@ -123,6 +123,11 @@ def no_log(line: str) -> None:
     """A log that drops every line."""
 
 
+def spoken(seconds: float) -> str:
+    """A duration for a person: in s, or in min from 100 s on."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
 def model_inputs(kind: str, sweeps: Dataset) -> Array:
     """What a method with the input `kind` takes of `sweeps`: raw counts [N, T, R, C], or features float32 [N, F]."""
     if kind == "raw":

@@ -6,6 +6,7 @@ the caller seeds and forks; no other random state is read or changed.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -26,7 +27,7 @@ from appliance.core.types import SweepFormat
 from train.data.sets import Dataset
 from train.models.checkpoint import Checkpoint, Stateful, default_generators
 from train.models.linear_head import fit_temperature, hold_out_or_all
-from train.models.methods import Cost, Effort, Log, Method, Model, no_log
+from train.models.methods import Cost, Effort, Log, Method, Model, no_log, spoken
 from train.models.networks import Network
 from train.onnx_tools.graph_builder import GraphModel
 from train.onnx_tools.quantize import quantize
@@ -158,6 +159,7 @@ def learn(
     checkpoint = Checkpoint(unfinished, parts, (rng, *default_generators(device)))
     cost = checkpoint.load()
     picks = order.split(recipe.batch)[len(cost) :]
+    done, begun = len(cost), time.monotonic()
     model.train().dropout = recipe.dropout
     for step, (pick, counts) in enumerate(zip(picks, float_batches(sweeps.samples, picks), strict=True), len(cost) + 1):
         x = perturbed(augment(model.prepare(counts), rng), recipe, rng).to(device)
@@ -169,7 +171,8 @@ def learn(
         average.update_parameters(model)
         watch(step, model)
         checkpoint.save(cost)
-        log(f"step {step}/{recipe.steps} loss {cost[-1][1]:.3f}")
+        left = (time.monotonic() - begun) / (step - done) * (recipe.steps - step)
+        log(f"step {step}/{recipe.steps} loss {cost[-1][1]:.3f}, {spoken(left)} left")
     averaged = average.module
     assert isinstance(averaged, type(model))
     return averaged.cpu().fused(), cost

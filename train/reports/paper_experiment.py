@@ -24,10 +24,9 @@ from appliance.inference.classifier import LEAST_PROBABILITY, fuse, softmax
 from train.data import sets
 from train.data.sets import Dataset
 from train.evaluation.evaluate import Plan, Result, Where, evaluate
-from train.evaluation.parallel import spoken
 from train.metrics import score
 from train.models import methods, prior_work
-from train.models.methods import FULL_EFFORT, Effort
+from train.models.methods import FULL_EFFORT, Effort, spoken
 from train.reports import paper_report, paper_values
 from train.reports.chart_report import BOX_ON_HARD, box_on_hard
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -88,17 +89,19 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     recordings to hold some out.
     """
     augmentation = settings.augmentation or default_augmentation(FIXED.zero_sum(sweeps.format.window))
+    out, by = _held_out(sweeps, seed)
+    may_train = settings.steps and len(sweeps) >= LEAST_SWEEPS and by != "nothing" and find_spec("torch")
+    told = partial(_tell, log, 3 if may_train else 2)
+    told(1, f"features of {len(sweeps)} sweeps and {COPIES} copies of each")
     fixed = fixed_trunk(sweeps, seed)
     changed = list(copies(sweeps, augmentation, seed, COPIES))
     known, classes = _known(fixed, sweeps, changed), len(sweeps.materials)
     parts = inner_parts(sweeps)
     court = Court([known] * len(parts), parts, classes)
-    judged, stages = _choose(court, fixed, settings, log), None
-    out, by = _held_out(sweeps, seed)
+    judged, stages = _choose(court, fixed, settings, partial(told, 2)), None
     train, held = (sweeps.take(~out), sweeps.take(out)) if by != "nothing" else (sweeps, sweeps)
-    wanted = settings.steps and len(sweeps) >= LEAST_SWEEPS and court.accuracy(judged) < ENOUGH
-    if wanted and by != "nothing" and find_spec("torch"):
-        stages = _stages(train, fixed.scale, seed, replace(settings, augmentation=augmentation), log)
+    if may_train and court.accuracy(judged) < ENOUGH:
+        stages = _stages(train, fixed.scale, seed, replace(settings, augmentation=augmentation), partial(told, 3))
         both = _side_by_side(_known(stages, sweeps, changed), known)
         court = Court([both], [InnerPart(by, out)], classes)
         judged = court.judge(_with_stages(judged.plan))
@@ -121,6 +124,12 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
         about,
         plan=plan.uncooled(),
     )
+
+
+def _tell(log: Log, parts: int, part: int, line: str) -> None:
+    """Show how far a fit is: `part` of `parts`. The last of three takes nearly all of the time, and says how much is left;
+    it does not come where the first two are enough."""
+    log(f"part {part} of {parts}, {line}")
 
 
 def fixed_trunk(sweeps: Dataset, seed: int) -> Trunk:

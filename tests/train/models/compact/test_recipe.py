@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -96,8 +97,11 @@ def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
 
 
 def test_the_same_seed_gives_the_same_fit(fitted: Fit):
-    """And another one other filters."""
-    again, other = (recipe.fit(easy(), seed, CLOSED) for seed in (1, 2))
+    """And another one other filters. Where no stages can follow, the choice is the second part of two."""
+    told: list[str] = []
+    again, other = (recipe.fit(easy(), seed, CLOSED, told.append) for seed in (1, 2))
+    assert told[0].startswith("part 1 of 2, features of")
+    assert told[1].startswith("part 2 of 2, choosing: ")
     for name, values in fitted.weights.items():
         np.testing.assert_array_equal(again.weights[name], values)
     assert other.plan != fitted.plan or not np.array_equal(other.weights["int8.weight"], fitted.weights["int8.weight"])
@@ -110,7 +114,12 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         assert not recipe.fit(easy(), 1, Settings(steps=20)).architecture.channels
         monkeypatch.setattr(recipe, name, value)
-    fit = recipe.fit(easy(), 1, Settings(steps=20))
+    told: list[str] = []
+    fit = recipe.fit(easy(), 1, Settings(steps=20), told.append)
+    assert [int(line.split()[1]) for line in told] == sorted(int(line.split()[1]) for line in told)
+    assert told[0] == f"part 1 of 3, features of {len(easy())} sweeps and 2 copies of each"
+    assert re.fullmatch(r"part 3 of 3, step 10/20 loss \d+\.\d+, \d+ s left", told[-11])
+    assert told[-1].endswith(", 0 s left")
     assert fit.architecture.channels == recipe.STAGES.channels
     stages = sum(recipe.STAGES.channels)
     assert fit.plan.parts[0].columns == tuple(range(stages))
