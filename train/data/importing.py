@@ -224,9 +224,8 @@ def _frames(values: Array, table: Table, plan: ImportPlan, time_column: int | No
         numbers = [i for i in range(wide) if i != time_column]
     if len(numbers) != want:
         which = "--columns names" if plan.columns else "it has" if time_column is None else "beside the time it has"
-        raise FormatError(
-            f"{which} {len(numbers)} columns, a grid of {plan.grid} takes {want}; see --columns and --grid"
-        )
+        advice = "it has so many rows, so add --transpose" if len(values) == want else "see --columns and --grid"
+        raise FormatError(f"{which} {len(numbers)} columns, a grid of {plan.grid} takes {want}; {advice}")
     return values[:, numbers].reshape(len(values), *shape)
 
 

@@ -200,6 +200,10 @@ BAD = {
     "nan": (GOOD.encode() + b"1,nan,3,4\n", "frame 21, taxel 1, 2 is nan; fill it in or cut it away"),
     "UTF-16": (GOOD.encode("utf-16"), "is UTF-16; save it as UTF-8"),
     "wide": (b"1,2,3,4,5\n" * 20, "it has 5 columns, a grid of 2x2 takes 4; see --columns and --grid"),
+    "taxels x frames": (
+        b"1,2,3,4,5\n" * 4,
+        "it has 5 columns, a grid of 2x2 takes 4; it has so many rows, so add --transpose",
+    ),
     "few": (b"1,2,3,4\n" * 9, "has 9 frames, a window takes 10; see --window"),
     "noise": (bytes(range(256)) * 9, "holds no line of numbers"),
 }
