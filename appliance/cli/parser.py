@@ -150,7 +150,7 @@ def _record_options(record: argparse.ArgumentParser) -> None:
     )
     for name in ("material", "position", "session"):
         record.add_argument(
-            f"--{name}", default="", metavar="TEXT", help="until a command on the serial line changes it"
+            f"--{name}", default="", metavar="TEXT", help="until a command on the serial line or the page changes it"
         )
     record.add_argument(
         "--format", metavar="RxC:TYPE:HZ", help="what the skin sends, e.g. 5x3:float32:100 (default: what it announces)"

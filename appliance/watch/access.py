@@ -96,6 +96,9 @@ def _token(path: Path) -> str:
     advice = "make install makes one; or set watch.address to 127.0.0.1"
     try:
         token = path.read_text("ascii").strip()
+    except PermissionError as e:
+        join = f"let it into its group with usermod -aG GROUP USER (ls -ld {path.parent} shows it)"
+        raise ConfigError(f"{path} may not be read by this user; {join}, or set watch.address to {HERE}") from e
     except (OSError, ValueError) as e:
         raise ConfigError(f"{path} cannot be read: {getattr(e, 'strerror', None) or e}; {advice}") from e
     if not LEAST_TOKEN <= len(token) <= MOST_TOKEN or not token.isalnum():

@@ -382,6 +382,17 @@ def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path: Path)
     assert Access.configured(WatchConfig(), 0) == Access(0)
 
 
+def test_a_token_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One that may not be read, as by the user who records: the error says how to be let in."""
+
+    def denied(path: Path, *args: object) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_text", denied)
+    with pytest.raises(ConfigError, match=r"token may not be read by this user; .*usermod -aG GROUP USER"):
+        Access.configured(WatchConfig(address="0.0.0.0", folder=str(tmp_path)), 0)
+
+
 def test_what_install_makes_is_for_the_unit_alone(tmp_path: Path):
     """Token, key and certificate stay as they are on another install; nobody but root and the group reads them."""
     page_secrets(tmp_path)
