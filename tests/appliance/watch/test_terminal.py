@@ -39,8 +39,9 @@ def lines_of(folder: Path, fmt: SweepFormat = skin.FORMAT, **facts: str) -> list
     offered.feed.sweep(cut(fmt), OK, {})
     offered.turns(4)
     lines = peer.lines()
-    offered.turns(2, replace(HEALTH, sweeping=True, ready=False))
-    lines += peer.lines()
+    for _ in range(20):  # a large window is sent in several turns, before what comes after it
+        offered.turns(1, replace(HEALTH, sweeping=True, ready=False))
+        lines += peer.lines()
     offered.feed.stopping()
     return lines
 
