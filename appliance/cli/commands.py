@@ -126,7 +126,7 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         recording = RecordingSession(folder, fmt, labels, devices.clock, _sentences(port), args.target)
         stack.callback(recording.close)
         page = _record_page(args, settings, fmt, devices, recording, lambda command: box.obey(command))
-        log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:g} s")
+        log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:.3g} s")
         if slow := skin_profile.warning(fmt):
             log.warning(f"record: {slow}")
         facts: Facts = {

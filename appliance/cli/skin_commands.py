@@ -33,6 +33,8 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     settings = devices.wire(load_settings(args))
     failed, port = 0, settings.sensor.link == "serial"
     with closing(skins.open_board(settings, devices)) as link:
+        more = "about half a minute" if port else "some seconds"
+        log.info(f"frames are listened to for {args.seconds:g} s; stopping, requests and overflow take {more} more")
         for found in skin_check.check(link, devices.clock, args.seconds, port=port):
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
             failed += found.verdict == "FAIL"
@@ -68,6 +70,8 @@ def run_detect(args: argparse.Namespace) -> int:
     for line in skin_detect.on_usb(settings.sensor):
         print(line, flush=True)
         found += 1
+    if usb:
+        log.info(f"listening at {', '.join(port.path for port in usb)}; some seconds at each")
     for one in skin_detect.detect(
         usb, profiles, lambda path, baud: SerialLink(path, baud, clock), clock,
         write=args.write, seconds=skin_detect.LISTEN_S,
@@ -121,6 +125,7 @@ def run_new(args: argparse.Namespace) -> int:
         _make(path.parent)  # before a user has listened in vain
     port, clock = args.port, SystemClock()
     bauds = (settings.sensor.baud,) if settings.sensor.baud else skin_new.BAUDS
+    log.info(f"listening at {port}: {args.seconds:g} s at each speed, until one shows a pattern; touch the skin")
     heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, args.seconds, clock)
     for number, proposal in enumerate(heard.proposals, 1):
         print(f"{number}: {skin_new.words(proposal)}")

@@ -438,8 +438,10 @@ def test_skin_check_prints_a_verdict_for_each_part(capsys: pytest.CaptureFixture
     """`palpate skin check` on the simulated board: all ok, exit code 0, and no bundle is asked for."""
     no_bundle = ["--set", "classifier.bundle=/nowhere"]
     assert main(["skin", "check", "--sim", "skin", "--virtual", *no_bundle]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    told = capsys.readouterr()
+    lines = told.out.splitlines()
     assert len(lines) == 12
+    assert "frames are listened to for 10 s" in told.err  # before anything is printed, a person knows how long it takes
     assert all(line.startswith("ok       ") for line in lines)
 
 

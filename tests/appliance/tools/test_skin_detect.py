@@ -121,7 +121,9 @@ def test_the_commands(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkey
     monkeypatch.setattr(skin_detect, "LISTEN_S", 0.05)
     with pseudo_terminal.pair() as (far, path):
         assert main(["skin", "detect", "--port", path]) == 1
-        assert f"{path}: no profile fits: sends nothing unasked" in capsys.readouterr().out
+        told = capsys.readouterr()
+        assert f"{path}: no profile fits: sends nothing unasked" in told.out
+        assert f"listening at {path}; some seconds" in told.err
         with pytest.raises(BlockingIOError):
             os.read(far, 1)
     (tmp_path / "skins").mkdir()

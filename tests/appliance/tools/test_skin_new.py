@@ -139,7 +139,9 @@ def test_emulated_skins_are_described_and_read_again(
         common += ["--port", str(player.path), "--set", "sensor.baud=115200"]
         assert main(common) == 0
         assert not list(tmp_path.iterdir())
-        first = capsys.readouterr().out.splitlines()[0]
+        told = capsys.readouterr()
+        first = told.out.splitlines()[0]
+        assert f"listening at {player.path}: 2 s at each speed" in told.err
         assert first.startswith("1: ")
         assert grid in first
         assert main([*common, "--grid", grid]) == 0
