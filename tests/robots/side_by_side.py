@@ -40,6 +40,8 @@ from tests.skins.load import BOX, hurry
 START_S, COME_S, LOOK_S = 20.0, 10.0, 10.0
 """Time for the boxes to start, for what is attached to come, and between two looks at the processes."""
 RESULTS = ROOT / "docs" / "robots" / "side-by-side.json"
+SWEEP_S = 3.0
+"""The robot sweeps no more often."""
 SHARE = 0.03
 """Most additional share of a core: one hundredth for the feed's readers, two for fifty questions a second over TCP, which the box
 answers."""
@@ -86,7 +88,7 @@ def spread(values: Sequence[float]) -> dict[str, float]:
     return {name: round(float(np.percentile(values, q)), 2) for name, q in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
-def sides(stack: ExitStack, feed: Path, seed: int, before: Sequence[str]) -> dict[str, BoxSide]:
+def sides(stack: ExitStack, feed: Path, seed: int, sweeps_n: int, before: Sequence[str]) -> dict[str, BoxSide]:
     """Both boxes, started."""
     found = {}
     for name, box in (
@@ -94,6 +96,7 @@ def sides(stack: ExitStack, feed: Path, seed: int, before: Sequence[str]) -> dic
         ("attacked", SharedLine(before, [f"feed.socket={feed}"])),
     ):
         sweeps = Script(seed)
+        sweeps[sweeps_n]  # worked out now: later it would keep a listener from noting when a sentence comes
         stack.callback(box.close)
         box.start(seed, sweeps)
         found[name] = BoxSide(box, LatencyListener(box, sweeps))
@@ -153,7 +156,7 @@ def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
     """Both boxes' figures, what the peers did, and what box and machine these are."""
     with ExitStack() as stack:
         feed = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
-        both = sides(stack, feed, seed, before)
+        both = sides(stack, feed, seed, round((START_S + COME_S + 60 * minutes) / SWEEP_S), before)
         listen(both, START_S, measured=False)
         for side in both.values():
             side.before_kib = side.box.process()[0]
