@@ -29,6 +29,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Status
 from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, softmax
+from appliance.inference.novelty import shaped_distances
 from train.calibration.posthoc import HeldOut, calibrate
 from train.data.sets import Dataset
 from train.export import bundle_score, contact_limit
@@ -204,14 +205,28 @@ def held_out_figures(held: HeldOut, made: Fit, protocol: str) -> dict[str, Any]:
 
 def logits_of_means(content: Content, sweeps: Dataset) -> Array:
     """Logits [N, K] as the box computes them from class means where a label is enrolled, before temperature scaling."""
+    with np.load(io.BytesIO(content.means)) as means:
+        logits: Array = _embedded(content, sweeps) @ means["means"].T + means["bias"]
+    return logits
+
+
+def _unknown(content: Content, sweeps: Dataset) -> Array:
+    """bool [N], which of them the box calls unknown: none where the bundle has no novelty check."""
+    if not content.known:
+        return np.zeros(len(sweeps), bool)
+    with np.load(io.BytesIO(content.means)) as means:
+        away = _embedded(content, sweeps)[:, None] - means["means"].astype(np.float64)
+        beyond: Array = shaped_distances(away, means["shapes"].astype(np.float64)).min(axis=1) > content.known.limit
+    return beyond
+
+
+def _embedded(content: Content, sweeps: Dataset) -> Array:
     embedding = onnx.ModelProto()
     embedding.CopyFrom(content.model)
     kept = [output for output in embedding.graph.output if output.name == "embedding"]
     del embedding.graph.output[:]
     embedding.graph.output.extend(kept)
-    with np.load(io.BytesIO(content.means)) as means:
-        logits: Array = run(embedding, sweeps.samples) @ means["means"].T + means["bias"]
-    return logits
+    return run(embedding, sweeps.samples)
 
 
 def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dataset:
@@ -238,7 +253,8 @@ def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dat
 def golden_file(content: Content, golden: Dataset) -> bytes:
     """golden.npz: sweeps, and the logits of the model for exactly these.
 
-    Sweeps are rounded, since noise does not pack: as coarsely as leaves labels as they are, and probabilities NEAR.
+    Sweeps are rounded, since noise does not pack: as coarsely as leaves labels as they are, probabilities NEAR, and known
+    sweeps known.
     """
 
     def answers(samples: Array) -> tuple[Array, ...]:
@@ -250,9 +266,10 @@ def golden_file(content: Content, golden: Dataset) -> bytes:
         near = np.abs(softmax(answer) - softmax(exact)).max() <= NEAR
         return bool(near and (answer.argmax(1) == golden.labels).all())
 
-    exact = answers(golden.samples)
+    exact, unknown = answers(golden.samples), _unknown(content, golden)
     for samples in _rounded(golden.samples):
-        if all(map(same, rounded := answers(samples), exact)):
+        still = _unknown(content, replace(golden, samples=samples)) <= unknown
+        if still.all() and all(map(same, rounded := answers(samples), exact)):
             return bundle.golden_file(samples, rounded[0])
     return bundle.golden_file(golden.samples, exact[0])
 
