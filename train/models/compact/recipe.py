@@ -105,6 +105,9 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
         both = _side_by_side(_known(stages, sweeps, changed), known)
         court = Court([both], [InnerPart(by, out)], classes)
         judged = court.judge(_with_stages(judged.plan))
+        if settings.choose:  # beside stages fewer may do
+            numbers = np.append(np.full(sum(STAGES.channels), -1), _filter_numbers(fixed))
+            judged = choice.fewer(court, judged, numbers, bank.LEAST_FILTERS, partial(told, 3))
     trunk, plan = _pruned(fixed, stages, judged.plan)
     heads: dict[str, Array] = {}
     for name, int8 in (("head", False), ("int8", True)):
@@ -165,10 +168,17 @@ def _choose(court: Court, trunk: Trunk, settings: Settings, log: Log) -> Judged:
     if not settings.choose:
         return court.judge(choice.views([np.flatnonzero(~filters.free)], pools))
     chosen = choice.choose(court, kinds, pools, levels, bands, log, settings.reattached)
-    number = np.full(max(part.stop for part in layout.values()), -1)
-    for pool in pools:
-        number[pool] = np.arange(len(pool))
-    return choice.fewer(court, chosen, number, bank.LEAST_FILTERS, log)
+    return choice.fewer(court, chosen, _filter_numbers(trunk), bank.LEAST_FILTERS, log)
+
+
+def _filter_numbers(trunk: Trunk) -> Array:
+    """Of each feature the number of the filter that gives it, -1 where none does."""
+    layout = trunk.layout()
+    numbers = np.full(max(part.stop for part in layout.values()), -1)
+    for name in ("sizes", "shares"):
+        if name in layout:
+            numbers[layout[name]] = np.arange(layout[name].stop - layout[name].start)
+    return numbers
 
 
 def _known(trunk: Trunk, sweeps: Dataset, changed: Sequence[Dataset], int8: bool = True) -> HeadData:
