@@ -22,6 +22,7 @@ from train.data.sets import Dataset
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
 from train.models.compact import graph, recipe
+from train.models.compact.bank import LEAST_FILTERS, Bank
 from train.models.compact.fitted import Fit
 from train.models.methods import model_inputs
 from train.onnx_tools import parity
@@ -168,16 +169,21 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
 def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     """Write what `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx, both with random weights.
 
-    The first is a trunk like the default bundle's in float32, the second the paper's CNN in int8; both take its sweeps.
+    The first is a trunk like the packaged bundle's in float32, with stages and the fewest filters, the second the paper's CNN
+    in int8; both take its sweeps.
     """
-    from train.models.paper_cnn import INT8_NODES, random_paper_cnn  # here: it imports PyTorch
+    from train.models.compact.network import Compact  # here, as what follows: it imports PyTorch
+    from train.models.paper_cnn import INT8_NODES, random_paper_cnn
 
     rng, form, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
     counts = rng.integers(0, 256, (4, form.window, *form.shape), np.uint8)
     sweeps = Dataset(counts, np.arange(4) % classes, skin.MATERIALS, form.rate_hz, {}, "random counts")
     trunk = recipe.fixed_trunk(sweeps, seed)
-    architecture = replace(trunk.architecture, pools=1)
-    small = graph.trunk_graph(form, trunk.scale, trunk.weights, architecture)
+    stages = Compact(form, classes, trunk.scale, norm=False, architecture=recipe.STAGES).weights()
+    filters = Bank.of(trunk.weights)
+    filters = filters.take(np.arange(len(filters))[:: len(filters) // LEAST_FILTERS])
+    architecture = replace(recipe.STAGES, pools=2, distribution=True, spectrum=True)
+    small = graph.trunk_graph(form, trunk.scale, {**trunk.weights, **stages, **filters.weights()}, architecture)
     size = small.graph.output[0].type.tensor_type.shape.dim[1].dim_value
     small = with_head(small, rng.standard_normal((classes, size)), np.zeros(classes))
     paper = quantize(random_paper_cnn(form, classes, rng), counts, INT8_NODES)
