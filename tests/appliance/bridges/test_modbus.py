@@ -36,13 +36,6 @@ START, STOP, NEW = (COILS.index(name) for name in ("START", "STOP", "NEW"))
 
 
 @pytest.fixture
-def box(tmp_path: Path) -> Iterator[SpeakingBox]:
-    """A box that obeys."""
-    with SpeakingBox(tmp_path / "line") as one:
-        yield one
-
-
-@pytest.fixture
 def address(box: SpeakingBox) -> Iterator[Address]:
     """A bridge to it that may write."""
     with bridge("modbus", "--port", box.path, "--allow-writes") as there:

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,6 @@ from tests.factories.paths import ROOT
 from tests.factories.speaking_box import SpeakingBox, obeying, result, state
 
 FAULTS = [s for s in Status if not s.classified and s not in (Status.UNKNOWN, Status.RECORDED)]
-
-
-@pytest.fixture
-def box(tmp_path: Path) -> Iterator[SpeakingBox]:
-    """A box that obeys."""
-    with SpeakingBox(tmp_path / "line") as one:
-        yield one
 
 
 def answering(*statuses: str) -> Callable[[Sentence], list[bytes]]:

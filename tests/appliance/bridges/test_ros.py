@@ -32,13 +32,6 @@ def _installed() -> None:
 
 
 @pytest.fixture
-def box(tmp_path: Path) -> Iterator[SpeakingBox]:
-    """A box that obeys."""
-    with SpeakingBox(tmp_path / "line") as one:
-        yield one
-
-
-@pytest.fixture
 def node(box: SpeakingBox) -> Iterator[RosPeer]:
     """A node that hears the box through the bridge; its parameters come from the page's file."""
     with ros.peer() as peer, ros.bridge("--params-file", str(PARAMETERS), "-p", f"port:={box.path}", *WRITES):

@@ -29,13 +29,6 @@ def _installed() -> None:
 
 
 @pytest.fixture
-def box(tmp_path: Path) -> Iterator[SpeakingBox]:
-    """A box that obeys."""
-    with SpeakingBox(tmp_path / "line") as one:
-        yield one
-
-
-@pytest.fixture
 def node(box: SpeakingBox) -> Iterator[RosPeer]:
     """A node that hears the box through a bridge which may command it, and knows its labels."""
     with ros.peer() as peer, ros.bridge("-p", f"port:={box.path}", *WRITES):

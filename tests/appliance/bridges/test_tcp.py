@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,13 +26,6 @@ from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, result, state
 
 Address = tuple[str, int]
-
-
-@pytest.fixture
-def box(tmp_path: Path) -> Iterator[SpeakingBox]:
-    """A box that obeys."""
-    with SpeakingBox(tmp_path / "line") as one:
-        yield one
 
 
 def url(address: Address) -> str:
