@@ -251,6 +251,7 @@ class FeedServer(Observer):
         self._newest: Frames | None = None
         self._large, self._large_ns = b"", 0  # the last line that was larger than a queue, and when it came
         self._retry_ns = self._health_ns = self._next_ns = clock.now_ns()
+        self._health = b""  # the line of this second
         self._tick, self._fresh = 0, False
         self._state: tuple[object, ...] = ()
         self._log = TroubleLog(
@@ -300,9 +301,9 @@ class FeedServer(Observer):
 
     def _work(self, listener: socket.socket, health: Health, now_ns: int) -> None:
         if now_ns >= self._health_ns:
-            self._health_ns = now_ns + HEALTH_NS
+            self._health_ns, self._health = now_ns + HEALTH_NS, b""
             if self._readers:
-                self._to_all(encode("health", self._report(health)))
+                self._to_all(self._health_line(health))
         self._put_frame(now_ns)
         for number, events in self._poll.poll(0, HEARD):
             if number in self._readers:
@@ -383,8 +384,13 @@ class FeedServer(Observer):
         self._readers[connection.fileno()] = reader
         self._poll.register(connection, select.EPOLLIN)
         reader.put(self._hello)
-        reader.put(encode("health", self._report(health)))
+        reader.put(self._health_line(health))
         self._let_wait(reader)
+
+    def _health_line(self, health: Health) -> bytes:
+        """Made once a second at most: those who connect again and again would make it the costliest of all."""
+        self._health = self._health or encode("health", self._report(health))
+        return self._health
 
     def _hear(self, reader: Reader, *, gone: bool) -> None:
         """Take up its requests. gone: it has closed the connection, perhaps after them."""

@@ -70,6 +70,14 @@ def test_health_comes_once_a_second_and_a_state_with_each_change(offered: Offere
     assert [(line["skin"], line["trouble"]) for line in peer.lines()] == [("absent", "no skin on USB")]
 
 
+def test_those_who_connect_within_a_second_hear_the_same_health(offered: Offered) -> None:
+    """It is made once, however many there are; after the next second it is another."""
+    first, second = offered.peer().lines()[1], offered.peer().lines()[1]
+    assert first == second
+    offered.turns(150, step_s=0.008)
+    assert offered.peer().lines()[1]["time_ns"] > first["time_ns"]
+
+
 def test_a_verdict_has_the_probabilities_of_all_labels(offered: Offered) -> None:
     """All fields of the verdict, with the shift of the contact."""
     peer = offered.peer()
