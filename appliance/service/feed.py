@@ -2,7 +2,8 @@
 lines on a local socket (PROTOCOL.md, part 4).
 
 Nothing here waits for a reader: what one does not take in time is dropped and counted. Every PERIOD_NS a bounded part of
-the work is done, whatever the readers do: many of them get their lines later, and the loop is none the slower.
+the work is done, and after a costly one more time passes, so that readers take no more than SHARE of a core whatever they
+do: many of them, or bad ones, get their lines later, and the loop is none the slower.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import os
 import select
 import socket
 import stat
+import time
 from binascii import b2a_base64
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -49,6 +51,10 @@ MOST_VALUES_S = 10_000
 """Raw counts a second that are written as text: of a large skin fewer frames a second are offered."""
 PERIOD_NS = 30_000_000
 """Time between two looks at the sockets; system calls in every turn of the loop would cost more than all that is sent."""
+SHARE = 0.006
+"""Most of a core that the looks at the sockets may take; waking the caches for them costs about as much again."""
+MOST_PERIOD_NS = 250_000_000
+"""One costly look, as when the machine is busy, holds up the next by no more than this."""
 SOON_NS = 5_000_000
 """A verdict, or another state, is sent so soon after the look before it."""
 SERVED, HEARD, HEARD_BYTES = 16, 2, 64
@@ -231,14 +237,14 @@ class FeedServer(Observer):
     """Offers the feed at `path` to at most MOST_READERS programs of the socket's group.
 
     fmt: of the sweeps. facts: what the first line says beside the format (PROTOCOL.md: source, bundle, labels, skin).
-    clock, more: as for Report.
+    clock, more: as for Report. spent_ns: processor time that this thread has taken so far.
     """
 
     def __init__(
         self, path: Path, fmt: SweepFormat, facts: Mapping[str, Any], clock: Clock,
-        more: Callable[[], Mapping[str, Any]] = dict,
+        more: Callable[[], Mapping[str, Any]] = dict, spent_ns: Callable[[], int] = time.thread_time_ns,
     ) -> None:  # fmt: skip
-        self._path, self._clock, self._report = path, clock, Report(clock, more)
+        self._path, self._clock, self._report, self._spent_ns = path, clock, Report(clock, more), spent_ns
         self._most_hz = min(MOST_HZ, MOST_VALUES_S / fmt.channels)
         self._hello = encode("hello", {
             "schema": FEED_SCHEMA, "version": __version__, "pid": os.getpid(), **facts, "format": fmt.json(),
@@ -294,10 +300,12 @@ class FeedServer(Observer):
         now_ns = self._clock.now_ns()
         if now_ns < self._next_ns - (PERIOD_NS - SOON_NS if self._fresh else 0):
             return
-        self._next_ns, self._fresh = now_ns + PERIOD_NS, False
+        begun_ns, self._fresh = self._spent_ns(), False
         listener = self._listener or self._offer(now_ns)
         if listener:
             self._work(listener, health, now_ns)
+        pause_ns = round((self._spent_ns() - begun_ns) / SHARE)
+        self._next_ns = now_ns + min(max(pause_ns, PERIOD_NS), MOST_PERIOD_NS)
 
     def _work(self, listener: socket.socket, health: Health, now_ns: int) -> None:
         if now_ns >= self._health_ns:

@@ -67,18 +67,24 @@ class FeedPeer:
 
 
 class Offered:
-    """A feed whose turns a test takes."""
+    """A feed whose turns a test takes. cost_ns: processor time of each look at the sockets."""
 
     def __init__(self, path: Path, fmt: SweepFormat = skin.FORMAT, **facts: Any) -> None:
         self.path, self.clock = path, rig.VirtualClock()
         known = {"source": "usb", "bundle": "9f3c2a1b", "labels": ["plastic rough", "wood"], "skin": "palpate"}
-        self.feed = FeedServer(path, fmt, known, self.clock, lambda: facts)
+        self.cost_ns = self._spent_ns = 0
+        self.feed = FeedServer(path, fmt, known, self.clock, lambda: facts, self._spent)
 
     def turns(self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND) -> None:
         """Take turns, `step_s` apart: so that each is one in which the feed does its work."""
         for _ in range(n):
             self.feed.turn(health)
             self.clock.sleep_until(self.clock.now_ns() + round(step_s * SECOND))
+
+    def _spent(self) -> int:
+        """Asked before and after each look."""
+        self._spent_ns += self.cost_ns
+        return self._spent_ns
 
     def peer(self) -> FeedPeer:
         """A connected reader that the box has taken up."""

@@ -11,6 +11,7 @@ import tracemalloc
 from base64 import b64decode
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,19 @@ import pytest
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, SweepFormat
 from appliance.service import feed as module
-from appliance.service.feed import HEARD, HEARD_BYTES, MOST_READERS, QUEUE_BYTES, SERVED, Asked, FeedServer, requests
+from appliance.service.feed import (
+    HEARD,
+    HEARD_BYTES,
+    MOST_PERIOD_NS,
+    MOST_READERS,
+    PERIOD_NS,
+    QUEUE_BYTES,
+    SERVED,
+    SHARE,
+    Asked,
+    FeedServer,
+    requests,
+)  # fmt: skip
 from appliance.sim import devices, rig, script, skin
 from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, cut, frames
 from tests.factories.simulated_box import SECOND, Rigged
@@ -464,6 +477,26 @@ def test_a_turn_serves_a_few_and_all_in_the_end(offered: Offered) -> None:
         assert len(got) == SERVED, f"turn {turn}"
 
 
+@pytest.mark.parametrize(
+    ("cost_ns", "period_ns"),
+    [
+        (round(PERIOD_NS * SHARE / 2), PERIOD_NS),
+        (round(PERIOD_NS * SHARE * 3), PERIOD_NS * 3),
+        (PERIOD_NS, MOST_PERIOD_NS),
+    ],
+)
+def test_a_costly_look_at_the_sockets_puts_off_the_next(
+    offered: Offered, monkeypatch: pytest.MonkeyPatch, cost_ns: int, period_ns: int
+) -> None:
+    """Looks take no more than SHARE of a core: one that took three times that is followed by a pause three times as long."""
+    offered.cost_ns = cost_ns
+    looks: list[int] = []
+    monkeypatch.setattr(offered.feed, "_work", lambda *_: looks.append(offered.clock.now_ns()))
+    offered.turns(1000, step_s=0.001)
+    assert len(looks) >= 3
+    assert {b - a for a, b in pairwise(looks)} == {period_ns}
+
+
 def test_a_reader_that_stops_in_the_middle_or_is_killed(offered: Offered) -> None:
     """Half a request and an end; a connection closed with lines unread: both are let go."""
     half, unread = offered.peer(), offered.peer()
@@ -608,7 +641,7 @@ def test_without_readers_nothing_is_written_as_text(offered: Offered, monkeypatc
 def test_a_running_box_offers_its_verdicts_frames_and_sweeps(rigged: Callable[..., Rigged], tmp_path: Path) -> None:
     """On simulated devices: the verdicts that the robot gets, frames, and the windows that the box has cut."""
     simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
-    feed = FeedServer(tmp_path / "feed.sock", skin.FORMAT, {"source": "sim"}, simulated.clock)
+    feed = FeedServer(tmp_path / "feed.sock", skin.FORMAT, {"source": "sim"}, simulated.clock, spent_ns=lambda: 0)
     box = rigged(simulated, observers=[feed])
     box.box.step()
     peer = FeedPeer(tmp_path / "feed.sock")
