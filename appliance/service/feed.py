@@ -51,7 +51,7 @@ MOST_VALUES_S = 10_000
 """Raw counts a second that are written as text: of a large skin fewer frames a second are offered."""
 PERIOD_NS = 30_000_000
 """Time between two looks at the sockets; system calls in every turn of the loop would cost more than all that is sent."""
-SHARE = 0.006
+SHARE = 0.004
 """Most of a core that the looks at the sockets may take; waking the caches for them costs about as much again."""
 MOST_PERIOD_NS = 250_000_000
 """One costly look, as when the machine is busy, holds up the next by no more than this."""
