@@ -3,8 +3,7 @@ each kind of readers. Out: JSON and a table: share of a core, memory, latency an
 if a target was missed.
 
 One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had the same machine. Box
-and listener run with real-time priority where `chrt` may be used: other programs of the machine then cost no latency. They
-do cost processor time, since caches and memory are shared: with the kind ELSEWHERE the same attack meets another box.
+and listener run with real-time priority where `chrt` may be used: other programs of the machine then cost no latency.
 """
 
 from __future__ import annotations
@@ -43,7 +42,6 @@ LOST, DROPPED = 7, 10
 PACKET = 6
 """Frames of a packet, as rig.Board sends them."""
 REAL_TIME = ("chrt", "-f", "10")
-ELSEWHERE = "elsewhere"
 
 
 @dataclass
@@ -104,32 +102,24 @@ def measure(
     """All kinds in turns; resident memory in KiB before there was any reader; what was measured."""
     kinds = {name: Kind() for name in names}
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        box, sweeps = _box(stack, before, folder / "feed.sock"), Script(seed)
+        path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
+        box, sweeps = ThisMachine(before, [f"feed.socket={path}"]), Script(seed)
+        stack.callback(box.close)
         box.start(seed, sweeps)
-        if ELSEWHERE in names:
-            _box(stack, before, folder / "elsewhere.sock").start(seed, Script(seed))
         listener = LatencyListener(box, sweeps)
         listener.listen(30.0, Kind())  # the start, and the first sweeps
         rss_kib = box.process()[0]
         for turn in range(max(1, round(minutes * 60 / SLOT_S))):
             for name, kind in kinds.items():
-                _slot(name, folder, box, listener, kind)
+                _slot(name, path, box, listener, kind)
                 report(f"{turn + 1}  {name:<10} {100 * kind.shares[-1]:5.2f} % of a core, {kind.rss_kib[-1]} KiB")
         box.stop()
     return kinds, rss_kib, dict(box.about())
 
 
-def _box(stack: ExitStack, before: Sequence[str], feed: Path) -> ThisMachine:
-    box = ThisMachine(before, [f"feed.socket={feed}"])
-    stack.callback(box.close)
-    return box
-
-
-def _slot(name: str, folder: Path, box: ThisMachine, listener: LatencyListener, kind: Kind) -> None:
-    """One turn of a kind: readers come, the box is watched, they go. folder: of the boxes' sockets."""
-    whom = ("elsewhere.sock", "attacked") if name == ELSEWHERE else ("feed.sock", name)
-    command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(folder / whom[0]), whom[1]]
+def _slot(name: str, path: Path, box: ThisMachine, listener: LatencyListener, kind: Kind) -> None:
+    """One turn of a kind: readers come, the box is watched, they go."""
+    command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(path), name]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as readers:
         listener.listen(SETTLE_S, Kind())
         begin_s, cpu_s = time.monotonic(), box.process()[2]
@@ -165,17 +155,15 @@ def lateness(kinds: dict[str, Kind]) -> dict[str, Any]:
 
 
 def result(kinds: dict[str, Kind], rss_kib: int) -> dict[str, Any]:
-    """Figures by kind. late_ms: see `lateness`. share_more: difference to no reader or, for the attack, to the same attack
-    ELSEWHERE where that was measured (`than`); mean of the turns with a 95 % interval. memory_mib: resident, more than
-    before the first reader, the most of all turns."""
+    """Figures by kind. late_ms: see `lateness`. share_more: difference to no reader, mean of the turns with a 95 %
+    interval. memory_mib: resident, more than before the first reader, the most of all turns."""
     late, figures = lateness(kinds), {}
     for name, kind in kinds.items():
-        than = ELSEWHERE if name == "attacked" and ELSEWHERE in kinds else "0"
-        more = np.array(kind.shares) - np.array(kinds[than].shares)
+        more = np.array(kind.shares) - np.array(kinds["0"].shares)
         width = 1.96 * more.std(ddof=1) / np.sqrt(len(more)) if len(more) > 1 else float("nan")
         figures[name] = {
             "seconds": round(kind.wall_s), "answers": len(kind.answers),
-            "share": round(kind.cpu_s / kind.wall_s, 5), "than": than,
+            "share": round(kind.cpu_s / kind.wall_s, 5),
             "share_more": [round(float(v), 5) for v in (more.mean(), more.mean() - width, more.mean() + width)],
             "memory_mib": round((max(kind.rss_kib) - rss_kib) / 1024, 2),
             "late_ms": {f"p{q}": round(float(np.percentile(late[name], q)), 2) for q in (50, 99)},
@@ -199,7 +187,7 @@ def missed(figures: dict[str, Any]) -> list[str]:
     for name, one in figures.items():
         more_ms = one["late_ms"]["p50"] - figures["0"]["late_ms"]["p50"]
         checks = {
-            f"{100 * one['share_more'][0]:.2f} % of a core": name != ELSEWHERE and one["share_more"][0] > SHARE,
+            f"{100 * one['share_more'][0]:.2f} % of a core": one["share_more"][0] > SHARE,
             f"{one['memory_mib']} MiB more": one["memory_mib"] > MIB,
             f"{more_ms:.2f} ms later in the median": more_ms > LATE_MS,
             f"{one['frames_lost']} frames lost": one["frames_lost"] > 0,
@@ -215,7 +203,6 @@ NAMES = {
     "1": "1 reader",
     "8": "8, one never reads",
     "64": "64, one never reads",
-    ELSEWHERE: "none; another box is attacked",
     "attacked": "attacked",
     "bridge": "a bridge that is attacked",
 }
@@ -229,7 +216,7 @@ def table(content: dict[str, Any]) -> str:
         f"{content['machine']}{', with real-time priority' * content['real_time']}; load average {content['load']:.1f} by other "
         f"work; commit {content['commit'][:12]}.",
         "",
-        "| readers | share of a core | more than without, or than where another box is attacked | memory, more | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost |",
+        "| readers | share of a core | more than without | memory, more | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, one in figures.items():

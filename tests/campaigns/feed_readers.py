@@ -27,7 +27,7 @@ ALL = b'{"frames": 20, "sweeps": true}\n'
 PAUSE_S = 0.002
 STORM = 1000
 """Connections that are open at once while the feed is attacked, most of which the box has not taken up or has refused."""
-KINDS = ("0", "1", "8", "64", "elsewhere", "attacked", "bridge")
+KINDS = ("0", "1", "8", "64", "attacked", "bridge")
 
 Act = Callable[[], None]
 Address = str | tuple[str, int]

@@ -47,17 +47,6 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(kinds: dict[str, Kind]) 
     assert "+0.70 % [+0.70, +0.70]" in rows[6]
 
 
-def test_the_attack_costs_what_the_same_attack_elsewhere_does_not(kinds: dict[str, Kind]) -> None:
-    """A machine that is slower for both boxes is not the feed's cost; what is more than that is, and is missed."""
-    slower = {**kinds, "elsewhere": kind(0.063), "attacked": kind(0.067)}
-    figures = feed_load.result(slower, 69_000)
-    assert figures["attacked"]["share_more"] == pytest.approx([0.004] * 3)
-    assert figures["elsewhere"]["share_more"] == pytest.approx([0.013] * 3)
-    assert feed_load.missed(figures) == []
-    worse = feed_load.result(slower | {"attacked": kind(0.075)}, 69_000)
-    assert feed_load.missed(worse) == ["attacked: 1.20 % of a core"]
-
-
 @pytest.mark.parametrize(
     ("change", "what"),
     [
