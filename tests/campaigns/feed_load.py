@@ -3,7 +3,8 @@ each kind of readers. Out: JSON and a table: share of a core, memory, latency an
 if a target was missed.
 
 One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had the same machine. Box
-and listener run with real-time priority where `chrt` may be used: other programs of the machine then cost no latency.
+and listener run with real-time priority where `chrt` may be used: other programs of the machine then cost no latency. What
+the loop spends in the feed is counted by itself, too (feed_inside).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from appliance.client.answers import Answer
 from appliance.core import storage
 from appliance.core.provenance import commit
 from appliance.sim import skin
+from tests.campaigns.feed_inside import spent_ns
 from tests.campaigns.feed_readers import KINDS
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine
@@ -50,6 +52,8 @@ class Kind:
 
     wall_s: float = 0.0
     cpu_s: float = 0.0
+    inside_s: float = 0.0
+    """Of cpu_s, in the feed."""
     shares: list[float] = field(default_factory=list)
     rss_kib: list[int] = field(default_factory=list)
     answers: list[tuple[float, int]] = field(default_factory=list)
@@ -103,7 +107,8 @@ def measure(
     kinds = {name: Kind() for name in names}
     with ExitStack() as stack:
         path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
-        box, sweeps = ThisMachine(before, [f"feed.socket={path}"]), Script(seed)
+        counted = [*before, sys.executable, "-m", "tests.campaigns.feed_inside", os.fspath(_inside(path))]
+        box, sweeps = ThisMachine(counted, [f"feed.socket={path}"]), Script(seed)
         stack.callback(box.close)
         box.start(seed, sweeps)
         listener = LatencyListener(box, sweeps)
@@ -117,14 +122,20 @@ def measure(
     return kinds, rss_kib, dict(box.about())
 
 
+def _inside(feed: Path) -> Path:
+    """The file of feed_inside beside the socket."""
+    return feed.with_suffix(".ns")
+
+
 def _slot(name: str, path: Path, box: ThisMachine, listener: LatencyListener, kind: Kind) -> None:
     """One turn of a kind: readers come, the box is watched, they go."""
     command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(path), name]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as readers:
         listener.listen(SETTLE_S, Kind())
-        begin_s, cpu_s = time.monotonic(), box.process()[2]
+        begin_s, cpu_s, inside_ns = time.monotonic(), box.process()[2], spent_ns(_inside(path))
         listener.listen(SLOT_S, kind)
         wall_s, cpu_s = time.monotonic() - begin_s, box.process()[2] - cpu_s
+        kind.inside_s += (spent_ns(_inside(path)) - inside_ns) / 1e9
         kind.rss_kib.append(box.process()[0])
         kind.wall_s, kind.cpu_s = kind.wall_s + wall_s, kind.cpu_s + cpu_s
         kind.shares.append(cpu_s / wall_s)
@@ -156,14 +167,15 @@ def lateness(kinds: dict[str, Kind]) -> dict[str, Any]:
 
 def result(kinds: dict[str, Kind], rss_kib: int) -> dict[str, Any]:
     """Figures by kind. late_ms: see `lateness`. share_more: difference to no reader, mean of the turns with a 95 %
-    interval. memory_mib: resident, more than before the first reader, the most of all turns."""
+    interval. inside: share of a core that the loop spends in the feed. memory_mib: resident, more than before the first
+    reader, the most of all turns."""
     late, figures = lateness(kinds), {}
     for name, kind in kinds.items():
         more = np.array(kind.shares) - np.array(kinds["0"].shares)
         width = 1.96 * more.std(ddof=1) / np.sqrt(len(more)) if len(more) > 1 else float("nan")
         figures[name] = {
             "seconds": round(kind.wall_s), "answers": len(kind.answers),
-            "share": round(kind.cpu_s / kind.wall_s, 5),
+            "share": round(kind.cpu_s / kind.wall_s, 5), "inside": round(kind.inside_s / kind.wall_s, 5),
             "share_more": [round(float(v), 5) for v in (more.mean(), more.mean() - width, more.mean() + width)],
             "memory_mib": round((max(kind.rss_kib) - rss_kib) / 1024, 2),
             "late_ms": {f"p{q}": round(float(np.percentile(late[name], q)), 2) for q in (50, 99)},
@@ -187,7 +199,8 @@ def missed(figures: dict[str, Any]) -> list[str]:
     for name, one in figures.items():
         more_ms = one["late_ms"]["p50"] - figures["0"]["late_ms"]["p50"]
         checks = {
-            f"{100 * one['share_more'][0]:.2f} % of a core": one["share_more"][0] > SHARE,
+            f"{100 * one['inside']:.2f} % of a core in the feed": one["inside"] > SHARE,
+            f"{100 * one['share_more'][1]:.2f} % of a core at least": one["share_more"][1] > SHARE,
             f"{one['memory_mib']} MiB more": one["memory_mib"] > MIB,
             f"{more_ms:.2f} ms later in the median": more_ms > LATE_MS,
             f"{one['frames_lost']} frames lost": one["frames_lost"] > 0,
@@ -216,14 +229,14 @@ def table(content: dict[str, Any]) -> str:
         f"{content['machine']}{', with real-time priority' * content['real_time']}; load average {content['load']:.1f} by other "
         f"work; commit {content['commit'][:12]}.",
         "",
-        "| readers | share of a core | more than without | memory, more | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost |",
-        "|---|---|---|---|---|---|---|---|",
+        "| readers | share of a core | more than without | in the feed | memory, more | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, one in figures.items():
         more = "" if name == "0" else "{:+.2f} % [{:+.2f}, {:+.2f}]".format(*(100 * v for v in one["share_more"]))
         late, latency = one["late_ms"], one["latency_ms"]
         rows.append(
-            f"| {NAMES[name]} | {100 * one['share']:.2f} % | {more} | {one['memory_mib']:.2f} MiB | "
+            f"| {NAMES[name]} | {100 * one['share']:.2f} % | {more} | {100 * one['inside']:.2f} % | {one['memory_mib']:.2f} MiB | "
             f"{late['p50']:.1f} / {late['p99']:.1f} ms | {latency['p50']:.2f} / {latency['p99']:.2f} ms | "
             f"{one['answers']} | {one['frames_lost']} |"
         )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
+import time
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.campaigns import feed_load, feed_readers
+from tests.campaigns import feed_inside, feed_load, feed_readers
 from tests.campaigns.feed_load import PACKET, Kind
 from tests.factories.feeds import OK, Offered, frames
 
@@ -50,7 +51,8 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(kinds: dict[str, Kind]) 
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        ({"shares": [0.07] * 15}, "2.00 % of a core"), ({"rss_kib": [70_000, 73_000]}, "3.91 MiB more"),
+        ({"shares": [0.07] * 15}, "2.00 % of a core at least"), ({"inside_s": 3.3}, "1.10 % of a core in the feed"),
+        ({"rss_kib": [70_000, 73_000]}, "3.91 MiB more"),
         ({"lost": 3}, "3 frames lost"), ({"dropped": 1}, "1 sentences dropped"),
         ({"faults": Counter({"sweeps without an answer": 2})}, "sweeps without an answer"),
     ],
@@ -68,6 +70,33 @@ def test_later_answers_are_found(kinds: dict[str, Kind]) -> None:
     """Two milliseconds in the median."""
     kinds["1"] = kind(0.052, 2.5)
     assert feed_load.missed(feed_load.result(kinds, 69_000)) == ["1: 2.00 ms later in the median"]
+
+
+def test_what_the_loop_spends_in_the_feed_is_counted(tmp_path: Path) -> None:
+    """Of all calls and nothing between them; a call that fails counts too."""
+
+    class Costly:
+        def turn(self, numbers: int) -> None:
+            sum(range(numbers))
+            if numbers == 3:
+                raise ValueError(numbers)
+
+        frames = answered = sweep = turn
+
+    path = tmp_path / "ns"
+    feed_inside.count(path, Costly)
+    before_ns = time.thread_time_ns()
+    sum(range(1_000_000))
+    assert feed_inside.spent_ns(path) == 0
+    costly = Costly()
+    costly.turn(1_000_000)
+    first_ns = feed_inside.spent_ns(path)
+    costly.answered(1_000_000)
+    both_ns = feed_inside.spent_ns(path)
+    assert 0 < first_ns < both_ns < time.thread_time_ns() - before_ns
+    with pytest.raises(ValueError, match="3"):
+        costly.turn(3)
+    assert feed_inside.spent_ns(path) > both_ns
 
 
 @pytest.mark.parametrize("name", ["1", "8"])
