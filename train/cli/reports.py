@@ -15,6 +15,8 @@ from appliance.core.storage import put
 from train.cli import options
 from train.cli.options import Add
 from train.data import sets
+from train.evaluation.evaluate import Where
+from train.models.methods import Effort
 from train.reports import (
     bench_table,
     bundle_experiment,
@@ -94,9 +96,10 @@ def _add_development(add: Add) -> argparse.ArgumentParser:
                          help="a case, or a point of its learning curve, that is not run, as the page names it")  # fmt: skip
     command.add_argument("--join", type=Path, action="append", default=[], metavar="FILE",
                          help="results.json of an earlier run, whose methods join those of this one")  # fmt: skip
-    command.add_argument(
-        "--draw", action="store_true", help="run nothing: draw the page of results.json in --out again"
-    )
+    again = command.add_mutually_exclusive_group()
+    again.add_argument("--draw", action="store_true", help="run nothing: draw the pages of results.json in --out again")
+    again.add_argument("--times", action="store_true",
+                       help="measure the times of results.json in --out again, keep its accuracies, and draw the pages")  # fmt: skip
     return command
 
 
@@ -158,34 +161,37 @@ def run_chart(args: argparse.Namespace) -> None:
 
 
 def run_development(args: argparse.Namespace) -> None:
-    """Evaluate, time, write the page to --out and print its path; with --draw write it of what lies there.
+    """Evaluate, time, write the pages to --out and print their path; with --draw write them of what lies there, with --times
+    after timing alone.
 
     Raises FormatError where no result of ours is there.
     """
     quick: bool = args.quick
-    if args.draw:
-        print(development_report.write(_results(args.out / "results.json"), args.out, quick))
-        return
-    names = development_experiment.QUICK_METHODS if quick else development_experiment.usual_methods()
-    cases = development_experiment.QUICK if quick else development_experiment.CASES
-    effort = development_experiment.QUICK_EFFORT if quick else options.effort(args)
     where, log = options.where(args), options.Log()
-    run = development_experiment.Development(
-        cases, tuple(args.method.split(",")) if args.method else names, where, log, args.data, effort, options.seeds(args),
-        args.leave_out,
-    )  # fmt: skip
-    earlier = [_results(path) for path in args.join]
-    figures = development_experiment.join(run.results(), earlier)
-    for name, why in figures["left_out"].items():
-        print(f"left out: {name}: {why}")
-    if not args.kept:
+    effort = development_experiment.QUICK_EFFORT if quick else options.effort(args)
+    figures = _results(args.out / "results.json") if args.draw or args.times else _developed(args, where, log, effort)
+    if args.times or not (args.draw or args.kept):
         train = (
             sets.load(chart_report.QUICK.train).select(chart_report.QUICK.only)
             if quick
             else sets.load(development_times.SET)
         )
-        figures["times"] = development_times.measured(figures["methods"], train, run.seeds[0], where.cache, log, effort)
+        figures["times"] = development_times.measured(figures["methods"], train, 1, where.cache, log, effort)
     print(development_report.write(figures, args.out, quick))
+
+
+def _developed(args: argparse.Namespace, where: Where, log: options.Log, effort: Effort) -> dict[str, Any]:
+    """What `development` has evaluated, joined with earlier runs."""
+    names = development_experiment.QUICK_METHODS if args.quick else development_experiment.usual_methods()
+    cases = development_experiment.QUICK if args.quick else development_experiment.CASES
+    run = development_experiment.Development(
+        cases, tuple(args.method.split(",")) if args.method else names, where, log, args.data, effort, options.seeds(args),
+        args.leave_out,
+    )  # fmt: skip
+    figures = development_experiment.join(run.results(), [_results(path) for path in args.join])
+    for name, why in figures["left_out"].items():
+        print(f"left out: {name}: {why}")
+    return figures
 
 
 def _results(path: Path) -> dict[str, Any]:

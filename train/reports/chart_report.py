@@ -30,6 +30,7 @@ from train.models import methods
 from train.models.compact.architectures import ARCHITECTURES
 from train.models.methods import FULL_EFFORT, Effort, Method
 from train.reports import chart_page, scatter
+from train.reports.method_names import family
 
 Json = dict[str, Any]
 Log = Callable[[str], None]
@@ -39,20 +40,6 @@ FABRICS = "fabricslide/fabricslide.npz"
 BOX_ON_HARD = "alignment/place.json"
 """Beside the chart's folder: what the box answers to T-HARD's sweeps."""
 SEVEN = ("direction=0", "force<=180")
-FAMILIES = {
-    "train.models.compact.default": "Palpate",
-    "train.models.compact.methods": "Palpate",
-    "train.models.baselines": "L and H",
-    "train.models.paper_cnn": "deep networks",
-    "train.models.recurrent": "deep networks",
-    "train.models.minirocket": "MiniRocket",
-    "train.models.minirocket_augmented": "MiniRocket",
-    "train.models.aeon_peers": "aeon",
-    "train.models.ds_cnn": "edge tools",
-    "train.models.lite": "edge tools",
-    "train.models.edge_spectral": "edge tools",
-}
-OTHERS = "related work"
 
 
 @dataclass(frozen=True)
@@ -159,8 +146,7 @@ class Charting:
     def _dot(self, one: Packed, costs: Json, accuracy: Json) -> Json:
         """Costs and accuracy of one; touch time is the mean part of the window that early exit needs, of the method itself."""
         share = self.touch.get(one.method, 1.0) if not one.form else 1.0
-        family = FAMILIES.get(methods.module_of(one.method), OTHERS)
-        return costs | {"touch_s": round(one.window_s * share, 3), "family": family, "accuracy": accuracy}
+        return costs | {"touch_s": round(one.window_s * share, 3), "family": family(one.method), "accuracy": accuracy}
 
     def accuracy(self) -> Accuracy:
         """Of all methods and their forms, by protocol."""

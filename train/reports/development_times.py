@@ -40,7 +40,8 @@ def measured(
     names: Sequence[str], sweeps: Dataset, seed: int, cache: Path | None, log: Log,
     effort: Effort = FULL_EFFORT, rounds: int = ROUNDS,
 ) -> Json:  # fmt: skip
-    """`entries` with `method`, `form`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep, and what was `left_out`.
+    """`entries` with `method`, `form`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep, of a graph also `weights`, `macs`
+    and `file_kb`, and what was `left_out`.
 
     Bundles are kept in `cache`, as those of the chart are.
     """
@@ -70,7 +71,7 @@ def _briefly(name: str, effort: Effort) -> Method:
 
 
 def _callable(method: Method, sweeps: Dataset, seed: int, cache: Path) -> list[tuple[Json, measure.Call]]:
-    """The method as the box runs it, in int8 too where it has such a form, and as its own library does."""
+    """The method in each of its precisions as the box runs it, and as its own library does."""
     if method.library:
         some = sweeps.take(np.arange(0, len(sweeps), EVERY))
         model = method.train(some, model_inputs(method.input, some), seed)
@@ -79,8 +80,9 @@ def _callable(method: Method, sweeps: Dataset, seed: int, cache: Path) -> list[t
     made = model_forms.packed(method, sweeps, seed, kept_folder(method, sweeps, seed, cache))
     return [
         ({"method": one.method, "form": one.form, "precision": one.precision, "runtime": one.runtime,
-          "runs_on_box": one.runtime == "onnx"}, measure.load(one.folder))
-        for one in made if not one.form or one.precision == "int8"
+          "runs_on_box": one.runtime == "onnx", "weights": one.weights, "macs": one.macs,
+          "file_kb": measure.sizes(one.folder)[0] / 1000}, measure.load(one.folder))
+        for one in made
     ]  # fmt: skip
 
 

@@ -29,7 +29,16 @@ def estimate(shares: Sequence[float], places: int = 1) -> str:
 
 def points(difference: float, sign: bool = False) -> str:
     """A difference of shares in percentage points: "2.3", "−0.4"; sign: also a plus."""
-    return f"{100 * difference:{'+' if sign else ''}.1f}".replace("-", "−")
+    rounded = round(100 * difference, 1) + 0.0  # no −0
+    return f"{rounded:{'+' if sign else ''}.1f}".replace("-", "−")
+
+
+def amount(value: float, unit: str = "") -> str:
+    """A cost in three significant digits with its unit: "0.401 ms", "104 ms"; thousands of KB are MB: "15.9 MB"."""
+    if unit == "KB" and value >= 1000:
+        value, unit = value / 1000, "MB"
+    digits = float(f"{value:.3g}")
+    return f"{digits:,.0f} {unit}".strip() if digits >= 100 else f"{digits:g} {unit}".strip()
 
 
 def seconds(value: float) -> str:

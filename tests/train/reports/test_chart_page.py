@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlparse
 
+import numpy as np
 import pytest
 
-from tests.factories.chart_data import DOTS, FRONT
+from tests.factories.chart_data import DOTS, FRONT, SHOWN
 from train.reports import chart_report, pareto
 
 NAMES = [pareto.name(one) for one in DOTS]
@@ -57,8 +61,8 @@ class BrowsedChart:
         return str(self.page.inner_text("#tip")) if self.page.is_visible("#tip") else ""
 
     def rows(self) -> list[str]:
-        """The table's first column."""
-        return [text.removeprefix("○ ") for text in self.page.locator("tbody th").all_inner_texts()]
+        """The table's lines, by what commands call them."""
+        return list(self.page.locator("#table tbody th small").all_inner_texts())
 
 
 @pytest.fixture
@@ -73,12 +77,12 @@ def seen(browser: Any, file: str) -> Iterator[BrowsedChart]:
 
 
 def test_it_shows_all_dots_and_the_front(seen: BrowsedChart):
-    """As Python found it: further right is dearer, further up more accurate; the still picture gives way."""
+    """Each network once, as Python found it: further right is dearer, further up more accurate; the still picture gives way."""
     there = seen.places()
-    assert len(there) == len(DOTS)
+    assert sorted(there, key=lambda i: there[i]) == SHOWN
     assert seen.best() == FRONT["speed"]
     assert seen.stairs().count("H") == len(FRONT["speed"])
-    assert there[0][0] < there[2][0] < there[5][0]
+    assert there[0][0] < there[2][0] < there[6][0]
     assert there[4][1] > there[0][1] > there[2][1]
     assert not seen.page.is_visible("#still")
 
@@ -91,8 +95,8 @@ def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: BrowsedChart, 
         seen.page.select_option("#x", cost)
         seen.page.select_option("#y", accuracy)
         spots = pareto.placed(DOTS, cost, accuracy)
-        assert set(seen.best()) == {DOTS.index(spot[0]) for spot in spots if spot[3]}
-        assert set(seen.places()) == {DOTS.index(spot[0]) for spot in spots}
+        assert set(seen.best()) == {DOTS.index(spot.dot) for spot in spots if spot.best}
+        assert set(seen.places()) == {DOTS.index(spot.dot) for spot in spots}
         if accuracy == "lopo":
             assert (seen.places(), seen.stairs()) != before
 
@@ -102,7 +106,7 @@ def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
     x, y = seen.places()[3]
     frame = seen.page.locator("#plot svg").bounding_box()
     seen.page.mouse.move(frame["x"] + x + 6, frame["y"] + y + 6)
-    for text in ("H-svm float", "L and H", "93.0 %", "91.0 – 95.0 %", "0.5 ms", "behind compact-20k int8"):
+    for text in ("H, SVM", "H-svm float", "L and H", "93.0 %", "91.0 – 95.0 %", "0.5 ms", "behind Palpate, as shipped"):
         assert text in seen.tip()
     seen.page.mouse.move(frame["x"] + 60, frame["y"] + 20)
     assert seen.tip() == ""
@@ -143,14 +147,16 @@ def test_nothing_left_is_no_trouble(seen: BrowsedChart):
 
 
 def test_scales_are_linear_or_logarithmic(seen: BrowsedChart):
-    """A tenfold cost is equally far everywhere on a logarithmic scale, and not on a linear one; errors likewise."""
-    ratio = lambda there: (there[3][0] - there[1][0]) / (there[5][0] - there[3][0])  # noqa: E731
-    assert ratio(seen.places()) == pytest.approx(0.5, rel=0.01)  # .05 to .5 to 50 ms
+    """A tenfold cost is equally far everywhere on a logarithmic scale, and not on a linear one; errors by their root, or not."""
+    ratio = lambda there: (there[3][0] - there[2][0]) / (there[6][0] - there[3][0])  # noqa: E731
+    assert ratio(seen.places()) == pytest.approx(np.log(12.5) / np.log(18), rel=0.01)  # .04 to .5 to 9 ms
     seen.page.uncheck("#xlog")
-    assert ratio(seen.places()) == pytest.approx(0.45 / 49.5, rel=0.01)
-    seen.page.check("#ylog")
-    there = seen.places()
-    assert (there[4][1] - there[0][1]) / (there[0][1] - there[2][1]) == pytest.approx(2.0, rel=0.01)  # .4 to .1 to .05
+    assert ratio(seen.places()) == pytest.approx(0.46 / 8.5, rel=0.01)
+    rise = lambda there: (there[4][1] - there[0][1]) / (there[0][1] - there[2][1])  # noqa: E731
+    root = np.sqrt([0.4, 0.1, 0.05])
+    assert rise(seen.places()) == pytest.approx((root[0] - root[1]) / (root[1] - root[2]), rel=0.01)
+    seen.page.uncheck("#stretch")
+    assert rise(seen.places()) == pytest.approx(0.3 / 0.05, rel=0.01)
 
 
 def test_the_choice_is_in_the_address(seen: BrowsedChart):
@@ -180,7 +186,7 @@ def test_the_address_may_change_while_the_page_is_open(seen: BrowsedChart):
 
 def test_the_keyboard_goes_from_dot_to_dot(seen: BrowsedChart):
     """One stop of Tab; arrows by cost, Home and End; Escape closes the tip."""
-    order = [pareto.name(spot[0]) for spot in pareto.placed(DOTS, "ms_p50", "speed")]
+    order = [pareto.label(spot.dot) for spot in pareto.placed(DOTS, "ms_p50", "speed")]
     seen.page.locator("#family input").last.focus()
     seen.page.keyboard.press("Tab")
     assert seen.tip()
@@ -208,9 +214,9 @@ def test_the_first_dot_may_be_hidden_and_tab_still_finds_one(seen: BrowsedChart)
 
 def test_dots_are_named_for_those_who_do_not_see_them(seen: BrowsedChart):
     """Each has its name and the two figures chosen; the controls have labels."""
-    assert seen.page.get_by_role("img", name="H-svm float: 93.0 %, 0.5 ms").count() == 1
+    assert seen.page.get_by_role("img", name="H, SVM: 93.0 %, 0.5 ms").count() == 1
     assert seen.page.get_by_label("accuracy", exact=True).count() == 1
-    assert seen.page.get_by_label("log of the error").count() == 1
+    assert seen.page.get_by_label("stretched towards 100 %").count() == 1
 
 
 @pytest.mark.slow
@@ -221,7 +227,7 @@ def test_the_table_is_sorted_by_what_was_chosen(seen: BrowsedChart):
     seen.page.locator("button[data-sort=cost]").focus()
     seen.page.keyboard.press("Enter")
     assert seen.rows() == [pareto.name(one) for one in sorted(DOTS, key=lambda one: one["ms_p50"])]
-    assert "time, median" in seen.page.inner_text("th[aria-sort=ascending]")
+    assert "time per sweep" in seen.page.inner_text("th[aria-sort=ascending]")
 
 
 @pytest.mark.slow
@@ -245,6 +251,71 @@ def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: st
     page.set_viewport_size({"width": 500, "height": 700})
     page.wait_for_function("document.querySelector('#plot svg').viewBox.baseVal.width < 500")
     context.close()
+
+
+def test_what_the_box_ships_stands_out(seen: BrowsedChart):
+    """It alone has a ring; its whole name stands at it, the others of ours have theirs without saying that they are ours."""
+    ringed = seen.page.eval_on_selector_all(
+        ".dot",
+        "all => all.filter((d) => getComputedStyle(d.querySelector('.ship')).stroke !== 'none').map((d) => Number(d.dataset.i))",
+    )
+    assert ringed == [2]
+    names = seen.page.locator("#names text").all_text_contents()
+    assert "Palpate, as shipped" in names
+    assert "2.0 k weights" in names
+
+
+def test_a_network_in_both_precisions_has_an_arrow(seen: BrowsedChart):
+    """From float to int8; none where a precision is filtered out."""
+    (arrow,) = seen.page.locator("#arrows line").all()
+    there = seen.places()
+    ends = [float(arrow.get_attribute(key)) for key in ("x1", "x2", "y1", "y2")]
+    assert ends[1::2] == pytest.approx(there[0], abs=0.01)
+    assert ends[0] > ends[1]
+    assert ends[2] < ends[3]  # .91 in float is above .90 in int8
+    seen.page.uncheck("#precision input[value=float]")
+    assert seen.page.locator("#arrows line").count() == 0
+
+
+def test_the_axis_goes_to_all_and_shows_where_guessing_is(seen: BrowsedChart):
+    """100 % is its last tick, the line of chance stands at 1/7, and the most accurate have ticks around them."""
+    ticks = [text.removesuffix(" %") for text in seen.page.locator("#grid text[text-anchor=end]").all_text_contents()]
+    assert {"90", "95", "99", "100"} < set(ticks)
+    assert "guessing: 14.3" in " ".join(ticks)
+    line, last = (seen.page.locator(f"#grid {which}").last for which in (".chance", "line:not(.chance)"))
+    assert float(line.get_attribute("y1")) > max(y for _, y in seen.places().values())
+    assert float(last.get_attribute("y1")) < min(y for _, y in seen.places().values())
+
+
+def test_large_files_are_told_in_megabytes(seen: BrowsedChart):
+    """50,000 KB are 50 MB, on the axis and in the table; nothing is "k KB"."""
+    seen.page.select_option("#x", "file_kb")
+    texts = " ".join([*seen.page.locator("#grid text").all_text_contents(), seen.page.inner_text("#table")])
+    assert "50 MB" in texts
+    assert "10 MB" in texts
+    assert "k KB" not in texts
+
+
+def test_what_was_not_measured_so_stands_last(seen: BrowsedChart):
+    """With a dash, and not on the chart."""
+    seen.page.select_option("#y", "lopo")
+    assert [name.split()[0] for name in seen.rows()[-2:]] == ["minirocket", "minirocket"]
+    assert "–" in seen.page.locator("#table tbody tr").last.inner_text()
+
+
+def test_all_figures_can_be_had(seen: BrowsedChart):
+    """As the file beside the page, and as a sheet that the page holds itself: a line for each form, shares from 0 to 1."""
+    assert seen.page.get_attribute("a[download]:not([href^=data])", "href") == "chart.json"
+    assert (Path(urlparse(seen.address).path).parent / "chart.json").exists()
+    with seen.page.expect_download() as sheet:
+        seen.page.click("a[href^='data:text/csv']")
+    assert sheet.value.suggested_filename == "chart.csv"
+    lines = list(csv.DictReader(sheet.value.path().read_text().splitlines()))
+    assert [line["method"] for line in lines] == [one["method"] for one in DOTS]
+    assert [float(line["a speed it never felt, mean"]) for line in lines] == [
+        one["accuracy"]["speed"]["mean"] for one in DOTS
+    ]
+    assert lines[-1]["a position it never felt (simulated), mean"] == ""
 
 
 @pytest.mark.slow

@@ -2,12 +2,13 @@
 "use strict";
 const { dots, costs, accuracies } = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
-const START = { x: "ms_p50", y: Object.keys(accuracies)[0], xlog: "1", ylog: "0", sort: "accuracy", off: "" };
+const START = { x: "ms_p50", y: Object.keys(accuracies)[0], xlog: "1", stretch: "1", sort: "accuracy", off: "" };
 const SIDES = [[-7, -8, "end"], [0, -11, "middle"], [9, 4, "start"], [-9, 4, "end"], [8, 16, "start"], [0, 19, "middle"],
   [8, -8, "start"], [-8, 16, "end"]];  // where a name may stand beside its dot, the best first
-const LEFT = 48, RIGHT = 16, TOP = 12, BOTTOM = 30, NEAR = 30, LEAST_ERROR = 0.0005;
+const LEFT = 48, RIGHT = 16, TOP = 12, BOTTOM = 30, NEAR = 30;
+const SHARES = [0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 1];  // ticks, closer together where the best are
 let chosen = { ...START };  // as in the address
-let spots = [];  // what is seen: {i, x, y: figures, px, py: places, best}, cheapest first
+let spots = [];  // one for each network that is seen: {i, other: forms, x, y: figures, px, py: places, best}, cheapest first
 let current = -1;  // index of the dot that the tip describes
 let marks = [];  // one element for each dot, there or not
 
@@ -16,8 +17,8 @@ const share = (v) => `${percents(v)} %`;
 const interval = (a) => `${percents(a.low)} – ${percents(a.high)} %`;
 const digits = (v) => Number(v.toPrecision(3)).toLocaleString("en", { maximumFractionDigits: 6 });
 const number = (v) => (v >= 1e6 ? `${digits(v / 1e6)} M` : v >= 1e4 ? `${digits(v / 1e3)} k` : digits(v));
-const figure = (dot, key) => (costs[key].unit ? digits : number)(dot[key]);
-const cost = (dot, key) => `${figure(dot, key)} ${costs[key].unit}`.trim();
+const amount = (v, unit) => (unit === "KB" && v >= 1000 ? `${digits(v / 1000)} MB` : unit ? `${digits(v)} ${unit}` : number(v));
+const cost = (dot, key) => (dot[key] == null ? "–" : amount(dot[key], costs[key].unit));
 const filters = () => [...document.querySelectorAll("#precision input, #family input")];
 const hidden = () => new Set(chosen.off.split(",").filter(Boolean));
 const safe = (text) => text.replace(/[&<>"]/g, (c) => `&#${c.charCodeAt(0)};`);
@@ -27,11 +28,19 @@ function front(points) {
   return points.map((p) => !points.some((o) => o.x <= p.x && o.y >= p.y && (o.x !== p.x || o.y !== p.y)));
 }
 
+// Each network once, as pareto.py has it: in the form that costs least, and in its other precision.
 function seen() {
-  const off = hidden();
-  const those = dots.map((dot, i) => ({ i, dot })).filter(({ dot }) =>
-    !off.has(dot.precision) && !off.has(dot.family) && dot[chosen.x] != null && chosen.y in dot.accuracy);
-  const points = those.map(({ i, dot }) => ({ i, x: dot[chosen.x], y: dot.accuracy[chosen.y].mean }));
+  const off = hidden(), networks = new Map();
+  dots.forEach((dot, i) => {
+    if (off.has(dot.precision) || off.has(dot.family) || dot[chosen.x] == null || !(chosen.y in dot.accuracy)) return;
+    const point = { i, x: dot[chosen.x], y: dot.accuracy[chosen.y].mean, late: dot.precision !== "int8" };
+    networks.set(dot.network, [...(networks.get(dot.network) ?? []), point]);
+  });
+  const points = [...networks.values()].map((forms) => {
+    const [first, ...rest] = forms.sort((a, b) => a.x - b.x || a.late - b.late);
+    const on_box = forms.some(({ i }) => dots[i].runs_on_box);
+    return { ...first, on_box, other: rest.find(({ late }) => late !== first.late) };
+  });
   front(points).forEach((best, k) => { points[k].best = best; });
   return points.sort((a, b) => a.x - b.x || b.y - a.y);
 }
@@ -49,16 +58,11 @@ function scale(values, log, pad) {
   return { at: (v) => (to(v) - a) / (b - a), ticks: ticks.filter((t) => to(t) >= a && to(t) <= b) };
 }
 
-// Accuracy upwards: as it is, or the error on a logarithmic scale.
-function upwards(entries, log) {
-  const ends = entries.flatMap((e) => [e.low, e.high]);
-  if (!log) {
-    const one = scale([...ends, Math.min(1, Math.max(...ends) + 0.01)], false, 0.03);
-    return { at: one.at, ticks: one.ticks.filter((t) => t < 1.0001) };
-  }
-  const error = (v) => Math.max(1 - v, LEAST_ERROR);
-  const one = scale(ends.map(error), true, 0.05);
-  return { at: (v) => 1 - one.at(error(v)), ticks: one.ticks.map((t) => 1 - t).filter((t) => t > 0.001) };
+// Accuracy upwards, to 100 %: as it is, or by the root of the error.
+function upwards(lows, stretched) {
+  const to = stretched ? (v) => -Math.sqrt(Math.max(1 - v, 0)) : (v) => v;
+  const low = to(Math.max(Math.min(...lows) - 0.04, 0)), ticks = stretched ? SHARES : SHARES.filter((t) => t !== 0.99);
+  return { at: (v) => (to(v) - low) / (to(1) - low), ticks: ticks.filter((t) => to(t) >= low) };
 }
 
 function draw() {
@@ -66,16 +70,21 @@ function draw() {
   spots = seen();
   document.querySelector("#plot svg").setAttribute("viewBox", `0 0 ${width} ${height}`);
   const entries = spots.map((s) => dots[s.i].accuracy[chosen.y]);
-  const xs = scale(spots.length ? spots.map((s) => s.x) : [1], chosen.xlog === "1", 0.06);
-  const ys = upwards(entries.length ? entries : [{ low: 0, high: 1 }], chosen.ylog === "1");
+  const ends = spots.flatMap((s) => (s.other ? [s.x, s.other.x] : [s.x])), { chance } = accuracies[chosen.y];
+  const xs = scale(ends.length ? ends : [1], chosen.xlog === "1", 0.06);
+  const ys = upwards([...entries.map((e) => e.low), chance || 1, entries.length ? 1 : 0], chosen.stretch === "1");
   const px = (v) => LEFT + xs.at(v) * (width - LEFT - RIGHT);
   const py = (v) => height - BOTTOM - ys.at(v) * (height - TOP - BOTTOM);
-  for (const spot of spots) [spot.px, spot.py] = [px(spot.x), py(spot.y)];
-  $("grid").innerHTML = grid(xs, ys, px, py, width, height);
+  for (const spot of spots) {
+    [spot.px, spot.py] = [px(spot.x), py(spot.y)];
+    if (spot.other) [spot.other_px, spot.other_py] = [px(spot.other.x), py(spot.other.y)];
+  }
+  $("grid").innerHTML = grid(xs, ys, px, py, width, height) + guessing(chance, py, width);
+  $("arrows").innerHTML = arrows(px, py);
   $("stairs").setAttribute("d", stairs(width - RIGHT));
   marks.forEach((mark) => { mark.style.display = "none"; });
   for (const spot of spots) place(spot, py);
-  $("names").innerHTML = names(width);
+  $("names").innerHTML = names(width, chance ? py(chance) : height);
   const [x, y] = [costs[chosen.x], accuracies[chosen.y]];
   $("axes").innerHTML = `${safe(y.short)}: ${safe(y.about)}.<br>${safe(x.short)}: ${safe(x.about)}.`;
   table();
@@ -92,10 +101,25 @@ function grid(xs, ys, px, py, width, height) {
   const unit = costs[chosen.x].unit, bottom = height - BOTTOM;
   const every = Math.max(1, Math.ceil(xs.ticks.length / (width / 62)));
   const across = xs.ticks.map((t, k) => `<line x1="${px(t)}" x2="${px(t)}" y1="${TOP}" y2="${bottom}"/>` + (k % every ? ""
-    : `<text x="${px(t)}" y="${bottom + 20}" text-anchor="middle">${number(t)}${unit && " " + unit}</text>`));
+    : `<text x="${px(t)}" y="${bottom + 20}" text-anchor="middle">${amount(t, unit)}</text>`));
   const up = ys.ticks.map((t, k) => `<line y1="${py(t)}" y2="${py(t)}" x1="${LEFT}" x2="${width - RIGHT}"/>
     <text x="${LEFT - 8}" y="${py(t) + 4}" text-anchor="end">${digits(100 * t)}${k === ys.ticks.length - 1 ? " %" : ""}</text>`);
   return across.join("") + up.join("");
+}
+
+// Where a model would be that only guesses.
+function guessing(chance, py, width) {
+  return chance ? `<line class="chance" x1="${LEFT}" x2="${width - RIGHT}" y1="${py(chance)}" y2="${py(chance)}"/>
+    <text x="${width - RIGHT}" y="${py(chance) - 4}" text-anchor="end">guessing: ${share(chance)}</text>` : "";
+}
+
+// From a network in float to itself in int8.
+function arrows(px, py) {
+  return spots.filter((s) => s.other).map((s) => {
+    const [from, to] = s.late ? [s, s.other] : [s.other, s];
+    return `<line class="${dots[s.i].family === "Palpate" ? "ours" : ""}" x1="${px(from.x)}" y1="${py(from.y)}" x2="${px(to.x)}"
+      y2="${py(to.y)}" marker-end="url(#head)"/>`;
+  }).join("");
 }
 
 // The front as stairs: what accuracy a cost buys.
@@ -109,31 +133,36 @@ function place(spot, py) {
   mark.style.display = "";
   mark.style.transform = `translate(${spot.px}px, ${spot.py}px)`;
   mark.classList.toggle("best", spot.best);
+  mark.classList.toggle("abroad", !spot.on_box);
   mark.dataset.cost = spot.x;
   mark.dataset.mean = spot.y;
   const bar = mark.querySelector(".bar");
   bar.setAttribute("y1", py(low) - spot.py);
   bar.setAttribute("y2", py(high) - spot.py);
-  mark.setAttribute("aria-label", `${dots[spot.i].name}: ${share(spot.y)}, ${cost(dots[spot.i], chosen.x)}`);
+  mark.setAttribute("aria-label", `${dots[spot.i].label}: ${share(spot.y)}, ${cost(dots[spot.i], chosen.x)}`);
 }
 
-// Names beside the dots, those of the front first, each once; a name that fits nowhere is left out.
-function names(width) {
-  const best = spots.filter((s) => s.best), named = new Set();
+// Names beside the dots, what the box ships first, then the front; a name that fits nowhere is left out.
+function names(width, guessed) {
+  const best = spots.filter((s) => s.best);
   const taken = spots.map((s) => [s.px - 6, s.py - 6, s.px + 6, s.py + 6]);
+  taken.push([LEFT, guessed - 1, width, guessed + 1], [width - RIGHT - 120, guessed - 15, width, guessed]);
   best.forEach((s, k) => {  // the stairs
     const [end, up] = k + 1 < best.length ? [best[k + 1].px, best[k + 1].py] : [width, s.py];
     taken.push([s.px, s.py - 1, end, s.py + 1], [end - 1, up, end + 1, s.py]);
   });
-  const leading = new Set(best.map((s) => dots[s.i].label));
-  const rest = spots.filter((s) => !s.best && !leading.has(dots[s.i].label)).sort((a, b) => b.y - a.y);
-  return [...best, ...rest].map((s) => {
-    const { label, family } = dots[s.i], spot = named.has(label) ? null : free(s, label.length * 7, width, taken);
+  for (const s of spots.filter((one) => one.other)) {
+    const xs = [s.px, s.other_px], ys = [s.py, s.other_py];
+    taken.push([Math.min(...xs), Math.min(...ys) - 2, Math.max(...xs), Math.max(...ys) + 2]);
+  }
+  const shipped = spots.filter((s) => dots[s.i].chosen), rest = spots.filter((s) => !s.best).sort((a, b) => b.y - a.y);
+  return [...new Set([...shipped, ...best, ...rest])].map((s) => {
+    const { label, family, chosen: mine } = dots[s.i], text = mine ? label : label.replace("Palpate, ", "");
+    const spot = free(s, text.length * 7, width, taken);
     if (!spot) return "";
-    named.add(label);
     taken.push(spot.box);
-    const kinds = (s.best ? "best" : "") + (family === "Palpate" ? " ours" : "");
-    return `<text class="${kinds}" x="${spot.x}" y="${spot.y}" text-anchor="${spot.side}">${safe(label)}</text>`;
+    const kinds = [s.best ? "best" : "", family === "Palpate" ? "ours" : "", mine ? "chosen" : ""].join(" ");
+    return `<text class="${kinds}" x="${spot.x}" y="${spot.y}" text-anchor="${spot.side}">${safe(text)}</text>`;
   }).join("");
 }
 
@@ -168,30 +197,38 @@ function description(spot) {
   const better = spots.find((o) => o.x <= spot.x && o.y >= spot.y && (o.x !== spot.x || o.y !== spot.y));
   const line = (name, value) => `<dt>${safe(name)}</dt><dd>${safe(value)}</dd>`;
   const rows = [line(accuracies[chosen.y].short + (a.name ? `, ${a.name}` : ""), share(a.mean)),
-    line("95 %, of " + a.n, interval(a)),
+    line("95 % interval" + (a.n ? `, ${a.n} sweeps` : ""), interval(a)), line("guessing", share(accuracies[chosen.y].chance)),
+    ...(spot.other ? [line(`in ${dots[spot.other.i].precision}`, `${share(spot.other.y)}, ${cost(dots[spot.other.i], chosen.x)}`)] : []),
     ...Object.keys(costs).map((key) => line(costs[key].short, cost(dot, key)))];
-  return `<b>${safe(dot.name)}</b><br>${safe(dot.family)}${dot.runs_on_box ? "" : " · cannot run on the box"}<br>`
-    + (better ? `behind ${safe(dots[better.i].name)}` : "on the Pareto front") + `<dl>${rows.join("")}</dl>`;
+  return `<b>${safe(dot.label)}</b><br>${safe(dot.name)} · ${safe(dot.family)}${spot.on_box ? "" : " · cannot run on the box"}<br>`
+    + (better ? `behind ${safe(dots[better.i].label)}` : "on the Pareto front") + `<dl>${rows.join("")}</dl>`;
 }
 
+// All forms of all models that are not filtered out, also those that were not measured so: they come last.
 function table() {
-  const rows = [...spots].sort((a, b) => (chosen.sort === "cost" ? a.x - b.x || b.y - a.y : b.y - a.y || a.x - b.x));
+  const off = hidden(), best = new Map(spots.map((s) => [s.i, s.best]));
+  const cost_of = ({ dot }) => dot[chosen.x] ?? Infinity, mean_of = ({ dot }) => dot.accuracy[chosen.y]?.mean ?? -1;
+  const by_cost = (a, b) => Math.sign(cost_of(a) - cost_of(b) || 0), by_mean = (a, b) => mean_of(b) - mean_of(a);
+  const [first, then] = chosen.sort === "cost" ? [by_cost, by_mean] : [by_mean, by_cost];
+  const rows = dots.map((dot, i) => ({ dot, i })).filter(({ dot }) => !off.has(dot.precision) && !off.has(dot.family))
+    .sort((a, b) => first(a, b) || then(a, b));
   const others = Object.keys(costs).filter((key) => key !== chosen.x);
   const sorted = (what, way) => (chosen.sort === what ? ` aria-sort="${way}"` : "");
-  const title = (key) => `${costs[key].short} ${costs[key].unit}`.trim();
+  const title = (key) => safe(costs[key].short);
   const head = `<th scope="col">model</th>
-    <th scope="col"${sorted("accuracy", "descending")}><button data-sort="accuracy">${accuracies[chosen.y].short}</button></th>
-    <th scope="col">95 %</th>
+    <th scope="col"${sorted("accuracy", "descending")}><button data-sort="accuracy">${safe(accuracies[chosen.y].short)}</button></th>
+    <th scope="col">95 % interval</th>
     <th scope="col"${sorted("cost", "ascending")}><button data-sort="cost">${title(chosen.x)}</button></th>`
     + others.map((key) => `<th scope="col">${title(key)}</th>`).join("");
-  const body = rows.map((s) => {
-    const dot = dots[s.i], a = dot.accuracy[chosen.y];
-    const cells = [share(a.mean), interval(a), ...[chosen.x, ...others].map((key) => figure(dot, key))];
-    return `<tr data-i="${s.i}" class="${s.best ? "best" : ""} ${dot.family === "Palpate" ? "ours" : ""}"><th scope="row">`
-      + `${dot.runs_on_box ? "" : "○ "}${safe(dot.name)}</th>${cells.map((c) => `<td>${c}</td>`).join("")}</tr>`;
+  const body = rows.map(({ dot, i }) => {
+    const a = dot.accuracy[chosen.y];
+    const cells = [...(a ? [share(a.mean), interval(a)] : ["–", "–"]), ...[chosen.x, ...others].map((key) => cost(dot, key))];
+    const kinds = [best.get(i) ? "best" : "", dot.family === "Palpate" ? "ours" : ""].join(" ");
+    return `<tr data-i="${i}" class="${kinds}"><th scope="row">${dot.runs_on_box ? "" : "○ "}${safe(dot.label)}`
+      + `<small>${safe(dot.name)}</small></th>${cells.map((c) => `<td>${c}</td>`).join("")}</tr>`;
   });
-  $("table").innerHTML = `<div class="wide"><table><caption>${spots.length} of ${dots.length} models; bold: on the Pareto front</caption>
-    <thead><tr>${head}</tr></thead><tbody>${body.join("")}</tbody></table></div>`;
+  $("table").innerHTML = `<div class="wide"><table><caption>${rows.length} of ${dots.length} measured forms; bold: on the Pareto front;
+    a dash: not measured</caption><thead><tr>${head}</tr></thead><tbody>${body.join("")}</tbody></table></div>`;
 }
 
 function choose(change) {
@@ -203,7 +240,7 @@ function choose(change) {
 
 function show_choice() {
   for (const id of ["x", "y"]) $(id).value = chosen[id];
-  for (const id of ["xlog", "ylog"]) $(id).checked = chosen[id] === "1";
+  for (const id of ["xlog", "stretch"]) $(id).checked = chosen[id] === "1";
   const off = hidden();
   filters().forEach((box) => { box.checked = !off.has(box.value); });
   draw();
@@ -236,9 +273,9 @@ function go(event) {
 
 function mark(dot, i) {
   const shape = dot.precision === "int8" ? '<rect class="mark" x="-5" y="-5" width="10" height="10"/>' : '<circle class="mark" r="5.4"/>';
-  const kinds = ["dot", dot.family === "Palpate" ? "ours" : "", dot.runs_on_box ? "" : "abroad"].join(" ");
+  const kinds = ["dot", dot.family === "Palpate" ? "ours" : "", dot.chosen ? "chosen" : ""].join(" ");
   return `<g class="${kinds}" data-i="${i}" tabindex="-1" role="img"><line class="bar" x1="0" x2="0"/>${shape}`
-    + '<circle class="ring" r="10"/></g>';
+    + '<circle class="ship" r="10"/><circle class="ring" r="13"/></g>';
 }
 
 function begin() {
@@ -252,7 +289,7 @@ function begin() {
     $(id).onchange = () => choose({ off: filters().filter((box) => !box.checked).map((box) => box.value).join() });
   }
   for (const id of ["x", "y"]) $(id).onchange = () => choose({ [id]: $(id).value });
-  for (const id of ["xlog", "ylog"]) $(id).onchange = () => choose({ [id]: $(id).checked ? "1" : "0" });
+  for (const id of ["xlog", "stretch"]) $(id).onchange = () => choose({ [id]: $(id).checked ? "1" : "0" });
   $("marks").innerHTML = dots.map(mark).join("");
   marks = [...$("marks").children];
   const svg = document.querySelector("#plot svg");

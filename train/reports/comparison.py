@@ -1,0 +1,66 @@
+"""Ours beside the best peer. In: accuracies with their intervals. Out: a line of a table, with what fell short said in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from train.metrics import differences
+from train.metrics.differences import Estimate
+from train.reports.formatting import points
+
+Json = Mapping[str, Any]
+NEAR = -0.01
+"""Wanted of ours everywhere: no further below the best peer."""
+ROUNDING = 1e-9
+
+
+def line(what: str, ours: Json, peers: Mapping[str, Json]) -> dict[str, Any]:
+    """A line of the table: the best of `peers` by name (it is chosen after the fact), the difference, and a verdict.
+
+    Entries have `mean`, `low` and `high`. Without a peer there is no verdict.
+    """
+    if not peers:
+        return {
+            "what": what,
+            "ours": ours,
+            "best": "",
+            "leader": None,
+            "gap": None,
+            "verdict": "no peer was run",
+            "short": False,
+        }
+    best = max(peers, key=lambda name: float(peers[name]["mean"]))
+    gap = differences.difference(estimate(ours), estimate(peers[best]))
+    short = gap[0] < NEAR - ROUNDING
+    return {
+        "what": what,
+        "ours": ours,
+        "best": best,
+        "leader": peers[best],
+        "gap": gap,
+        "verdict": verdict(gap),
+        "short": short,
+    }
+
+
+def estimate(figures: Json) -> Estimate:
+    """An accuracy with the ends of its interval."""
+    return figures["mean"], figures["low"], figures["high"]
+
+
+def verdict(gap: Estimate) -> str:
+    """A difference, ours less the best peer, in words; not certain where its interval holds 0."""
+    middle, low, high = gap
+    if abs(middle) < ROUNDING:
+        return "level"
+    if middle >= NEAR - ROUNDING and middle < 0:
+        return "within a point"
+    word = "ahead" if middle > 0 else "falls short"
+    return word if low > 0 or high < 0 else f"{word}, not certain"
+
+
+def shown(gap: Estimate) -> str:
+    """A difference in percentage points with its interval: "−3.7 [−10.5, +4.1]"."""
+    middle, low, high = (points(value, sign=True) for value in gap)
+    return f"{middle} [{low}, {high}]"
