@@ -9,7 +9,7 @@ DESKTOP := $(VENV)/desktop.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins chart paper ros rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak attacked fuzz hostile flips cuts \
+.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins reports figures chart development paper ros rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak attacked fuzz hostile flips cuts \
   deploy install wheel lock clean
 
 help: ## this list
@@ -92,7 +92,7 @@ types: $(DESKTOP) ## mypy --strict
 
 bench: $(DESKTOP) ## measure this machine: docs/bench.json, and the tables of README and manual
 	$(BIN)/palpate bench --json docs/bench.json
-	$(BIN)/palpate-train bench-table docs/bench.json README.md docs/manual.md
+	$(BIN)/palpate-train figures
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
@@ -101,6 +101,12 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 
 skins: $(DESKTOP) ## measure emulated skins: docs/skins.md; PART=way, noise or load alone, SKINS= some of them
 	nice $(BIN)/python -m tests.skins $(PART) $(SKINS)
+
+reports: $(DESKTOP) ## all pages that are stale, the most telling first: PAGES= some, SCHEDULER= a Dask cluster, LIST=1: what would run
+	nice $(BIN)/palpate-train reports $(PAGES) $(if $(LIST),--list) $(if $(SCHEDULER),--scheduler $(SCHEDULER))
+
+figures: $(DESKTOP) ## the figures of docs/ in README, manual and pages
+	$(BIN)/palpate-train figures
 
 chart: $(DESKTOP) ## speed against accuracy: docs/chart/ (goes on where it was interrupted)
 	$(BIN)/palpate-train chart $(CHART)

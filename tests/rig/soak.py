@@ -30,6 +30,8 @@ from tests.rig import soak_judge, soak_page
 from tests.rig.soak_boxes import BoxUnderTest, Gone, Script, ThisMachine
 from tests.rig.soak_guest import VirtualBox
 from tests.rig.soak_judge import SoakRun
+from train.metrics import score
+from train.reports import html, provenance
 
 BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
 Clock = Callable[[], float]
@@ -203,7 +205,14 @@ def soak(
 ) -> Path:  # fmt: skip
     """Record one box for what is left of `hours`; its record."""
     path = work / f"{box.name.replace(' ', '-')}.json"
-    about = {"box": box.name, "commit": commit(), "seed": seed, "format": str(skin.FORMAT), **box.about()}
+    about = {
+        "box": box.name,
+        "commit": commit(),
+        "bundle": score.shipped(),
+        "seed": seed,
+        "format": str(skin.FORMAT),
+        **box.about(),
+    }
     runs, started = restore(path, about)
     done_s = sum(run.length_s for run in runs)
     if done_s >= hours * 3600 - 1:
@@ -232,10 +241,9 @@ def draw(work: Path, out: Path) -> bool:
         },
         "boxes": boxes,
     }
-    html, svg = soak_page.render(results)
+    page, svg = soak_page.render(results)
     write(out / "results.json", results)
-    (out / "index.html").write_text(html)
-    (out / "soak.svg").write_text(svg)
+    html.publish(out, page, {"soak": svg}, provenance.of(results))
     reached = True
     for name, box in results["boxes"].items():
         for what, wanted, came, met in soak_judge.targets(box["sums"]):

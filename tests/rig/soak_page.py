@@ -27,7 +27,7 @@ from tests.rig.soak_judge import (
     kind,
     targets,
 )
-from train.reports import formatting, html
+from train.reports import formatting, html, provenance
 from train.reports.plot_style import ACCENT, BLACK, FAINT, SMALL, WIDTH, add_axes, set_ticks, to_svg
 
 Json = Mapping[str, Any]
@@ -46,6 +46,8 @@ def render(records: Json) -> tuple[str, str]:
     page = html.render(
         "soak_page.html.j2",
         Path(__file__).parent,
+        header=provenance.of(records),
+        home=html.HOME,
         picture=html.picture(svg),
         names=list(boxes),
         hours=[f"{_hours(box['sums']['hours'])} on {_the(name)}" for name, box in boxes.items()],

@@ -21,7 +21,7 @@ from train.evaluation.corruptions import EvaluationSweeps
 from train.export import contact_positions
 from train.metrics import score
 from train.models import methods
-from train.reports import contact_plot, contact_table, marked_text, plots, uncertainty_report
+from train.reports import contact_plot, contact_table, marked_text, plots, provenance, uncertainty_report
 
 
 def register(add: Add) -> None:
@@ -182,7 +182,8 @@ def run_stress(args: argparse.Namespace) -> None:
     table = robustness.table(result)
     put(args.out / "results.json", (json.dumps(result) + "\n").encode(), parents=True)
     put(args.out / "table.md", table.encode(), parents=True)
-    put(args.out / "curves.svg", plots.robustness(result, args.strong.split(",")).encode(), parents=True)
+    picture = provenance.in_svg(plots.robustness(result, args.strong.split(",")), provenance.of(result))
+    put(args.out / "curves.svg", picture.encode(), parents=True)
     print(table)
 
 
@@ -224,9 +225,10 @@ def run_alignment(args: argparse.Namespace) -> None:
     result = contact_positions.measure(box, args.unseen, args.seen, args.hard, options.Log())
     args.out.mkdir(parents=True, exist_ok=True)
     put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
-    put(args.out / "place.svg", (contact_plot.draw(result) + "\n").encode(), parents=True)
+    about = provenance.of(result)
+    put(args.out / "place.svg", (provenance.in_svg(contact_plot.draw(result), about) + "\n").encode(), parents=True)
     page = args.out / "README.md"
     if page.exists():
         text = marked_text.insert(page.read_text(encoding="utf-8"), "alignment", contact_table.table(result), str(page))
-        put(page, text.encode())
+        put(page, provenance.in_markdown(text, about).encode())
     print("\n".join(contact_positions.lines(result)))

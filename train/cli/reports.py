@@ -1,4 +1,4 @@
-"""The commands that write pages and plots: paper, chart, development, matrix, overview, bench-table, report."""
+"""The commands that write pages and plots: reports, figures, paper, chart, development, matrix, overview, report."""
 
 from __future__ import annotations
 
@@ -16,23 +16,28 @@ from train.cli import options
 from train.cli.options import Add
 from train.data import sets
 from train.evaluation.evaluate import Where
+from train.metrics import score
 from train.models.methods import Effort
 from train.reports import (
-    bench_table,
     bundle_experiment,
     bundle_report,
     chart_report,
     development_experiment,
     development_report,
     development_times,
+    docs_pages,
+    document_figures,
     overview_plot,
     paper_experiment,
     plots,
+    provenance,
 )
 
 
 def register(add: Add) -> None:
-    """paper, chart, development, matrix, overview, bench-table, report."""
+    """reports, figures, paper, chart, development, matrix, overview, report."""
+    _add_reports(add)
+    add("figures", run_figures, "write the figures of results into README, manual and pages")
     paper = add("paper", run_paper, "run the paper's experiment on the simulated skin and write a page about it")
     paper.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
     paper.add_argument(
@@ -66,9 +71,15 @@ def register(add: Add) -> None:
         "--out", type=Path, default=Path("docs/overview.svg"), metavar="FILE.svg", help="(docs/overview.svg)"
     )
     overview.add_argument("--material", default="wood", metavar="NAME", help="of the tube (wood)")
-    table = add("bench-table", run_bench_table, "write the figures of make bench into the tables of documents")
-    table.add_argument("figures", type=Path, metavar="FILE", help="of palpate bench --json")
-    table.add_argument("documents", type=Path, nargs="+", metavar="FILE.md", help="each with <!-- bench --> markers")
+
+
+def _add_reports(add: Add) -> None:
+    command = add(
+        "reports", run_reports, "make the project's pages again: those that are stale, or those that are named"
+    )
+    command.add_argument("pages", nargs="*", metavar="PAGE", help=f"some of {', '.join(docs_pages.names())}")
+    command.add_argument("--list", action="store_true", help="run nothing: say which page is stale, and why")
+    options.add_where(command)
 
 
 def _add_report(add: Add) -> None:
@@ -111,6 +122,19 @@ def run_paper(args: argparse.Namespace) -> None:
     print(paper_experiment.run(args.out, args.quick, options.where(args), options.Log(), options.effort(args)))
 
 
+def run_reports(args: argparse.Namespace) -> None:
+    """List, or make one page after another. Raises FormatError for an unknown page, and at the end where one failed."""
+    docs_pages.require_project()
+    if args.list:
+        print(docs_pages.table(docs_pages.named(args.pages)))
+        return
+    where = ["--jobs", str(args.jobs), "--cache", str(args.cache)] + (
+        ["--scheduler", args.scheduler] if args.scheduler else []
+    )
+    docs_pages.make(args.pages, where, options.Log().keep)
+    run_figures(args)
+
+
 def run_report(args: argparse.Namespace) -> None:
     """Measure, write the page and print its path."""
     for option in ("out", "json"):
@@ -133,7 +157,8 @@ def run_matrix(args: argparse.Namespace) -> None:
             results += json.loads(path.read_bytes())
         except ValueError as e:
             raise FormatError(f"{path.name}: not what evaluate wrote: {e}") from e
-    put(args.out, plots.matrix(results, count="recording" if args.recordings else "window").encode(), parents=True)
+    picture = plots.matrix(results, count="recording" if args.recordings else "window")
+    put(args.out, provenance.in_svg(picture, provenance.of(results)).encode(), parents=True)
     print(args.out)
 
 
@@ -209,12 +234,13 @@ def _results(path: Path) -> dict[str, Any]:
 
 def run_overview(args: argparse.Namespace) -> None:
     """Write the plot and print its path."""
-    put(args.out, overview_plot.draw(args.material).encode(), parents=True)
+    about = provenance.of(score.provenance() | {"set": f"sim:T-REAL:{overview_plot.SEED}", "seed": overview_plot.SEED})
+    put(args.out, provenance.in_svg(overview_plot.draw(args.material), about).encode(), parents=True)
     print(args.out)
 
 
-def run_bench_table(args: argparse.Namespace) -> None:
-    """The table is printed, and stands in each document."""
-    figures = bench_table.read(args.figures)
-    bench_table.write(figures, args.documents)
-    print(bench_table.table(figures))
+def run_figures(args: argparse.Namespace) -> None:
+    """Name each document that has changed. Raises FormatError outside of the project's folder."""
+    docs_pages.require_project()
+    for name in document_figures.write():
+        print(name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import time
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.bundle import bundle
 from appliance.core.provenance import commit
 from appliance.core.statistics import wilson
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
@@ -79,8 +81,16 @@ def accuracy_figure(right: int, n: int) -> dict[str, Any]:
 
 @cache
 def provenance() -> dict[str, str]:
-    """The origin that a result file records beside its sets and seeds.
+    """The origin that a result file records beside its sets and seeds. shipped: the id of the packaged bundle.
 
-    The commit is that of the first call: others may follow during a long run.
+    All is of the first call: other commits, and another day, may follow during a long run.
     """
-    return {"commit": commit(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+    return {
+        "commit": commit(), "shipped": shipped(), "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+    }  # fmt: skip
+
+
+def shipped() -> str:
+    """The id of the packaged bundle, as the box prints it."""
+    return bundle.identity((bundle.DEFAULT / "manifest.json").read_bytes())

@@ -1,47 +1,27 @@
 """The table of the box's figures in README and manual. In: docs/bench.json, which `palpate bench --json` wrote. Out:
-the table in Markdown, and documents with it between their markers.
+the table in Markdown; document_figures puts it into the documents.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-from appliance.core.errors import FormatError
-from appliance.core.storage import put
-from train.reports import marked_text
+from train.reports import provenance
 
 Json = dict[str, Any]
 
 
-def read(path: Path) -> Json:
-    """The figures in `path`. Raises FormatError where these are not those of a whole bench."""
-    try:
-        figures: Json = json.loads(path.read_bytes())
-        table(figures)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
-        raise FormatError(f"{path} does not hold the figures of a bench: {e!r}; run `make bench`") from e
-    return figures
-
-
 def table(figures: Json) -> str:
-    """The figures as a table with a caption, in Markdown. Raises KeyError where one is missing."""
+    """The figures as a table with a caption, in Markdown; where they are of an older bundle, it says so first.
+
+    Raises KeyError where one is missing.
+    """
+    older = provenance.of(figures).older
     rows = [f"| {what} | {value} |" for what, value in _rows(figures)]
-    return "\n".join([_caption(figures), "", "| what | measured |", "|---|---|", *rows])
-
-
-def insert(text: str, figures: Json, name: str) -> str:
-    """`text` with the table between its markers. Raises FormatError, naming the document, where they are not there
-    once."""
-    return marked_text.insert(text, "bench", table(figures), name)
-
-
-def write(figures: Json, documents: list[Path]) -> None:
-    """Write the table into each document."""
-    for path in documents:
-        put(path, insert(path.read_text(encoding="utf-8"), figures, str(path)).encode())
+    return "\n".join(
+        [*([f"**{older}**", ""] if older else []), _caption(figures), "", "| what | measured |", "|---|---|", *rows]
+    )
 
 
 def _caption(figures: Json) -> str:

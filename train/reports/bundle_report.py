@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import spectrogram
 
 from train.data.sets import Dataset
-from train.reports import formatting, html, plots, sweep_plot
+from train.reports import formatting, html, plots, provenance, sweep_plot
 from train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -65,7 +65,7 @@ def page(figures: Json, sweeps: Dataset) -> str:
     if sweeps.format.window >= LEAST_FRAMES:
         pictures["spectrograms"] = html.picture(spectrograms(sweeps, shown))
     return html.render(
-        "bundle.html.j2", f=figures, pictures=pictures, range_db=RANGE_DB,
+        "bundle.html.j2", header=provenance.of(figures), f=figures, pictures=pictures, range_db=RANGE_DB,
         right=[figures["named_rightly"]["right"] / figures["named_rightly"]["total"], *figures["named_rightly"]["interval"]],
         statuses=sorted(figures["statuses"].items(), key=lambda item: -item[1]),
         material_head=MATERIALS, materials=[_material(row) for row in figures["materials"]],

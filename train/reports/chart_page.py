@@ -18,6 +18,7 @@ from markupsafe import Markup
 from train.models.methods import SHIPPED
 from train.reports import comparison, method_names
 from train.reports import html as pages
+from train.reports import provenance
 from train.reports.formatting import estimate
 from train.reports.method_names import OURS
 from train.reports.pareto import ACCURACIES, COSTS, ChartAxis, Dot, label, name, networks, subject
@@ -49,6 +50,8 @@ def html(
     head, rows = _table(dots, there, costs)
     return pages.render(
         "chart.html.j2",
+        header=provenance.of(list(dots)),
+        home=pages.HOME,
         dots=dots,
         count=len(set(of)),
         picture=pages.picture(picture),

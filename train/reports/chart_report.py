@@ -29,7 +29,7 @@ from train.metrics import score
 from train.models import methods
 from train.models.compact.architectures import ARCHITECTURES
 from train.models.methods import FULL_EFFORT, Effort, Method
-from train.reports import chart_page, scatter
+from train.reports import chart_page, html, provenance, scatter
 from train.reports.method_names import family
 
 Json = dict[str, Any]
@@ -275,7 +275,5 @@ def write(out: Path, found: Sequence[Json], quick: bool = False, left_out: dict[
     lines = ",\n".join(json.dumps(dot, allow_nan=False) for dot in found)
     put(out / "chart.json", f"[\n{lines}\n]\n".encode(), parents=True)
     picture = scatter.chart(found)
-    put(out / "chart.svg", picture.encode(), parents=True)
     page = chart_page.html(found, picture, quick, left_out or {}, box_on_hard(out.parent / BOX_ON_HARD))
-    put(out / "index.html", page.encode(), parents=True)
-    return out / "index.html"
+    return html.publish(out, page, {"chart": picture}, provenance.of(list(found)))

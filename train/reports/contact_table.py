@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from train.reports.formatting import estimate
+from train.reports.formatting import estimate, percent
 
 Json = dict[str, Any]
 HEAD = (
@@ -37,6 +37,16 @@ def table(result: Json) -> str:
     )
     lines = [f"| {' | '.join(row)} |" for row in (HEAD, ("---",) * len(HEAD), *(_cells(*row) for row in rows))]
     return "\n".join([caption, "", *lines])
+
+
+def sentence(result: Json) -> str:
+    """What a moved skin costs, in a sentence for the manual. Raises LookupError where a distance was not measured."""
+    still, row, far = ({point["mm"]: point for point in result["moved"]["rows"]}[mm] for mm in (0.0, 4.0, 6.0))
+    right = [percent(point["accuracy"][0], 0) for point in (still, row, far)]
+    return (
+        f"On the simulated skin {right[0]} of the sweeps are answered correctly in the trained place, {right[1]} one row of\n"
+        f"taxels away ({percent(row['network'][0], 0)} by label alone, `unsure` and `unknown` aside), {right[2]} one and a half."
+    )
 
 
 def _moved(result: Json) -> Iterator[tuple[str, Json]]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.reports import chart_page, comparison, development_chart, development_plots, html, method_names, scatter
+from train.reports import chart_page, comparison, development_chart, development_plots, html, method_names, provenance, scatter
 from train.reports.comparison import ROUNDING
 from train.reports.development_chart import (
     UNIT,
@@ -50,11 +50,7 @@ def write(figures: Json, out: Path, quick: bool = False) -> Path:
     """
     pages, pictures = render(figures, quick)
     put(out / "results.json", (json.dumps(figures, allow_nan=False) + "\n").encode(), parents=True)
-    for name, svg in pictures.items():
-        put(out / f"{name}.svg", svg.encode(), parents=True)
-    for name, page in pages.items():
-        put(out / f"{name}.html", page.encode(), parents=True)
-    return out / "index.html"
+    return html.publish(out, pages, pictures, provenance.of(figures))
 
 
 def render(figures: Json, quick: bool = False) -> tuple[dict[str, str], dict[str, str]]:
@@ -81,7 +77,7 @@ def render(figures: Json, quick: bool = False) -> tuple[dict[str, str], dict[str
     lines = [comparison.line(plain_case(one), table[case][ours], _plain_names({name: table[case][name] for name in peers if name in table[case]}))
              for case, one in of.items()]  # fmt: skip
     pages["index"] = html.render(
-        "development.html.j2", figures=figures, quick=quick, ours=ours, names=names, means=means, main=main, times=times, lines=lines,
+        "development.html.j2", header=provenance.of(figures), home=html.HOME, figures=figures, quick=quick, ours=ours, names=names, means=means, main=main, times=times, lines=lines,
         cases=of, table=table, best_of={case: line["best"] for case, line in zip(of, lines, strict=True)}, plain={case: plain_case(one) for case, one in of.items()}, name_of=method_names.plain_name,
         about={name: method_names.about(name) for name in names}, shown=comparison.shown,
         precisions=list(precisions(table, main["shared"], names)),

@@ -1,22 +1,33 @@
 """Pages from templates. In: a template's name and its data. Out: one HTML file that needs nothing else.
 
 No font and no address outside: a page opens from a folder without a network and reads on a phone. Whatever a template
-prints is escaped, but for pictures, which `picture` marks as SVG.
+prints is escaped, but for pictures, which `picture` marks as SVG. A page of the project itself has a way back to its
+README (`home`), a `header` and, where its figures are of an older default, a first line that says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from train.reports import formatting
-from train.reports.plot_style import DARK_ROLES, FONT, ROLES
+from appliance.core.storage import put
+from train.reports import formatting, provenance
+from train.reports.plot_style import DARK, FONT, LIGHT, SCHEMES
+from train.reports.provenance import Provenance
 
 TEMPLATES = Path(__file__).with_name("templates")
+HOME = "../../README.md"
+"""README, from a page in a folder of docs/."""
+FRAMES = (
+    (r"<th(?=[ >])(?![^>]*\bscope=)", '<th scope="col"'),
+    (r'<div class="wide"(?![^>]*\btabindex)', '<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways"'),
+)  # fmt: skip
+"""What every table has, whichever template wrote it: a screen reader knows what its head is of, and arrow keys scroll it."""
 PERCENT: dict[str, Callable[..., str]] = {
     "percent": formatting.percent,
     "exact_percent": formatting.exact_percent,
@@ -32,9 +43,17 @@ FILTERS: dict[str, Callable[..., str]] = {
 """Of all templates; those of PERCENT keep number and sign in one line of a page."""
 
 
-def render(template: str, folder: Path = TEMPLATES, **data: Any) -> str:
-    """The page that a template of `folder` makes of `data`; templates/base.html.j2 has what all pages share."""
-    return _environment(folder, True).get_template(template).render(**data)
+def render(
+    template: str, folder: Path = TEMPLATES, *, header: Provenance | None = None, home: str = "", **data: Any
+) -> str:
+    """The page that a template of `folder` makes of `data`; templates/base.html.j2 has what all pages share.
+
+    header: where its figures are from. home: the address of README, of the project's pages.
+    """
+    page = _environment(folder, True).get_template(template).render(provenance=header, home=home, **data)
+    for pattern, framed in FRAMES:
+        page = re.sub(pattern, framed, page)
+    return page
 
 
 def render_text(template: str, **data: Any) -> str:
@@ -43,8 +62,16 @@ def render_text(template: str, **data: Any) -> str:
 
 
 def picture(svg: str) -> Markup:
-    """An SVG of plot_style.to_svg, whose texts are escaped already, for a page to hold as it is."""
-    return Markup(svg)
+    """An SVG of plot_style.to_svg, whose texts are escaped already, for a page to hold as it is; the colours are the page's."""
+    return Markup(svg.replace(SCHEMES, "", 1))
+
+
+def publish(out: Path, page: str, pictures: Mapping[str, str], about: Provenance) -> Path:
+    """Write the pictures, NAME.svg, each with its header, and the page, index.html, into the folder `out`; the page's path."""
+    for name, svg in pictures.items():
+        put(out / f"{name}.svg", provenance.in_svg(svg, about).encode(), parents=True)
+    put(out / "index.html", page.encode(), parents=True)
+    return out / "index.html"
 
 
 def _environment(folder: Path, escape: bool) -> Environment:
@@ -58,8 +85,8 @@ def _environment(folder: Path, escape: bool) -> Environment:
     made.filters |= FILTERS | ({name: _unbroken(show) for name, show in PERCENT.items()} if escape else PERCENT)
     made.globals |= {
         "font": Markup(FONT),
-        "light": Markup(_variables(ROLES)),
-        "dark": Markup(_variables(DARK_ROLES)),
+        "light": Markup(LIGHT),
+        "dark": Markup(DARK),
     }
     return made
 
@@ -69,7 +96,3 @@ def _unbroken(show: Callable[..., str]) -> Callable[..., str]:
         return show(*values, **options).replace(" %", "\N{NO-BREAK SPACE}%")
 
     return shown
-
-
-def _variables(roles: dict[str, str]) -> str:
-    return " ".join(f"--{role}: {colour};" for role, colour in roles.items())

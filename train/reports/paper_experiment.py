@@ -27,7 +27,7 @@ from train.evaluation.evaluate import Plan, Result, Where, evaluate
 from train.metrics import score
 from train.models import methods, prior_work
 from train.models.methods import FULL_EFFORT, Effort, spoken
-from train.reports import paper_report, paper_values
+from train.reports import html, paper_report, paper_values, provenance
 from train.reports.chart_report import BOX_ON_HARD, box_on_hard
 
 Array = NDArray[Any]
@@ -162,7 +162,7 @@ def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effo
     outcomes = list(_outcomes(parts, steps, where, effort, log))
     results = summary(outcomes, parts, effort) | {
         "quick": quick,
-        "commit": score.provenance()["commit"],
+        **score.provenance(),
         "took_s": round(time.monotonic() - start),
     }
     put(out / "results.json", _lines(results).encode(), parents=True)
@@ -176,10 +176,7 @@ def draw(out: Path) -> Path:
     except (OSError, ValueError) as e:
         raise FormatError(f"{out}/results.json is not of the paper's experiment: {e}; run it without --draw") from e
     page, pictures = paper_report.render(results, box_on_hard(out.parent / BOX_ON_HARD))
-    for name, svg in pictures.items():
-        put(out / f"{name}.svg", svg.encode(), parents=True)
-    put(out / "index.html", page.encode(), parents=True)
-    return out / "index.html"
+    return html.publish(out, page, pictures, provenance.of(results))
 
 
 def _outcomes(

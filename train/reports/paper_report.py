@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.models.methods import SHIPPED
-from train.reports import html, plots
+from train.reports import html, plots, provenance
 from train.reports.formatting import estimate, exact_percent, seconds
 from train.reports.paper_values import CNNS, CONFUSION, COST, FIGURES, SEVERAL, display_name, short_name
 
@@ -43,7 +43,14 @@ def render(summary: Mapping[str, Any], box_on_hard: Mapping[str, Any] | None = N
     pictures = report.pictures()
     drawn = {name: html.picture(svg) for name, svg in pictures.items()}
     return html.render(
-        "paper.html.j2", pictures=drawn, box_on_hard=box_on_hard, **report.run(), **report.figures(), **report.network()
+        "paper.html.j2",
+        header=provenance.of(summary),
+        home=html.HOME,
+        pictures=drawn,
+        box_on_hard=box_on_hard,
+        **report.run(),
+        **report.figures(),
+        **report.network(),
     ), pictures
 
 

@@ -1,7 +1,7 @@
 """The style that all pictures share. In: what was drawn with matplotlib. Out: SVG text, the same in every run.
 
 A picture is 360 units wide, the width of a phone. Its colours are roles (--text, --accent …) that a page sets for light
-and dark; a picture by itself is dark on white.
+and dark, and that a picture by itself sets, too: in Markdown it is as dark as its reader has chosen.
 """
 
 from __future__ import annotations
@@ -33,6 +33,17 @@ PLACES = 2
 """Decimals of coordinates: a hundredth of a unit cannot be seen."""
 DIGITS = 6
 """Significant digits of a tick label, where the tick needs so many."""
+
+
+def _variables(roles: Mapping[str, str]) -> str:
+    return " ".join(f"--{role}: {colour};" for role, colour in roles.items())
+
+
+LIGHT, DARK = _variables(ROLES), _variables(DARK_ROLES)
+SCHEMES = f"<style>:root {{ {LIGHT} }} @media (prefers-color-scheme: dark) {{ :root {{ {DARK} }} }}</style>"
+"""What makes a picture light or dark by itself. A page has the same rules: there it changes nothing."""
+AXIS = "axis:"
+"""Begins the id of an axis with numbers while it is drawn; its title follows."""
 SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 NUMBERS = {"x", "y", "x1", "y1", "x2", "y2", "width", "height"}
 """Attributes that hold one coordinate."""
@@ -76,6 +87,13 @@ def add_axes(figure: Figure, left: float, right: float, top: float, bottom: floa
     for spine in axes.spines.values():
         spine.set_visible(False)
     return axes
+
+
+def set_titles(axes: Axes, x: str = "", y: str = "") -> None:
+    """What an axis shows, with its unit: below the horizontal one, and level above the upper end of the vertical one."""
+    axes.set_xlabel(x, color=GREY, size=SMALL)
+    axes.set_ylabel(y, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")
+    axes.yaxis.set_label_coords(0, 1.02)
 
 
 def tiles(axes: Axes, rows: int, columns: int) -> None:
@@ -130,8 +148,14 @@ def write(axes: Axes, x: float, y: float, text: str, colour: str = BLACK, size: 
 
 def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
     """The picture as SVG text. about: its title, for those who cannot see it. plain: with colours in place of roles, for
-    programs that know no style sheets."""
+    programs that know no style sheets.
+
+    Each axis with numbers has its title as the attribute data-axis, "" where it has none.
+    """
     figure.patch.set_facecolor(WHITE)
+    for axes in figure.axes:
+        axes.xaxis.set_gid(_named(axes.xaxis, figure.get_supxlabel()))
+        axes.yaxis.set_gid(_named(axes.yaxis, figure.get_supylabel()))
     file = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": about}):
         figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
@@ -148,7 +172,15 @@ def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
     title.text = about
     root.insert(0, title)
     ElementTree.indent(root, space="")
-    return ElementTree.tostring(root, encoding="unicode")
+    text = ElementTree.tostring(root, encoding="unicode")
+    return text if plain else text.replace("</title>", f"</title>{SCHEMES}", 1)
+
+
+def _named(axis: Axis, shared: str) -> str | None:
+    """The id under which an axis with numbers is drawn: its title, or the one that all of the picture share."""
+    if not isinstance(axis.get_major_formatter(), TickFormatter) or not len(axis.get_majorticklocs()):
+        return None
+    return AXIS + (axis.get_label_text() or shared)
 
 
 def _drop_empty_groups(parent: ElementTree.Element) -> None:
@@ -163,7 +195,9 @@ def _restyle(element: ElementTree.Element, colours: Mapping[str, str]) -> None:
     """Colours as `colours` says, no font of matplotlib's, no names of groups, coordinates no finer than can be seen."""
     attributes = element.attrib
     if element.tag == f"{{{SVG}}}g":
-        attributes.pop("id", None)  # two pictures of a page would share them
+        name = attributes.pop("id", "")  # two pictures of a page would share them
+        if name.startswith(AXIS):
+            attributes["data-axis"] = name.removeprefix(AXIS)
     if "style" in attributes:
         parts = (part.partition(":") for part in attributes["style"].split(";"))
         pairs = {name.strip(): value.strip() for name, _, value in parts if name.strip() != "font-family"}

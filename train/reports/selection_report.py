@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from train.reports import formatting, html, selection_plots
+from train.reports import formatting, html, provenance, selection_plots
 
 Json = Mapping[str, Any]
 UNITS = {"ms": "ms", "kb": "kB", "mb": "MB"}
@@ -28,7 +28,9 @@ def page(choice: Json) -> str:
     if choice["less"]:
         reductions = selection_plots.reductions(choice["less"], "accuracy with less of each thing")
         pictures["reductions"] = html.picture(reductions)
-    return html.render("selection.html.j2", choice=choice, pictures=pictures, **_facts(choice))
+    return html.render(
+        "selection.html.j2", header=provenance.of(choice), choice=choice, pictures=pictures, **_facts(choice)
+    )
 
 
 def _facts(choice: Json) -> dict[str, Any]:

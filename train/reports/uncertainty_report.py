@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from appliance.core.storage import put
 from train.calibration.novelty import KEPT
 from train.models.methods import SHIPPED
-from train.reports import formatting, html
+from train.reports import formatting, html, provenance
 from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, SMALL, set_ticks, single_axes, to_svg
 
 Json = Mapping[str, Any]
@@ -35,10 +35,7 @@ def write(figures: dict[str, Any], out: Path) -> Path:
     """results.json, the pictures and the page in the folder `out`; the page's path."""
     page, pictures = render(figures)
     put(out / "results.json", (json.dumps(figures) + "\n").encode(), parents=True)
-    for name, svg in pictures.items():
-        put(out / f"{name}.svg", svg.encode(), parents=True)
-    put(out / "index.html", page.encode(), parents=True)
-    return out / "index.html"
+    return html.publish(out, page, pictures, provenance.of(figures))
 
 
 def render(figures: Json) -> tuple[str, dict[str, str]]:
@@ -49,6 +46,8 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
     heat, rules = figures["calibration"]["temperature"], figures["early"]["rules"]
     page = html.render(
         "uncertainty.html.j2",
+        header=provenance.of(figures),
+        home=html.HOME,
         figures=figures,
         shipped=SHIPPED,
         pictures={name: html.picture(svg) for name, svg in pictures.items()},

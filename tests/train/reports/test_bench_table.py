@@ -1,9 +1,7 @@
-"""The one table of the box's figures: README and manual show docs/bench.json, and name none of its figures
-elsewhere."""
+"""The one table of the box's figures, which README and manual show: they name none of its figures elsewhere."""
 
 from __future__ import annotations
 
-import copy
 import json
 import re
 from pathlib import Path
@@ -11,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from appliance.core.errors import FormatError
 from tests.factories.paths import ROOT
-from train.cli.main import main
+from train.metrics import score
 from train.reports import bench_table
 
 BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
@@ -54,13 +51,6 @@ def named(text: str, figures: dict[str, Any]) -> list[str]:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_documents_show_the_figures_of_the_bench(path: Path, figures: dict[str, Any]):
-    """What stands between the markers is the table of docs/bench.json, to the letter (`make bench` writes both)."""
-    text = path.read_text(encoding="utf-8")
-    assert text == bench_table.insert(text, figures, path.name)
-
-
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 def test_documents_name_no_figure_of_the_bench_elsewhere(path: Path, figures: dict[str, Any]):
     """Running text and other tables have neither its values nor others for the same things."""
     assert named(running_text(path), figures) == []
@@ -90,21 +80,14 @@ def test_a_value_of_the_table_would_be_found(figures: dict[str, Any]):
     assert named(f"the robot has it after {value}, mostly", figures) == [value]
 
 
-def test_the_command_writes_the_table_and_nothing_else(tmp_path: Path, figures: dict[str, Any]):
-    """Text before and after the markers stays; a second run changes nothing; a changed figure changes the document."""
-    document, file = tmp_path / "a.md", tmp_path / "bench.json"
-    document.write_text(f"before\n\n{BEGIN}\nold\n{END}\n\nafter\n")
-    file.write_text(json.dumps(figures))
-    assert main(["bench-table", str(file), str(document)]) == 0
-    written = document.read_text()
-    assert written.startswith(f"before\n\n{BEGIN}\nMeasured by `make bench` with the simulated skin")
-    assert written.endswith(f" |\n{END}\n\nafter\n")
-    assert "old" not in written
-    assert main(["bench-table", str(file), str(document)]) == 0
-    assert document.read_text() == written
-    changed = copy.deepcopy(figures)
-    changed["rss_mb"]["after_1000"] += 1
-    assert bench_table.insert(written, changed, "a.md") != written
+def test_figures_of_an_older_bundle_say_so_first(figures: dict[str, Any]):
+    """Before the caption; those of the packaged one begin with it."""
+    figures["bundle"] = score.shipped()
+    assert bench_table.table(figures).startswith("Measured by `make bench` with the simulated skin")
+    figures["bundle"] = "0badbead"
+    first, _, rest = bench_table.table(figures).partition("\n\n")
+    assert first == f"**Made with an older default, bundle 0badbead; the box ships bundle {score.shipped()} now.**"
+    assert rest.startswith("Measured by")
 
 
 def test_the_table_has_a_row_for_each_figure(figures: dict[str, Any]):
@@ -134,18 +117,3 @@ def test_memory_without_the_simulated_board_has_its_row(figures: dict[str, Any])
     rows = bench_table.table(figures).splitlines()
     (at,) = (i for i, row in enumerate(rows) if row.startswith("| resident memory after 1,000 sweeps"))
     assert rows[at + 1] == "| of it without the simulated readout board | 56.2 MiB |"
-
-
-@pytest.mark.parametrize("text", ["", BEGIN, f"{END}{BEGIN}", f"{BEGIN}{END}{BEGIN}{END}"])
-def test_a_document_without_one_pair_of_markers_is_named(text: str, figures: dict[str, Any]):
-    """FormatError with the document's name and what to do."""
-    with pytest.raises(FormatError, match=r"a\.md has not one pair of markers"):
-        bench_table.insert(text, figures, "a.md")
-
-
-@pytest.mark.parametrize("content", [b"", b"[]", b'{"accuracy": {}}'])
-def test_figures_that_are_not_those_of_a_bench_are_named(tmp_path: Path, content: bytes):
-    """FormatError with the file and the command that writes it."""
-    (tmp_path / "b.json").write_bytes(content)
-    with pytest.raises(FormatError, match="run `make bench`"):
-        bench_table.read(tmp_path / "b.json")
