@@ -23,6 +23,8 @@ from train.reports.provenance import Provenance
 TEMPLATES = Path(__file__).with_name("templates")
 HOME = "../../README.md"
 """README, from a page in a folder of docs/."""
+MADE = "\n\n<!-- written with the page -->\n"
+"""Ends a README.md that `publish` may write again."""
 FRAMES = (
     (r"<th(?=[ >])(?![^>]*\bscope=)", '<th scope="col"'),
     (r'<div class="wide"(?![^>]*\btabindex)', '<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways"'),
@@ -67,11 +69,30 @@ def picture(svg: str) -> Markup:
 
 
 def publish(out: Path, page: str, pictures: Mapping[str, str], about: Provenance) -> Path:
-    """Write the pictures, NAME.svg, each with its header, and the page, index.html, into the folder `out`; the page's path."""
+    """Write the pictures, NAME.svg, each with its header, and the page, index.html, into the folder `out`; the page's path.
+
+    For those who see no HTML, as on GitHub, README.md beside it shows the pictures; one that was written by hand stays.
+    """
     for name, svg in pictures.items():
         put(out / f"{name}.svg", provenance.in_svg(svg, about).encode(), parents=True)
     put(out / "index.html", page.encode(), parents=True)
+    readme = out / "README.md"
+    if not readme.exists() or readme.read_text(encoding="utf-8").endswith(MADE):
+        put(readme, provenance.in_markdown(_pictures_alone(page, pictures), about).encode())
     return out / "index.html"
+
+
+def _pictures_alone(page: str, pictures: Mapping[str, str]) -> str:
+    """A page's title and pictures in Markdown, with the way home and to the page."""
+    title = _between("h1", page)
+    shown = [f"![{_between('title', svg)}]({name}.svg)" for name, svg in pictures.items()]
+    links = "The whole page, to be opened in a browser: [index.html](index.html). Back to [Palpate](../../README.md)."
+    return "\n\n".join([f"# {title}", links, *shown]) + MADE
+
+
+def _between(tag: str, text: str) -> str:
+    found = re.search(rf"<{tag}\b[^>]*>(.*?)</{tag}>", text, re.DOTALL)
+    return " ".join(found[1].split()) if found else ""
 
 
 def _environment(folder: Path, escape: bool) -> Environment:

@@ -418,6 +418,7 @@ def test_the_quick_form_writes_everything(tmp_path: Path, capsys: pytest.Capture
         "results.json",
         "index.html",
         "chart.html",
+        "README.md",
         "accuracy.svg",
         "curves.svg",
         "front.svg",
