@@ -243,7 +243,7 @@ def draw(work: Path, out: Path) -> bool:
     }
     page, svg = soak_page.render(results)
     write(out / "results.json", results)
-    html.publish(out, page, {"soak": svg}, provenance.of(results))
+    html.publish(out, {"index": page}, {"soak": svg}, provenance.of(results))
     reached = True
     for name, box in results["boxes"].items():
         for what, wanted, came, met in soak_judge.targets(box["sums"]):

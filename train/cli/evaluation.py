@@ -16,6 +16,7 @@ from appliance.inference.classifier import Classifier
 from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import sets
+from train.data.progress import Progress
 from train.evaluation import evaluate, robustness, sim_calibration, uncertainty
 from train.evaluation.corruptions import EvaluationSweeps
 from train.export import contact_positions
@@ -222,7 +223,9 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
 def run_alignment(args: argparse.Namespace) -> None:
     """Measure, write the figures and the plot, the table into the page where one lies there, and print a summary."""
     box = Classifier(bundle.load(args.bundle), SystemClock())
-    result = contact_positions.measure(box, args.unseen, args.seen, args.hard, options.Log())
+    displacements = len(contact_positions.DIRECTIONS) * (2 * len(contact_positions.OFF_MM) + 1)
+    progress = Progress(displacements, options.Log())
+    result = contact_positions.measure(box, args.unseen, args.seen, args.hard, progress.begin)
     args.out.mkdir(parents=True, exist_ok=True)
     put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     about = provenance.of(result)

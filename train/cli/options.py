@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from appliance.core.errors import FormatError
 from train.cli import numbers
 from train.data import labels, sets
+from train.data.progress import ProgressLine
 from train.evaluation import evaluate
 from train.models import methods
 
@@ -110,20 +113,38 @@ def where(args: argparse.Namespace) -> evaluate.Where:
 
 
 class Log:
-    """Shows progress on the error stream: one line that is overwritten on a terminal, else one line every LOG_EVERY_S."""
+    """Shows progress on the error stream: on a terminal a bar and the latest line, else one line every LOG_EVERY_S."""
 
     def __init__(self) -> None:
         self._last = time.monotonic()
+        self._bar: Any = None
 
     def __call__(self, line: str) -> None:
-        """Show `line`."""
+        """Show `line`; of a ProgressLine also how much is done."""
         if sys.stderr.isatty():
-            print(f"\r{line}\033[K", end="", file=sys.stderr, flush=True)
+            known = {"completed": line.done, "total": line.total} if isinstance(line, ProgressLine) else {"total": None}
+            self._shown().update(0, description=line, **known)
         elif time.monotonic() - self._last > LOG_EVERY_S:
             self._last = time.monotonic()
             print(line, file=sys.stderr, flush=True)
 
     def keep(self, line: str) -> None:
         """Show `line` at once, and leave it there."""
-        start = "\r\033[K" if sys.stderr.isatty() else ""
-        print(f"{start}{line}", file=sys.stderr, flush=True)
+        print(line, file=sys.stderr, flush=True)
+
+    def _shown(self) -> Any:
+        """The bar, which goes when the process ends; what is printed meanwhile stands above it."""
+        if self._bar is None:
+            from rich import progress  # here: a tenth of a second that only a terminal needs
+            from rich.console import Console
+            from rich.table import Column
+
+            text = progress.TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1))
+            self._bar = progress.Progress(
+                progress.SpinnerColumn(), progress.BarColumn(16), progress.TimeElapsedColumn(), text,
+                console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty(), expand=True,
+            )  # fmt: skip
+            self._bar.add_task("")
+            self._bar.start()
+            atexit.register(self._bar.stop)
+        return self._bar

@@ -20,6 +20,7 @@ from appliance.core.errors import FormatError
 from appliance.core.types import DATA_TYPES
 from train.data import labels, raw_files, sampling
 from train.data.file_names import NamePattern, group
+from train.data.progress import Progress
 from train.data.raw_files import Table
 from train.data.sets import Dataset
 
@@ -132,9 +133,9 @@ def import_folder(folder: Path, plan: ImportPlan, log: Callable[[str], None], le
     """The set of all files in `folder` and below whose names fit the pattern; files that are left out are added to
     `left_out` as they are found. Raises FormatError where materials cannot be sent or nothing is left."""
     named = _named(folder, plan, left_out)
-    recordings = []
-    for i, (name, fields) in enumerate(named.items(), 1):
-        log(f"{i} of {len(named)}: {name}")
+    recordings, progress = [], Progress(len(named), log)
+    for name, fields in named.items():
+        progress.begin(name)
         try:
             recordings.append(_recording(folder / name, name, fields, plan))
         except FormatError as e:

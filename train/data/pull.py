@@ -24,6 +24,7 @@ from appliance.core import storage
 from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.types import load
+from train.data.progress import Progress
 
 FOLDER = f"{StoreConfig().folder}/sweeps"
 PAIR = (".json", ".npy")
@@ -132,16 +133,19 @@ def pull(box: RecordingHost, out: Path, report: PullReport, log: Callable[[str],
     wanted = list(_new_recordings(listed, out, report))
     if not wanted:
         return
-    names, came = [name + suffix for name in wanted for suffix in PAIR], 0
+    names = [name + suffix for name in wanted for suffix in PAIR]
+    progress = Progress(len(wanted), log)
     with tempfile.TemporaryFile() as request:
         request.write(b"".join(f"{name}\0".encode() for name in names))
         request.seek(0)
         with box.output(SEND, request) as stream:
-            for came, (name, pair) in enumerate(_pairs(stream, names), 1):
+            for name, pair in _pairs(stream, names):
                 _keep(name, pair, {suffix: listed[name + suffix] for suffix in PAIR}, out, report)
-                log(f"{came} of {len(wanted)}")
-    if came < len(wanted):
-        raise ApplianceError(f"{box.host}: only {came} of {len(wanted)} recordings came; run the same command again")
+                progress(name)
+    if progress.done < len(wanted):
+        raise ApplianceError(
+            f"{box.host}: only {progress.done} of {len(wanted)} recordings came; run the same command again"
+        )
 
 
 def listing(box: RecordingHost) -> dict[str, str]:

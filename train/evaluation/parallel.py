@@ -6,7 +6,6 @@ worker first, so that one that dies loses only the task it was computing, which 
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from appliance.core.errors import FormatError
-from train.models.methods import spoken
+from train.data.progress import Progress as Progress  # of tasks, which are mostly run here
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -83,16 +82,3 @@ def _on_cluster(
             ) from e
         except KilledWorker as e:
             raise FormatError(f"the workers at {scheduler!r} died too often ({e}); see their logs and memory") from e
-
-
-class Progress:
-    """Logs how many tasks are done and how long the others will take, if they take as long on average."""
-
-    def __init__(self, total: int, log: Callable[[str], None]) -> None:
-        self._total, self._log, self._done, self._start = total, log, 0, time.monotonic()
-
-    def __call__(self, what: str) -> None:
-        """One more task is done: `what`."""
-        self._done += 1
-        left = (time.monotonic() - self._start) / self._done * (self._total - self._done)
-        self._log(f"{self._done}/{self._total} done, {spoken(left)} left ({what})")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.signal import features
+from train.data.progress import spoken as spoken  # the trainings say it, too
 from train.data.sets import Dataset
 from train.features import kinds
 
@@ -121,11 +122,6 @@ class Method:
 
 def no_log(line: str) -> None:
     """A log that drops every line."""
-
-
-def spoken(seconds: float) -> str:
-    """A duration for a person: in s, or in min from 100 s on."""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 def model_inputs(kind: str, sweeps: Dataset) -> Array:

@@ -19,6 +19,7 @@ from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
 from appliance.core.types import Status
 from appliance.inference.classifier import Classifier
+from train.data.progress import Progress
 from train.data.sets import Dataset
 from train.evaluation import uncertainty
 from train.evaluation.corruptions import EvaluationSweeps, applicable
@@ -97,7 +98,9 @@ def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: 
     falls: the severity at which five points are lost; None where none is.
     """
     clean, rows = _named(classifier, test.sweeps), []
-    for corruption in applicable(test):
+    tried = applicable(test)
+    progress = Progress(len(tried), log)
+    for corruption in tried:
         named = [clean]
         for severity in corruption.severities[1:]:
             samples = corruption.apply(test, severity, seed)
@@ -109,7 +112,9 @@ def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: 
             "severities": list(corruption.severities), "wrong": list(wrong), "total": len(test.sweeps),
             "falls": falls({"severities": corruption.severities, "accuracy": accuracy}),
         })  # fmt: skip
-        log(f"{corruption.name}: {right[-1]} of {len(test.sweeps)} at {corruption.severities[-1]:g} {corruption.unit}")
+        progress(
+            f"{corruption.name}: {right[-1]} of {len(test.sweeps)} at {corruption.severities[-1]:g} {corruption.unit}"
+        )
     return sorted(rows, key=lambda row: (_reach(row), row["right"][-1]))
 
 

@@ -16,12 +16,12 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from train.models.methods import SHIPPED
-from train.reports import comparison, method_names
+from train.reports import comparison, method_names, provenance
 from train.reports import html as pages
-from train.reports import provenance
 from train.reports.formatting import estimate
 from train.reports.method_names import OURS
 from train.reports.pareto import ACCURACIES, COSTS, ChartAxis, Dot, label, name, networks, subject
+from train.reports.provenance import Provenance
 
 SCRIPT = pages.TEMPLATES / "chart.js"
 
@@ -34,10 +34,11 @@ def html(
     box_on_hard: Mapping[str, Any] | None = None,
     accuracies: Mapping[str, ChartAxis] = ACCURACIES,
     source: str = "chart.json",
+    header: Provenance | None = None,
 ) -> str:
     """The whole file. picture: SVG. quick: the figures mean nothing. left_out: what is missing, and why. box_on_hard: what
     the box answers to T-HARD's sweeps, see chart_report.box_on_hard. accuracies: the axes, the first one first seen. source:
-    the file beside the page that has all figures."""
+    the file beside the page that has all figures. header: where they are from, if the dots do not say so."""
     there = {key: axis for key, axis in accuracies.items() if any(key in dot["accuracy"] for dot in dots)}
     costs = {key: axis for key, axis in COSTS.items() if any(dot.get(key) is not None for dot in dots)}
     chosen, of = subject(dots), networks(dots)
@@ -50,7 +51,7 @@ def html(
     head, rows = _table(dots, there, costs)
     return pages.render(
         "chart.html.j2",
-        header=provenance.of(list(dots)),
+        header=header or provenance.of(list(dots)),
         home=pages.HOME,
         dots=dots,
         count=len(set(of)),

@@ -276,4 +276,4 @@ def write(out: Path, found: Sequence[Json], quick: bool = False, left_out: dict[
     put(out / "chart.json", f"[\n{lines}\n]\n".encode(), parents=True)
     picture = scatter.chart(found)
     page = chart_page.html(found, picture, quick, left_out or {}, box_on_hard(out.parent / BOX_ON_HARD))
-    return html.publish(out, page, {"chart": picture}, provenance.of(list(found)))
+    return html.publish(out, {"index": page}, {"chart": picture}, provenance.of(list(found)))

@@ -14,7 +14,16 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.reports import chart_page, comparison, development_chart, development_plots, html, method_names, provenance, scatter
+from train.reports import (
+    chart_page,
+    comparison,
+    development_chart,
+    development_plots,
+    html,
+    method_names,
+    provenance,
+    scatter,
+)
 from train.reports.comparison import ROUNDING
 from train.reports.development_chart import (
     UNIT,
@@ -73,7 +82,7 @@ def render(figures: Json, quick: bool = False) -> tuple[dict[str, str], dict[str
         axes = development_chart.axes(cases, main["shared"])
         pictures["front"] = scatter.chart(dots, list(axes)[:1], accuracies=axes)
         pages["chart"] = chart_page.html(_with_origin(dots, figures), pictures["front"], quick, times["left_out"], accuracies=axes,
-                                         source="results.json")  # fmt: skip
+                                         source="results.json", header=provenance.of(figures))  # fmt: skip
     lines = [comparison.line(plain_case(one), table[case][ours], _plain_names({name: table[case][name] for name in peers if name in table[case]}))
              for case, one in of.items()]  # fmt: skip
     pages["index"] = html.render(

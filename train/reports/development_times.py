@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import BundleError, FormatError
+from train.data.progress import Progress
 from train.data.sets import Dataset
 from train.export import measure, model_forms
 from train.models import methods
@@ -49,8 +50,9 @@ def measured(
     calls: dict[str, measure.Call] = {}
     left_out: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as work:
+        progress = Progress(len(names), log)
         for method in [_briefly(name, effort) for name in names]:
-            log(f"{method.name} is trained for its time")
+            progress.begin(f"{method.name} is trained for its time")
             try:
                 for entry, call in _callable(method, sweeps, seed, cache or Path(work)):
                     calls[str(len(entries))] = call

@@ -68,17 +68,18 @@ def picture(svg: str) -> Markup:
     return Markup(svg.replace(SCHEMES, "", 1))
 
 
-def publish(out: Path, page: str, pictures: Mapping[str, str], about: Provenance) -> Path:
-    """Write the pictures, NAME.svg, each with its header, and the page, index.html, into the folder `out`; the page's path.
+def publish(out: Path, pages: Mapping[str, str], pictures: Mapping[str, str], about: Provenance) -> Path:
+    """Write the pictures, NAME.svg, each with its header, and the pages, NAME.html, into the folder `out`; the path of "index".
 
     For those who see no HTML, as on GitHub, README.md beside it shows the pictures; one that was written by hand stays.
     """
     for name, svg in pictures.items():
         put(out / f"{name}.svg", provenance.in_svg(svg, about).encode(), parents=True)
-    put(out / "index.html", page.encode(), parents=True)
+    for name, page in pages.items():
+        put(out / f"{name}.html", page.encode(), parents=True)
     readme = out / "README.md"
     if not readme.exists() or readme.read_text(encoding="utf-8").endswith(MADE):
-        put(readme, provenance.in_markdown(_pictures_alone(page, pictures), about).encode())
+        put(readme, provenance.in_markdown(_pictures_alone(pages["index"], pictures), about).encode())
     return out / "index.html"
 
 

@@ -22,11 +22,12 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.inference.classifier import LEAST_PROBABILITY, fuse, softmax
 from train.data import sets
+from train.data.progress import spoken
 from train.data.sets import Dataset
 from train.evaluation.evaluate import Plan, Result, Where, evaluate
 from train.metrics import score
 from train.models import methods, prior_work
-from train.models.methods import FULL_EFFORT, Effort, spoken
+from train.models.methods import FULL_EFFORT, Effort
 from train.reports import html, paper_report, paper_values, provenance
 from train.reports.chart_report import BOX_ON_HARD, box_on_hard
 
@@ -176,7 +177,7 @@ def draw(out: Path) -> Path:
     except (OSError, ValueError) as e:
         raise FormatError(f"{out}/results.json is not of the paper's experiment: {e}; run it without --draw") from e
     page, pictures = paper_report.render(results, box_on_hard(out.parent / BOX_ON_HARD))
-    return html.publish(out, page, pictures, provenance.of(results))
+    return html.publish(out, {"index": page}, pictures, provenance.of(results))
 
 
 def _outcomes(

@@ -28,9 +28,8 @@ def page(choice: Json) -> str:
     if choice["less"]:
         reductions = selection_plots.reductions(choice["less"], "accuracy with less of each thing")
         pictures["reductions"] = html.picture(reductions)
-    return html.render(
-        "selection.html.j2", header=provenance.of(choice), choice=choice, pictures=pictures, **_facts(choice)
-    )
+    header = provenance.of({key: choice.get(key) for key in ("commit", "set", "seeds", "date")})
+    return html.render("selection.html.j2", header=header, choice=choice, pictures=pictures, **_facts(choice))
 
 
 def _facts(choice: Json) -> dict[str, Any]:

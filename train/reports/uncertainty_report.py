@@ -35,7 +35,7 @@ def write(figures: dict[str, Any], out: Path) -> Path:
     """results.json, the pictures and the page in the folder `out`; the page's path."""
     page, pictures = render(figures)
     put(out / "results.json", (json.dumps(figures) + "\n").encode(), parents=True)
-    return html.publish(out, page, pictures, provenance.of(figures))
+    return html.publish(out, {"index": page}, pictures, provenance.of(figures))
 
 
 def render(figures: Json) -> tuple[str, dict[str, str]]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from train.data import transforms
+from train.data.progress import Progress
 from train.data.transforms import WHOLE, Change
 from train.selection.nested_cv import Trials
 from train.selection.scene import Scene
@@ -40,11 +41,12 @@ def curves(choice: Selection, scene: Scene, log: Callable[[str], None]) -> tuple
     """The curves of scene.reduce; the reductions of scene.apply as one Change, and the accuracy with it."""
     found: list[Json] = []
     strongest: dict[str, Step] = {}
+    progress = Progress(len(scene.reduce), log)
     for kind in scene.reduce:
+        progress.begin(f"reduced: {kind}")
         if kind == "classes":
             found.append(classes(choice, scene.accuracy))
             continue
-        log(f"reduced: {kind}")
         curve, strongest[kind] = _curve(choice, scene, kind)
         found.append(curve)
     applied, accuracy = _together(choice, scene, {kind: strongest[kind] for kind in scene.apply if kind in strongest})

@@ -23,6 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from appliance.core.errors import ApplianceError, BundleError, FormatError
 from appliance.core.storage import put
+from train.data.progress import Progress
 from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
@@ -96,8 +97,9 @@ def bundle_costs(
         kept = (where.cache or Path(aside)) / "bundles"
         found: dict[str, BundleCost] = {}
         folders: dict[str, Path] = {}
-        for i, method in enumerate(methods.find(names, effort)):
-            log(f"{i}/{len(names)} bundles packed ({method.name} is next)")
+        progress = Progress(len(names), log)
+        for method in methods.find(names, effort):
+            progress.begin(f"bundle of {method.name}")
             folder, refused = _packed(method, sweeps, scene, kept)
             if refused:
                 found[method.name] = BundleCost(refused=refused)

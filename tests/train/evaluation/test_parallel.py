@@ -58,17 +58,6 @@ def test_an_error_in_a_task_is_the_callers():
         list(parallel.results(add, [99], [np.arange(3.0)], jobs=2))
 
 
-def test_progress_shows_how_much_is_left():
-    """Done, all, a time, and what was done."""
-    lines: list[str] = []
-    progress = parallel.Progress(2, lines.append)
-    progress("a")
-    progress("b")
-    assert re.fullmatch(r"1/2 done, \d+ s left \(a\)", lines[0])
-    assert lines[1] == "2/2 done, 0 s left (b)"
-    assert parallel.spoken(600) == "10 min"
-
-
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
     """A scheduler and two workers without nannies: who dies stays dead."""

@@ -45,7 +45,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def lay(folder: Path, results: dict[str, Any], shown: dict[str, Any]) -> None:
     """Write results, and a page of those that it shows."""
     page = html.render("base.html.j2", header=provenance.of(shown), home=html.HOME)
-    html.publish(folder, page, {}, provenance.of(shown))
+    html.publish(folder, {"index": page}, {}, provenance.of(shown))
     (folder / "results.json").write_text(json.dumps(results))
 
 

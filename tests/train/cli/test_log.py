@@ -1,0 +1,70 @@
+"""Progress as a person sees it: a bar on a terminal that leaves nothing behind, lines now and then in a log."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+
+from tests.factories.paths import ROOT
+from train.cli import options
+from train.data.progress import ProgressLine
+
+SCRIPT = """
+import sys, time
+from train.cli.options import Log
+from train.data.progress import Progress
+log = Log()
+progress = Progress(4, log)
+progress("the first [bold]fold[/bold]")
+time.sleep(0.3)
+log.keep("a line that stays")
+print("a result", flush=True)
+log("not counted {what}")
+time.sleep(0.3)
+sys.exit(3)
+"""
+
+
+def on_a_terminal(out_too: bool) -> tuple[str, str]:
+    """What the script shows on a terminal of 100 columns, and what it prints where its output goes elsewhere."""
+    far, near = pty.openpty()
+    done = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT], cwd=ROOT, stdin=near, stderr=near, stdout=near if out_too else subprocess.PIPE,
+        env=os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "30"},
+    )  # fmt: skip
+    os.close(near)
+    shown = b""
+    try:
+        while more := os.read(far, 65536):
+            shown += more
+    except OSError:  # all is read: the process has closed it
+        pass
+    os.close(far)
+    printed = done.stdout.read().decode() if done.stdout else ""
+    assert done.wait() == 3
+    return shown.decode(), printed
+
+
+@pytest.mark.slow
+def test_a_terminal_shows_a_bar_and_is_left_as_it_was():
+    """How much is done, the line as it was written, what is printed above; at the end the cursor is back."""
+    shown, printed = on_a_terminal(out_too=False)
+    for text in ("━", "1/4 done, ", "(the first [bold]fold[/bold])", "a line that stays", "not counted {what}"):
+        assert text in shown, text
+    assert printed == "a result\n"
+    assert shown.rindex("\x1b[?25h") > shown.rindex("\x1b[?25l")
+    assert "a result" in on_a_terminal(out_too=True)[0]
+
+
+def test_a_log_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    """Whole lines without escapes; none before its time, but for those that are kept."""
+    log = options.Log()
+    log(ProgressLine.of(1, 2, 3.0, "early"))
+    log.keep("kept")
+    monkeypatch.setattr(options, "LOG_EVERY_S", -1)
+    log(ProgressLine.of(1, 2, 3.0, "a fold"))
+    assert capsys.readouterr().err == "kept\n1/2 done, 3 s left (a fold)\n"

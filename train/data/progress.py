@@ -1,0 +1,55 @@
+"""Progress of long work: how much of it is done, and how long the rest will take. In: tasks as they begin or end. Out: lines."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+Clock = Callable[[], float]
+
+
+class ProgressLine(str):
+    """A line for people that knows its numbers, for a display that draws a bar. done, total: tasks."""
+
+    done: int
+    total: int
+
+    @classmethod
+    def of(cls, done: int, total: int, left_s: float | None, what: str) -> ProgressLine:
+        """left_s: how long the others will take, where it is known."""
+        line = cls(f"{done}/{total} done{'' if left_s is None else f', {spoken(left_s)} left'} ({what})")
+        line.done, line.total = done, total
+        return line
+
+
+class Progress:
+    """Logs how many tasks are done and how long the others will take, if they take as long on average. clock: in s.
+
+    done: tasks so far.
+    """
+
+    def __init__(self, total: int, log: Callable[[str], None], clock: Clock = time.monotonic) -> None:
+        self._total, self._log, self._clock = total, log, clock
+        self._start, self.done = clock(), 0
+
+    def __call__(self, what: str) -> None:
+        """One more task is done: `what`."""
+        self.done += 1
+        self._show(what)
+
+    def begin(self, what: str) -> None:
+        """A task begins, `what`; it is done when the next one begins."""
+        self._show(what)
+        self.done += 1
+
+    def _show(self, what: str) -> None:
+        took = self._clock() - self._start
+        left_s = took / self.done * (self._total - self.done) if self.done else None
+        self._log(ProgressLine.of(self.done, self._total, left_s, what))
+
+
+def spoken(seconds: float) -> str:
+    """A duration for a person: in s, in min from 100 s on, in h from 100 min on."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
