@@ -23,7 +23,7 @@ from train.reports.chart_report import FABRICS, SEVEN, ChartPart, joined
 
 Json = dict[str, Any]
 Log = Callable[[str], None]
-OURS = ("default", "filter-bank", "compact-50k")
+OURS = ("default", "default-reattached", "filter-bank", "compact-50k")
 """No peers; the first of them that is there is compared with the peers."""
 PEERS = ("minirocket", "minirocket-augmented", "multirocket-hydra", "quant", "ds-cnn", "lite", "edge-spectral")
 EACH = (5, 10, 20)

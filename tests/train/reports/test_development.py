@@ -123,7 +123,7 @@ def test_a_part_of_the_results_makes_a_page():
 def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
     """An error says what to do, and nothing is written."""
     with pytest.raises(
-        FormatError, match="no result of default or filter-bank or compact-50k; run the command without --kept"
+        FormatError, match="no result of default or default-reattached or filter-bank or compact-50k; run the command"
     ):
         development_report.write(figures(results=[entry("one", "quant", 0.9)]), tmp_path / "page")
     assert not (tmp_path / "page").exists()

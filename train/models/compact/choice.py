@@ -39,16 +39,26 @@ class Judged:
 
 class Court:
     """Judges candidates on held-out parts. known: what heads are fitted to, for each part the same sweeps in the same order;
-    their features may differ, where a trunk was trained without the part."""
+    their features may differ, where a trunk was trained without the part. copied: augmented copies of the held-out sweeps
+    are judged too, and count as much as these.
 
-    def __init__(self, known: Sequence[HeadData], parts: Sequence[InnerPart], classes: int) -> None:
+    labels, clusters: of all that is judged [n], the latter numbers of parts. own: bool [n], which are sweeps, not copies.
+    """
+
+    def __init__(
+        self, known: Sequence[HeadData], parts: Sequence[InnerPart], classes: int, copied: bool = False
+    ) -> None:
         self._known, self._parts, self._classes = known, parts, classes
-        self.sweeps = np.concatenate([np.flatnonzero(part.out) for part in parts])
-        self.labels = known[0].labels[self.sweeps]
-        groups = [part.group for part in parts]
-        sizes = {name: sum(int(p.out.sum()) for p in parts if p.group == name) for name in groups}
-        self.weights = np.concatenate([np.full(p.out.sum(), 1 / sizes[p.group] / len(sizes)) for p in parts])
-        self.clusters = np.concatenate([np.full(p.out.sum(), i) for i, p in enumerate(parts)])
+        of, labels = known[0].source, known[0].labels
+        self._copies = [part.out[of] & copied for part in parts]
+        numbers = range(len(parts))
+        self.labels = np.concatenate([np.append(labels[parts[i].out], labels[of][self._copies[i]]) for i in numbers])
+        sizes = [(int(parts[i].out.sum()), int(self._copies[i].sum())) for i in numbers]
+        self.own = np.concatenate([np.repeat([True, False], pair) for pair in sizes])
+        self.clusters = np.repeat(numbers, [sum(pair) for pair in sizes])
+        kind = np.array([part.group for part in parts])[self.clusters] + np.where(self.own, "", "\n")
+        _, member, counts = np.unique(kind, return_inverse=True, return_counts=True)
+        self.weights = 1 / counts[member] / len(counts)
         self._logits: dict[tuple[Columns, bool], Array] = {}
 
     def judge(self, parts: Sequence[HeadPart]) -> Judged:
@@ -111,14 +121,13 @@ class Court:
         """Logits [n, K] of one discriminant for the held-out sweeps."""
         key = part.columns, part.copies
         if key not in self._logits:
-            self._logits[key] = np.concatenate(
-                [self._tested(part, known, p.out) for known, p in zip(self._known, self._parts, strict=True)]
-            )
+            self._logits[key] = np.concatenate([self._tested(part, i) for i in range(len(self._parts))])
         return self._logits[key]
 
-    def _tested(self, part: HeadPart, known: HeadData, out: Array) -> Array:
+    def _tested(self, part: HeadPart, number: int) -> Array:
+        known, out = self._known[number], self._parts[number].out
         weight, bias = replace(part, factor=1.0).fit(known.take(~out).given(), self._classes)
-        return known.features[out] @ weight.T + bias
+        return np.concatenate([known.features[out], known.copied[self._copies[number]]]) @ weight.T + bias
 
 
 def _error(x: Array) -> float:

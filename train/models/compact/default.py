@@ -1,4 +1,4 @@
-"""The methods of the default recipe. In: an Effort. Out: the METHODS default and filter-bank.
+"""The methods of the default recipe. In: an Effort. Out: the METHODS default, default-reattached, filter-bank.
 
 Each is what the box runs, the int8 graph; the form "float" is the same before quantization.
 """
@@ -20,6 +20,8 @@ from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from train.onnx_tools.graph_builder import GraphModel, with_head
 
 Array = NDArray[Any]
+REATTACHED = "default-reattached"
+"""The method that does what `palpate-train fit --reattached` does."""
 
 
 def train(sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log) -> CompactModel:
@@ -37,7 +39,7 @@ def train(sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Setting
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
-    """`default`, and `filter-bank`, which is the same without choosing or training."""
+    """`default`, the same for a skin that is taken off and put back, and `filter-bank`, which chooses and trains nothing."""
     settings = recipe.Settings(steps=max(round(recipe.Settings().steps * effort.share), 2))
     return (
         Method(
@@ -45,6 +47,13 @@ def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
             "the box's default: filters, spectrum and trained stages as held-out groups of the training sweeps ask for",
             "raw",
             partial(train, settings=settings),
+            effort=f"{settings.steps} iterations of stages",
+        ),
+        Method(
+            REATTACHED,
+            "as default, but every head sees augmented copies, which look as if the skin had been taken off and put back",
+            "raw",
+            partial(train, settings=replace(settings, reattached=True)),
             effort=f"{settings.steps} iterations of stages",
         ),
         Method(

@@ -97,17 +97,14 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     changed = list(copies(sweeps, augmentation, seed, COPIES))
     known, classes = _known(fixed, sweeps, changed), len(sweeps.materials)
     parts = inner_parts(sweeps)
-    court = Court([known] * len(parts), parts, classes)
+    court = Court([known] * len(parts), parts, classes, settings.reattached)
     judged, stages = _choose(court, fixed, settings, partial(told, 2)), None
     train, held = (sweeps.take(~out), sweeps.take(out)) if by != "nothing" else (sweeps, sweeps)
     if may_train and court.accuracy(judged) < ENOUGH:
         stages = _stages(train, fixed.scale, seed, replace(settings, augmentation=augmentation), partial(told, 3))
         both = _side_by_side(_known(stages, sweeps, changed), known)
-        court = Court([both], [InnerPart(by, out)], classes)
-        judged = court.judge(_with_stages(judged.plan))
-        if settings.choose:  # beside stages fewer may do
-            numbers = np.append(np.full(sum(STAGES.channels), -1), _filter_numbers(fixed))
-            judged = choice.fewer(court, judged, numbers, bank.LEAST_FILTERS, partial(told, 3))
+        court = Court([both], [InnerPart(by, out)], classes, settings.reattached)
+        judged = _beside_stages(court, judged, fixed, settings, partial(told, 3))
     trunk, plan = _pruned(fixed, stages, judged.plan)
     heads: dict[str, Array] = {}
     for name, int8 in (("head", False), ("int8", True)):
@@ -169,6 +166,34 @@ def _choose(court: Court, trunk: Trunk, settings: Settings, log: Log) -> Judged:
         return court.judge(choice.views([np.flatnonzero(~filters.free)], pools))
     chosen = choice.choose(court, kinds, pools, levels, bands, log, settings.reattached)
     return choice.fewer(court, chosen, _filter_numbers(trunk), bank.LEAST_FILTERS, log)
+
+
+def _beside_stages(court: Court, judged: Judged, fixed: Trunk, settings: Settings, log: Log) -> Judged:
+    """What was chosen with a discriminant of trained stages, with as few filters as then do.
+
+    For a skin that will be reattached stages and the spectrum are enough where neither held-out sweeps nor their copies
+    show more. Sweeps in place alone would not: they do not show what a view is good for in a condition that nobody recorded.
+    """
+    size, full = sum(STAGES.channels), court.judge(_with_stages(judged.plan))
+    if not settings.choose:
+        return full
+    if settings.reattached:
+        log("choosing: stages and the spectrum alone")
+        lean = court.judge(_stages_alone(fixed.layout().get("bands", slice(0, 0))))
+        if court.holds(lean, full):
+            return lean
+    numbers = np.append(np.full(size, -1), _filter_numbers(fixed))
+    return choice.fewer(court, full, numbers, bank.LEAST_FILTERS, log)
+
+
+def _stages_alone(bands: slice) -> list[HeadPart]:
+    """A discriminant of each stage and the spectrum, whose features `bands` come after those of stages; all see copies."""
+    size, ends = sum(STAGES.channels), np.cumsum(STAGES.channels).tolist()
+    spectrum = range(size + bands.start, size + bands.stop)
+    return [
+        HeadPart((*range(end - channels, end), *spectrum), True)
+        for channels, end in zip(STAGES.channels, ends, strict=True)
+    ]
 
 
 def _filter_numbers(trunk: Trunk) -> Array:
@@ -263,7 +288,7 @@ def describe(trunk: Trunk, plan: HeadPlan) -> str:
 
 
 def _validation(court: Court, judged: Judged) -> dict[str, Any]:
-    """Accuracy on held-out parts of heads that did not see them, with its 95 % interval by part."""
-    right = judged.logits.argmax(axis=1) == court.labels
-    low, high = interval(right, court.clusters)
+    """Accuracy on held-out parts of heads that did not see them, with its 95 % interval by part; copies do not count."""
+    right = (judged.logits.argmax(axis=1) == court.labels)[court.own]
+    low, high = interval(right, court.clusters[court.own])
     return {"accuracy": round(float(right.mean()), 4), "n": len(right), "low": low, "high": high}

@@ -157,7 +157,26 @@ def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
     )
     at = Court([own] * 3, parts, 3)
     assert at.accuracy(at.judge([HeadPart(tuple(range(400)), False)])) < 0.5
-    assert at.sweeps.tolist() == list(range(240))
+    assert at.labels.tolist() == given.labels.tolist()
+
+
+def test_copies_of_held_out_sweeps_count_as_much_as_these():
+    """Where they are judged, what fails on copies is no longer as good as what does not, and loses to it."""
+    given, parts = known()
+    copied = given.copied.copy()
+    copied[:, GOOD[0]] = 0
+    blind = np.hstack([given.features, given.features[:, GOOD]]), np.hstack([copied, given.copied[:, GOOD]])
+    both = replace(given, features=blind[0], copied=blind[1])
+    fails, stands = [HeadPart(GOOD, False)], [HeadPart((5, 6), False)]
+    in_place, moved = Court([both] * 3, parts, 3), Court([both] * 3, parts, 3, copied=True)
+    assert in_place.own.all()
+    assert in_place.accuracy(in_place.judge(fails)) == in_place.accuracy(in_place.judge(stands))
+    assert moved.own.sum() == len(given.labels) == (~moved.own).sum()
+    assert moved.weights[moved.own].sum() == pytest.approx(0.5)
+    assert moved.better(moved.judge(stands), moved.judge(fails))
+    assert not moved.holds(moved.judge(fails), moved.judge(stands))
+    own = moved.judge(fails).logits[moved.own].argmax(axis=1) == moved.labels[moved.own]
+    assert own.mean() == pytest.approx(in_place.accuracy(in_place.judge(fails)))
 
 
 def test_the_temperature_is_the_best_for_held_out_sweeps():

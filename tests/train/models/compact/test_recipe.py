@@ -19,7 +19,7 @@ from train.cli.main import main
 from train.data.sets import Dataset
 from train.data.splitters import inner_parts
 from train.models import checkpoint, training
-from train.models.compact import default, recipe
+from train.models.compact import choice, default, recipe
 from train.models.compact.bank import Bank
 from train.models.compact.fitted import Fit
 from train.models.compact.recipe import Settings
@@ -130,6 +130,27 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
     assert fit.about["validation"]["n"] == len(fit.held)
     logits = run(with_head(fit.trunk(), *fit.int8_head()), easy().samples)
     assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("holds", [True, False])
+def test_stages_and_the_spectrum_are_enough_where_copies_show_it(monkeypatch: pytest.MonkeyPatch, holds: bool):
+    """For a skin that is put back: each stage then has a discriminant with the spectrum, and the trunk holds no filters."""
+    for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
+        monkeypatch.setattr(recipe, name, value)
+    monkeypatch.setattr(choice.Court, "holds", lambda *_: holds)
+    fit = recipe.fit(easy(), 1, Settings(steps=20, reattached=True))
+    bands = fit.bands
+    assert bands
+    assert bool(fit.architecture.pools) != holds
+    assert bool(fit.architecture.distribution) != holds
+    assert fit.about["validation"]["n"] == len(fit.held)  # copies were judged, and are not counted
+    if holds:
+        sizes = [len(part.columns) for part in fit.plan.parts]
+        assert sizes == [channels + bands for channels in recipe.STAGES.channels]
+        assert all(part.copies for part in fit.plan.parts)
+        logits = run(with_head(fit.trunk(), *fit.int8_head()), easy().samples)
+        assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
 
 
 def refused(fit: Fit) -> NoReturn:
