@@ -211,7 +211,16 @@ def test_plans_name_methods_and_parts_that_exist():
         ran = {(part, m + step.means_removed * paper_values.CENTRED) for step in steps for part in step.parts
                for m in step.methods}  # fmt: skip
         left = known ^ {m.removesuffix(paper_values.CENTRED) for _, m in ran}
-        newer = {"default", "multirocket-hydra", "quant", "minirocket-augmented", "ds-cnn", "lite", "edge-spectral"}
+        newer = {
+            "default",
+            "default-reattached",
+            "multirocket-hydra",
+            "quant",
+            "minirocket-augmented",
+            "ds-cnn",
+            "lite",
+            "edge-spectral",
+        }
         assert left == {m for m in known if m.startswith("compact-")} | {"paper-cnn-centred"} | newer
         assert {part for part, _ in ran} == set(parts) == set(paper_report.TITLES)
         cnn = {(p, m) for p in paper_values.ACCURACY for m in paper_values.CNNS}
