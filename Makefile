@@ -96,7 +96,7 @@ bench: $(DESKTOP) ## measure this machine: docs/bench.json, and the tables of RE
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
-	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --seed 1 --reattached --out build/default.npz
+	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --seed 1 --reattached --steps 1200 --out build/default.npz
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default --version 3
 
 skins: $(DESKTOP) ## measure emulated skins: docs/skins.md; PART=way, noise or load alone, SKINS= some of them

@@ -20,9 +20,9 @@ from train.calibration.temperature import fit_temperature
 from train.models.compact.augment import Augmentation
 
 Array = NDArray[Any]
-MOST_WRONG = 0.02
+MOST_WRONG = 0.0125
 """Share of held-out copies that may be named wrongly with status ok. Heads that have learnt from copies name these better than
-sweeps of a skin that really moved: with .02 a fit for a skin that is put back names 4 % of sim:T-HARD:201-236:2 wrongly."""
+sweeps of a skin that really moved: with .0125 a fit for a skin that is put back names 4 % of sim:T-HARD:201-236:2 wrongly."""
 UNSURE = np.arange(50, 100) / 100
 """Least probabilities that a moved sweep may need."""
 NEVER = 1.01
