@@ -102,8 +102,8 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 skins: $(DESKTOP) ## measure emulated skins: docs/skins.md; PART=way, noise or load alone, SKINS= some of them
 	nice $(BIN)/python -m tests.skins $(PART) $(SKINS)
 
-reports: $(DESKTOP) ## all pages that are stale, the most telling first: PAGES= some, SCHEDULER= a Dask cluster, LIST=1: what would run
-	nice $(BIN)/palpate-train reports $(PAGES) $(if $(LIST),--list) $(if $(SCHEDULER),--scheduler $(SCHEDULER))
+reports: $(DESKTOP) ## all pages that are stale, the most telling first: PAGES= some, SCHEDULER= a Dask cluster, LIST=1: what would run, DRAW=1: draw them alone
+	nice $(BIN)/palpate-train reports $(PAGES) $(if $(LIST),--list) $(if $(DRAW),--draw) $(if $(SCHEDULER),--scheduler $(SCHEDULER))
 
 figures: $(DESKTOP) ## the figures of docs/ in README, manual and pages
 	$(BIN)/palpate-train figures

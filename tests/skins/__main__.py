@@ -18,6 +18,7 @@ from appliance.core.provenance import commit
 from tests.factories.paths import ROOT
 from tests.skins import load, noise, page, way
 from tests.skins.subjects import NAMES, subject
+from train.metrics import score
 
 WORK = ROOT / "build" / "skins"
 RESULTS = ROOT / "docs" / "skins.json"
@@ -27,7 +28,7 @@ FAULTS = 10_000
 def _way(name: str, args: argparse.Namespace) -> dict[str, Any]:
     rmtree(WORK / name, ignore_errors=True)
     (WORK / name).mkdir(parents=True)
-    return way.go(name, WORK / name)
+    return {"shipped": score.shipped(), **way.go(name, WORK / name)}
 
 
 def _noise(name: str, args: argparse.Namespace) -> dict[str, Any]:

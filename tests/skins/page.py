@@ -7,21 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from appliance.core.storage import put
+from train.reports import marked_text, provenance
 
 Json = dict[str, Any]
 
 
 def write(path: Path, results: Json) -> None:
-    """Put each table into the page. Raises ValueError where a pair of markers is not there once."""
+    """Put each table and the header into the page. Raises FormatError where a pair of markers is not there once."""
     text = path.read_text("utf-8")
     for part, table in TABLES.items():
-        begin, end = f"<!-- {part} -->", f"<!-- /{part} -->"
-        if text.count(begin) != 1 or text.count(end) != 1:
-            raise ValueError(f"{path} has not one pair of markers {begin} and {end}; put them where the table belongs")
-        before, _, rest = text.partition(begin)
-        rows = "\n".join(table(results.get(part, {})))
-        text = f"{before}{begin}\n{rows}\n{end}{rest.partition(end)[2]}"
-    put(path, text.encode())
+        text = marked_text.insert(text, part, "\n".join(table(results.get(part, {}))), str(path))
+    put(path, provenance.in_markdown(text, provenance.of(results)).encode())
 
 
 def _percent(share: float) -> str:

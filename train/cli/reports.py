@@ -79,6 +79,7 @@ def _add_reports(add: Add) -> None:
     )
     command.add_argument("pages", nargs="*", metavar="PAGE", help=f"some of {', '.join(docs_pages.names())}")
     command.add_argument("--list", action="store_true", help="run nothing: say which page is stale, and why")
+    command.add_argument("--draw", action="store_true", help="measure nothing: draw them of the results that are there")
     options.add_where(command)
 
 
@@ -131,7 +132,11 @@ def run_reports(args: argparse.Namespace) -> None:
     where = ["--jobs", str(args.jobs), "--cache", str(args.cache)] + (
         ["--scheduler", args.scheduler] if args.scheduler else []
     )
-    docs_pages.make(args.pages, where, options.Log().keep)
+    log = options.Log().keep
+    if args.draw:
+        docs_pages.draw(args.pages, log)
+    else:
+        docs_pages.make(args.pages, where, log)
     run_figures(args)
 
 

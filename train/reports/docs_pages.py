@@ -33,7 +33,8 @@ COMMANDS = {"train": "palpate-train", "appliance": "palpate"}
 class DocsPage:
     """One page. file, results: below docs/. words: what `python -m` runs. needs: keys of NEEDS.
 
-    folds: whether the command takes the options that say where folds run and are kept.
+    folds: whether the command takes the options that say where folds run and are kept. drawn: whether it takes --draw, which
+    draws the page of the results that are there.
     """
 
     name: str
@@ -42,6 +43,7 @@ class DocsPage:
     words: tuple[str, ...]
     needs: tuple[str, ...] = ()
     folds: bool = False
+    drawn: bool = False
 
     @property
     def command(self) -> str:
@@ -65,12 +67,12 @@ class DocsPage:
 
 
 PAGES = (
-    DocsPage("development", "development/index.html", "development/results.json", ("train", "development"), (REAL,), True),
+    DocsPage("development", "development/index.html", "development/results.json", ("train", "development"), (REAL,), True, True),
     DocsPage("alignment", "alignment/README.md", "alignment/place.json", ("train", "alignment", "--out", "docs/alignment")),
     DocsPage("certainty", "certainty/index.html", "certainty/results.json",
              ("train", "certainty", "--set", "sim:T-REAL:1-3", "--test", "sim:T-REAL:4-6:20"), folds=True),
-    DocsPage("chart", "chart/index.html", "chart/chart.json", ("train", "chart"), (REAL,), True),
-    DocsPage("paper", "paper/index.html", "paper/results.json", ("train", "paper"), folds=True),
+    DocsPage("chart", "chart/index.html", "chart/chart.json", ("train", "chart"), (REAL,), True, True),
+    DocsPage("paper", "paper/index.html", "paper/results.json", ("train", "paper"), folds=True, drawn=True),
     DocsPage("overview", "overview.svg", "overview.svg", ("train", "overview")),
     DocsPage("bench", "bench.json", "bench.json", ("appliance", "bench", "--json", "docs/bench.json")),
     DocsPage("skins", "skins.md", "skins.json", ("tests.skins",)),
@@ -109,6 +111,21 @@ def _state(page: DocsPage) -> str:
     lacks = page.lacks() if why else []
     left_out = f"; left out: it needs {' and '.join(lacks)}" if lacks else ""
     return f"stale: {why.rstrip('.')}{left_out}" if why else "of today"
+
+
+def draw(wanted: Sequence[str], log: Callable[[str], None], run: Run | None = None) -> None:
+    """Draw the pages that are named, or all that are stale, of the results that are there, in seconds.
+
+    Those whose command cannot do that are left out by name. Raises FormatError at the end where a page failed.
+    """
+    failed = []
+    for page in [page for page in named(wanted) if wanted or page.stale()]:
+        if not page.drawn:
+            log(f"{page.name} is left out: its command has no --draw")
+        elif (run or _run)([*page.words, "--draw"]):
+            failed.append(page.name)
+    if failed:
+        raise FormatError(f"{', '.join(failed)} could not be drawn; see above")
 
 
 def make(wanted: Sequence[str], where: Sequence[str], log: Callable[[str], None], run: Run | None = None) -> None:

@@ -58,7 +58,8 @@ class Provenance:
         now = score.shipped()
         others = [name for name in self.bundle if name != now]
         if others:
-            return f"Made with an older default, bundle {' and '.join(others)}; the box ships bundle {now} now."
+            part = "in part " if now in self.bundle else ""
+            return f"Made {part}with an older default, bundle {' and '.join(others)}; the box ships bundle {now} now."
         return "" if self.bundle else f"Made without the default that the box ships now, bundle {now}."
 
 

@@ -32,7 +32,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         lay(tmp_path / "docs" / name, results, results)
     monkeypatch.setitem(docs_pages.NEEDS, NEED, lambda: False)
     pages = [
-        DocsPage("older", "older/index.html", "older/results.json", ("train", "older"), folds=True),
+        DocsPage("older", "older/index.html", "older/results.json", ("train", "older"), folds=True, drawn=True),
         DocsPage("current", "current/index.html", "current/results.json", ("train", "current", "--out", "x")),
         DocsPage("lacking", "lacking/index.html", "lacking/results.json", ("tests.lacking",), (NEED,)),
         DocsPage("new", "new/index.html", "new/results.json", ("appliance", "new")),
@@ -111,6 +111,16 @@ def test_a_failure_is_named_and_the_others_are_made(project: Path):
     assert len(run.words) == 2
     with pytest.raises(FormatError, match="lacking is left out"):
         docs_pages.make(("lacking",), (), lambda line: None, RunCommands())
+
+
+def test_pages_are_drawn_again_without_measuring(project: Path):
+    """Those that are stale and whose command can do that; the others are named, and so is what fails."""
+    run, lines = RunCommands(), []
+    docs_pages.draw((), lines.append, run)
+    assert run.words == [["train", "older", "--draw"]]
+    assert lines == [f"{name} is left out: its command has no --draw" for name in ("lacking", "new")]
+    with pytest.raises(FormatError, match="older could not be drawn"):
+        docs_pages.draw(("older",), lines.append, RunCommands(older=1))
 
 
 def test_an_unknown_page_or_another_folder_is_an_error(
