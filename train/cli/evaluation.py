@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
@@ -19,10 +21,14 @@ from train.data import sets
 from train.data.progress import Progress
 from train.evaluation import evaluate, robustness, sim_calibration, uncertainty
 from train.evaluation.corruptions import EvaluationSweeps
-from train.export import contact_positions
+from train.export import bundle_stress, contact_positions
 from train.metrics import score
 from train.models import methods
-from train.reports import contact_plot, contact_table, marked_text, plots, provenance, uncertainty_report
+from train.reports import contact_plot, contact_table, marked_text, provenance, stress_report, uncertainty_report
+
+STRESSED = "sim:T-REAL:101-104:1"
+"""At 36 attachments at which neither the methods nor the packaged bundle are trained."""
+STRESSED_METHODS = "default,default-reattached,minirocket,minirocket-augmented,H-svm,compact"
 
 
 def register(add: Add) -> None:
@@ -81,17 +87,22 @@ def _add_evaluate(add: Add) -> None:
 
 
 def _add_stress(add: Add) -> None:
-    command = add("stress", run_stress, "test trained methods on corrupted sweeps, one corruption at a time")
-    options.add_set(command)
-    command.add_argument(
-        "--test", required=True, metavar="SET", help="the set that is corrupted; a simulated one is drawn anew"
+    command = add(
+        "stress", run_stress, "test trained methods, and a bundle, on corrupted sweeps, one corruption at a time"
     )
-    command.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
+    options.add_set(command, "sim:T-REAL:1")
+    command.add_argument("--test", default=STRESSED, metavar="SET",
+                         help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})")  # fmt: skip
+    command.add_argument("--method", default=STRESSED_METHODS, metavar="NAME[,NAME...]",
+                         help=f"ours first; the first five are drawn; or all; see palpate-train methods ({STRESSED_METHODS})")  # fmt: skip
     command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)")
+    command.add_argument("--bundle", type=Path, metavar="DIR", help="that answers as the box does (the packaged one)")
+    command.add_argument("--out", type=Path, default=Path("docs/stress"), metavar="DIR",
+                         help="for results.json, pictures and page (docs/stress)")  # fmt: skip
+    command.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
     command.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="for results.json, table.md and curves.svg"
+        "--draw", action="store_true", help="run nothing: draw the page of results.json in --out again"
     )
-    command.add_argument("--strong", default="compact,minirocket", metavar="A,B", help="methods drawn with their bands")
     options.add_effort(command)
     options.add_where(command)
 
@@ -161,31 +172,44 @@ def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:
 
 
 def run_stress(args: argparse.Namespace) -> None:
-    """Write the curves as JSON and as a plot, and the table; print the table."""
-    train = options.load(args)
-    simulated = args.test.startswith("sim:")
+    """Write the figures, the pictures and the page; print the page's path. With --draw only the pictures and the page."""
+    if args.draw:
+        print(stress_report.write(stress_report.read(args.out), args.out))
+        return
+    train, seeds, log = options.load(args), options.seeds(args), options.Log()
     test = (
         EvaluationSweeps.simulated(args.test)
-        if simulated
+        if args.test.startswith("sim:")
         else EvaluationSweeps.of(sets.load(args.test).select(args.only))
     )
+    box = _box_under_stress(args.bundle, test, seeds, log)
     result = robustness.run(
-        options.names(args),
-        train,
-        test,
-        options.where(args),
-        seeds=options.seeds(args),
-        effort=options.effort(args),
-        log=options.Log(),
+        options.names(args), train, test, options.where(args), seeds=seeds, effort=options.effort(args), log=log
     )
-    result["box"] = robustness.box_answers(bundle.load(bundle.DEFAULT))
-    result |= {"train": train.source, "digest": sets.digest(train), "format": str(train.format)} | score.provenance()
-    table = robustness.table(result)
-    put(args.out / "results.json", (json.dumps(result) + "\n").encode(), parents=True)
-    put(args.out / "table.md", table.encode(), parents=True)
-    picture = provenance.in_svg(plots.robustness(result, args.strong.split(",")), provenance.of(result))
-    put(args.out / "curves.svg", picture.encode(), parents=True)
-    print(table)
+    positions = test.sweeps.groups.get("position")
+    result |= {"box": box, "train": train.source, "train_sweeps": len(train), "train_digest": sets.digest(train),
+               "test": test.sweeps.source, "test_sweeps": len(test.sweeps), "test_digest": sets.digest(test.sweeps),
+               "attachments": 0 if positions is None else len(np.unique(positions)),
+               "format": str(train.format), "seeds": list(seeds)} | score.provenance()  # fmt: skip
+    print(stress_report.write(result, args.out))
+
+
+def _box_under_stress(
+    folder: Path | None, test: EvaluationSweeps, seeds: Sequence[int], log: Callable[[str], None]
+) -> dict[str, Any]:
+    """What a bundle answers. Raises FormatError where it cannot; of the packaged one (None) the curves are missing then."""
+    box = Classifier(bundle.load(folder or bundle.DEFAULT), SystemClock())
+    try:
+        curves = bundle_stress.under_corruptions(box, test, seeds, log)
+    except FormatError:
+        if folder:
+            raise
+        curves = {}
+    manifest = box.bundle.manifest
+    return {
+        "bundle": {"name": manifest.name, "version": manifest.version, "id": box.bundle.id}, "made": dict(manifest.made),
+        "uninformative": robustness.box_answers(box.bundle), "curves": curves,
+    }  # fmt: skip
 
 
 def run_certainty(args: argparse.Namespace) -> None:

@@ -24,9 +24,11 @@ SET = "FILE (.npz, .h5), a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEE
 LOG_EVERY_S = 30
 
 
-def add_set(command: argparse.ArgumentParser) -> None:
-    """--set and --only."""
-    command.add_argument("--set", action="append", required=True, metavar="SET", dest="sets", help=SET)
+def add_set(command: argparse.ArgumentParser, usual: str = "") -> None:
+    """--set and --only. usual: where none is given; without it one must be."""
+    told = f"{SET} ({usual})" if usual else SET
+    command.add_argument("--set", action="append", required=not usual, metavar="SET", dest="sets", help=told)
+    command.set_defaults(usual_set=usual)
     command.add_argument("--only", action="extend", nargs="+", default=[], metavar="NAME=VALUE",
                          help="keep these sweeps: force=100,150, force<=180, material=Canvas,Linen")  # fmt: skip
     add_rename(command)
@@ -85,7 +87,8 @@ def writable_file(path: Path, option: str = "--out") -> None:
 
 def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated ones that name none."""
-    pairs, loaded = labels.renames(args.rename), [sets.load(spec, seed) for spec in args.sets]
+    pairs = labels.renames(args.rename)
+    loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
     labels.check_known(pairs, (name for sweeps in loaded for name in sweeps.materials))
     return sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded]).select(args.only)
 

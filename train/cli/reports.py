@@ -45,6 +45,8 @@ def register(add: Add) -> None:
     )
     paper.add_argument("--draw", action="store_true", help="run nothing: draw the page of results.json in --out again")
     paper.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
+    paper.add_argument("--method", metavar="NAME[,NAME...]",
+                       help="run these; all others stay as results.json in --out has them (all)")  # fmt: skip
     chart = add("chart", run_chart, "chart accuracy against cost: every method as a bundle, timed as on the box")
     chart.add_argument("--out", type=Path, default=Path("docs/chart"), metavar="DIR", help="where it goes (docs/chart)")
     chart.add_argument(
@@ -120,7 +122,8 @@ def run_paper(args: argparse.Namespace) -> None:
     if args.draw:
         print(paper_experiment.draw(args.out))
         return
-    print(paper_experiment.run(args.out, args.quick, options.where(args), options.Log(), options.effort(args)))
+    only = args.method.split(",") if args.method else ()
+    print(paper_experiment.run(args.out, args.quick, options.where(args), options.Log(), options.effort(args), only))
 
 
 def run_reports(args: argparse.Namespace) -> None:

@@ -1,7 +1,7 @@
 """The paper's CNN followed while it learns: accuracy over iterations at new positions and a row off. In: a size, a seed.
 
-Out: a Curve in a file, beside the two accuracies that the paper prints. Trained whole it takes an hour of one core, so there
-is a small one to compare simulated worlds with: a quarter of the filters and neurons, one second of each sweep, 600
+Out: a curve in a file, beside the two accuracies that the paper prints, with the newest answers, which the paper's page shows.
+Trained whole it takes an hour of one core, so there is a small one to compare simulated worlds with: a quarter of the filters and neurons, one second of each sweep, 600
 iterations at ten times the rate. An interrupted training goes on from the file and a checkpoint beside it.
 """
 
@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sklearn.metrics import log_loss
 
 from appliance.core.storage import put
+from appliance.inference.classifier import softmax
 from appliance.sim import skin
 from train.data import sets
 from train.data.sets import Dataset
@@ -95,7 +97,8 @@ def follow(
     unfinished, result = out.with_suffix(".pt"), _kept(out, about)
     if result is None:
         unfinished.unlink(missing_ok=True)  # of another training
-        result = {"about": about, "printed": PRINTED, "points": []}
+        start: dict[str, Any] = {"about": about, "printed": PRINTED, "steps": recipe.steps, "points": []}
+        result = start | score.provenance()
         _write(out, result)
     if any(point["step"] == recipe.steps for point in result["points"]):
         return result
@@ -103,9 +106,10 @@ def follow(
 
     def watch(step: int, network: Network) -> None:
         if step in at:
-            answers = {name: _answers(network, sweeps.samples) for name, sweeps in given.items()}
+            logits = {name: _logits(network, sweeps.samples) for name, sweeps in given.items()}
             earlier = [point for point in result["points"] if point["step"] < step]
-            result["points"] = [*earlier, {"step": step} | _point(answers, given)]
+            result["points"] = [*earlier, {"step": step} | _point(logits, given)]
+            result["newest"] = {name: _given(logits[name], given[name]) for name in PRINTED}
             _write(out, result)
 
     with deterministic_device(seed) as device:
@@ -137,26 +141,34 @@ def _write(out: Path, result: dict[str, Any]) -> None:
 
 
 @torch.no_grad()
-def _answers(network: Network, samples: Array) -> Array:
-    """Labels int64 [n]; the network trains on afterwards."""
+def _logits(network: Network, samples: Array) -> Array:
+    """Logits float32 [n, K]; the network trains on afterwards."""
     device = next(network.parameters()).device
     network.eval()
     numbers = batches(len(samples), 32)
-    labels = [network(x.to(device)).argmax(1).cpu().numpy() for x in float_batches(samples, numbers)]
+    logits = [network(x.to(device)).cpu().numpy() for x in float_batches(samples, numbers)]
     network.train()
-    return np.concatenate(labels)
+    return np.concatenate(logits)
 
 
-def _point(answers: dict[str, Array], given: dict[str, Dataset]) -> dict[str, Any]:
-    """Of each set the share of right answers and its 95 % interval over positions; the confusion of all but training."""
-    point: dict[str, Any] = {}
+def _given(logits: Array, sweeps: Dataset) -> dict[str, Any]:
+    """What the network answers to each sweep, as JSON."""
+    return {"labels": sweeps.labels.tolist(), "position": sweeps.group("position").tolist(),
+            "logits": logits.astype(float).round(4).tolist()}  # fmt: skip
+
+
+def _point(logits: dict[str, Array], given: dict[str, Dataset]) -> dict[str, Any]:
+    """Of each set the share of right answers and its 95 % interval over positions; the confusion of all but training, of
+    which there is the cross entropy."""
+    point: dict[str, Any] = {"cost": round(float(log_loss(given["train"].labels, softmax(logits["train"]))), 6)}
     for name, sweeps in given.items():
-        right = answers[name] == sweeps.labels
+        named = logits[name].argmax(1)
+        right = named == sweeps.labels
         ends = score.interval(right, sweeps.group("position"))
         point[name] = [round(float(value), 4) for value in (right.mean(), *ends)]
         if name != "train":
             confusion = np.zeros((len(sweeps.materials),) * 2, int)
-            np.add.at(confusion, (sweeps.labels, answers[name]), 1)
+            np.add.at(confusion, (sweeps.labels, named), 1)
             point[f"{name} confusion"] = confusion.tolist()
     return point
 

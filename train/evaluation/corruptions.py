@@ -131,11 +131,12 @@ Change = Callable[[Array, float, Generator, EvaluationSweeps], Array]
 class Corruption:
     """One thing that goes wrong.
 
-    unit: of `severities`, which rise from 0 = none. change: (float32 [N, T, R, C] or [N, T, R, C, A], severity, rng, test)
+    title: its name for readers. unit: of `severities`, which rise from 0 = none. change: (float32 [N, T, R, C] or [N, T, R, C, A], severity, rng, test)
     -> the same shape, not yet digitized. only: "simulated" where a scene is needed, "files" for what replaces it without one.
     """
 
     name: str
+    title: str
     unit: str
     severities: tuple[float, ...]
     about: str
@@ -325,30 +326,30 @@ def _noise(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Ar
 SHIFTS, TURNS, ERRORS_MS = (0, 0.25, 0.5, 1, 1.5), (0, 5, 10, 20, 30), (0, 10, 25, 50, 100)
 HALVES, TAXELS = (0, 0.1, 0.2, 0.35, 0.5), (0, 1, 2, 3, 4)
 CORRUPTIONS = (
-    Corruption("shift-rows", "rows", SHIFTS, "skin further along the sliding, drawn anew", _shift, "simulated"),
-    Corruption("turn", "degrees", TURNS, "skin turned on the finger, drawn anew", _turn, "simulated"),
-    Corruption("force-down", "share", HALVES, "pressed less, drawn anew", partial(_force, -1), "simulated"),
-    Corruption("force-up", "share", HALVES, "pressed more, drawn anew", partial(_force, 1), "simulated"),
-    Corruption("speed-down", "share", HALVES, "slid slower, drawn anew", partial(_speed, -1), "simulated"),
-    Corruption("speed-up", "share", HALVES, "slid faster, drawn anew", partial(_speed, 1), "simulated"),
-    Corruption("window", "ms", ERRORS_MS, "window too early or late, into the rest, drawn anew", _window, "simulated"),
-    Corruption("shift-grid", "rows", SHIFTS, "taxels read further on, edge mirrored, new gains", _shift_grid, "files"),
-    Corruption("turn-grid", "degrees", TURNS, "taxels read on a turned grid, edge mirrored, new gains", _turn_grid, "files"),
-    Corruption("window-held", "ms", ERRORS_MS, "window too early or late, first or last frame held", _window_held, "files"),
-    Corruption("dead", "taxels", TAXELS, "read 0", _dead),
-    Corruption("stuck", "taxels", TAXELS, "each at some count of the set's range", _stuck),
-    Corruption("noisy", "taxels", TAXELS, f"white noise of {NOISY:g} of the set's deviations", _noisy),
-    Corruption("gain-spread", "share", HALVES, "each taxel's gain off by up to this share", _gain_spread),
-    Corruption("gain-down", "share", HALVES, "all gains lower", partial(_gain, -1)),
-    Corruption("gain-up", "share", HALVES, "all gains higher", partial(_gain, 1)),
-    Corruption("stretch", "share", HALVES, "slower: all is stretched in time", partial(_stretch, -1), "files"),
-    Corruption("shorten", "share", HALVES, "faster: all is shortened in time", partial(_stretch, 1), "files"),
-    Corruption("drift", "of full load", (0, 0.02, 0.05, 0.1, 0.2), "offset of each taxel, from one to another", _drift),
-    Corruption("bits", "fewer than 8", (0, 1, 2, 3, 4), "steps of the set's range: 7, 6, 5, 4 bits", _bits),
-    Corruption("lost", "share", (0, 0.02, 0.05, 0.1, 0.2), "frames lost, at most two in a row, filled as the box does", _lost),
-    Corruption("saturation", "share", HALVES, "clipped so far below full load", _saturation),
-    Corruption("hum", "deviations", (0, 0.25, 0.5, 1, 2), "50 Hz on all taxels, amplitude", _hum),
-    Corruption("noise", "deviations", (0, 0.1, 0.2, 0.3, 0.5), "white, of each taxel's deviation", _noise),
+    Corruption("shift-rows", "skin further along", "rows", SHIFTS, "skin further along the sliding, drawn anew", _shift, "simulated"),
+    Corruption("turn", "skin turned", "degrees", TURNS, "skin turned on the finger, drawn anew", _turn, "simulated"),
+    Corruption("force-down", "less force", "share", HALVES, "pressed less, drawn anew", partial(_force, -1), "simulated"),
+    Corruption("force-up", "more force", "share", HALVES, "pressed more, drawn anew", partial(_force, 1), "simulated"),
+    Corruption("speed-down", "slower", "share", HALVES, "slid slower, drawn anew", partial(_speed, -1), "simulated"),
+    Corruption("speed-up", "faster", "share", HALVES, "slid faster, drawn anew", partial(_speed, 1), "simulated"),
+    Corruption("window", "window off", "ms", ERRORS_MS, "window too early or late, into the rest, drawn anew", _window, "simulated"),
+    Corruption("shift-grid", "skin further along", "rows", SHIFTS, "taxels read further on, edge mirrored, new gains", _shift_grid, "files"),
+    Corruption("turn-grid", "skin turned", "degrees", TURNS, "taxels read on a turned grid, edge mirrored, new gains", _turn_grid, "files"),
+    Corruption("window-held", "window off", "ms", ERRORS_MS, "window too early or late, first or last frame held", _window_held, "files"),
+    Corruption("dead", "dead taxels", "taxels", TAXELS, "read 0", _dead),
+    Corruption("stuck", "stuck taxels", "taxels", TAXELS, "each at some count of the set's range", _stuck),
+    Corruption("noisy", "noisy taxels", "taxels", TAXELS, f"white noise of {NOISY:g} of the set's deviations", _noisy),
+    Corruption("gain-spread", "uneven gains", "share", HALVES, "each taxel's gain off by up to this share", _gain_spread),
+    Corruption("gain-down", "lower gain", "share", HALVES, "all gains lower", partial(_gain, -1)),
+    Corruption("gain-up", "higher gain", "share", HALVES, "all gains higher", partial(_gain, 1)),
+    Corruption("stretch", "slower", "share", HALVES, "slower: all is stretched in time", partial(_stretch, -1), "files"),
+    Corruption("shorten", "faster", "share", HALVES, "faster: all is shortened in time", partial(_stretch, 1), "files"),
+    Corruption("drift", "drift", "of full load", (0, 0.02, 0.05, 0.1, 0.2), "offset of each taxel, from one to another", _drift),
+    Corruption("bits", "fewer bits", "fewer than 8", (0, 1, 2, 3, 4), "steps of the set's range: 7, 6, 5, 4 bits", _bits),
+    Corruption("lost", "lost frames", "share", (0, 0.02, 0.05, 0.1, 0.2), "frames lost, at most two in a row, filled as the box does", _lost),
+    Corruption("saturation", "saturation", "share", HALVES, "clipped so far below full load", _saturation),
+    Corruption("hum", "50 Hz hum", "deviations", (0, 0.25, 0.5, 1, 2), "50 Hz on all taxels, amplitude", _hum),
+    Corruption("noise", "white noise", "deviations", (0, 0.1, 0.2, 0.3, 0.5), "white, of each taxel's deviation", _noise),
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Robustness: under which corruptions each method fails. In: methods, a training set, EvaluationSweeps. Out: curves, tables.
+"""Robustness: under which corruptions each method fails. In: methods, a training set, EvaluationSweeps. Out: curves.
 
 One task is one method and one seed: `evaluate_method` trains it and tests it under every corruption, `merge` makes a result
 of many tasks, wherever they ran. What a task returns, and the result, are plain numbers and text that JSON can hold.
@@ -7,8 +7,7 @@ of many tasks, wherever they ran. What a task returns, and the result, are plain
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +17,6 @@ from numpy.typing import NDArray
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import SweepConfig
 from appliance.core.errors import FormatError
-from appliance.core.statistics import wilson
 from appliance.core.storage import put
 from appliance.core.types import Edge, EdgeKind, Frames, SweepFormat, Verdict
 from appliance.inference.classifier import Classifier
@@ -29,6 +27,7 @@ from train.evaluation import parallel
 from train.evaluation.corruptions import Corruption, EvaluationSweeps, applicable
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
+from train.metrics.score import interval
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
 
@@ -73,19 +72,37 @@ def evaluate_model(
     method: Method, model: Model, test: EvaluationSweeps, corruptions: Sequence[Corruption] | None, seed: int
 ) -> Json:
     """What `evaluate_method` returns, of a trained model. The sweeps depend on test, corruption, severity and seed alone."""
-    curves = {}
+    trials = CorruptionCounts(test)
     clean = _right(method, model, test.sweeps, test.sweeps.samples)
     for corruption in applicable(test) if corruptions is None else corruptions:
-        points = [clean]
-        for severity in corruption.severities[1:]:
-            points.append(_right(method, model, test.sweeps, corruption.apply(test, severity, seed)))
-        right, broken = zip(*points, strict=True)
-        curves[corruption.name] = {
-            "unit": corruption.unit, "about": corruption.about, "severities": [float(s) for s in corruption.severities],
-            "right": list(right), "broken": list(broken),
+        trials.add(corruption, [clean, *(_right(method, model, test.sweeps, corruption.apply(test, severity, seed))
+                                         for severity in corruption.severities[1:])])  # fmt: skip
+    return trials.task(method.name, seed) | {
+        "ran": getattr(model, "ran", ""), "trouble": uninformative_answers(method, model, test)
+    }  # fmt: skip
+
+
+class CorruptionCounts:
+    """Counts right answers to `test` under one corruption after another, for a task that `merge` takes."""
+
+    def __init__(self, test: EvaluationSweeps) -> None:
+        self.test, self.curves = test, dict[str, Json]()
+
+    def add(self, corruption: Corruption, answers: Sequence[tuple[Array, int]]) -> None:
+        """answers: at each severity, bool [N], which sweeps were named rightly, and how many answers were not finite."""
+        position = self.test.sweeps.groups.get("position")
+        low, high = zip(*(interval(right, position) for right, _ in answers), strict=True)
+        self.curves[corruption.name] = {
+            "title": corruption.title, "unit": corruption.unit, "about": corruption.about,
+            "severities": [float(s) for s in corruption.severities], "right": [int(right.sum()) for right, _ in answers],
+            "low": list(low), "high": list(high), "broken": [broken for _, broken in answers],
         }  # fmt: skip
-    return {"method": method.name, "seed": seed, "set": test.sweeps.source, "refused": "", "total": len(test.sweeps),
-            "ran": getattr(model, "ran", ""), "curves": curves, "trouble": uninformative_answers(method, model, test)}  # fmt: skip
+
+    def task(self, name: str, seed: int) -> Json:
+        """All of it; `name` answered."""
+        sweeps = self.test.sweeps
+        return {"method": name, "seed": seed, "set": sweeps.source, "refused": "", "total": len(sweeps), "ran": "",
+                "curves": self.curves, "trouble": {}}  # fmt: skip
 
 
 def run(
@@ -100,11 +117,12 @@ def run(
 ) -> Json:
     """All methods and seeds under all corruptions that apply, merged; tasks whose results are kept are not done again.
 
+    Every method gets its first seed before any gets its second, so that an interrupted run compares alike.
     Raises FormatError as `evaluate_method` does, and for an unknown method.
     """
     about = [digest(train), digest(test.sweeps), test.scene is not None]
     tasks = {(method.name, seed): fingerprint([*about, method.name, method.effort, seed], methods.module_of(method.name), "train.evaluation.robustness")
-             for method in methods.find(names, effort) for seed in seeds}  # fmt: skip
+             for seed in seeds for method in methods.find(names, effort)}  # fmt: skip
     paths = {task: where.cache / f"{key}.json" for task, key in tasks.items() if where.cache}
     done = {task: json.loads(path.read_text()) for task, path in paths.items() if path.exists()}
     left = [task for task in tasks if task not in done and not where.kept]
@@ -114,7 +132,9 @@ def run(
         if where.cache:
             put(paths[task], json.dumps(result).encode(), parents=True)
         progress(f"{task[0]} under corruptions, seed {task[1]}")
-    return merge(done.values())
+    result = merge(done.values())
+    result["methods"] = {name: result["methods"][name] for name in names if name in result["methods"]}
+    return result
 
 
 def _run_task(task: tuple[str, int], train: Dataset, test: EvaluationSweeps, effort: Effort) -> Json:
@@ -125,10 +145,10 @@ def _run_task(task: tuple[str, int], train: Dataset, test: EvaluationSweeps, eff
 def merge(tasks: Iterable[Json]) -> Json:
     """The result of tasks, whatever their order: {"sets": [...], "methods": {name: entry}}.
 
-    An entry holds seeds, refused ("" or why), ran, clean (accuracy), curves and trouble. A curve holds unit,
+    An entry holds seeds, refused ("" or why), ran, clean (accuracy), curves and trouble. A curve holds title, unit,
     about, severities, right and total (sums), accuracy, low and high, broken (answers that were not finite; they count
-    as wrong), falls and lost. low to high is the wider of Wilson's 95 % interval for the sweeps of one task and the
-    spread of the tasks: seeds see the same sweeps, and the interval of their sum would be too narrow.
+    as wrong), falls and lost. low to high is the mean of the tasks' 95 % intervals, extended to the spread of the tasks:
+    seeds see the same sweeps, and the interval of their sum would be too narrow.
     """
     tasks = sorted(tasks, key=lambda t: (t["set"], t["seed"]))
     names = sorted({t["method"] for t in tasks})
@@ -151,7 +171,7 @@ def falls(curve: Json, points: float = POINTS) -> float | None:
     return None
 
 
-def at_targets(curves: Json) -> dict[str, tuple[float, ...]]:
+def at_targets(curves: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
     """Accuracy, lower and upper end of its interval at each of TARGETS that `curves` has, between two severities on a line."""
     found = {}
     for key, those in TARGETS.items():
@@ -161,52 +181,16 @@ def at_targets(curves: Json) -> dict[str, tuple[float, ...]]:
     return found
 
 
-def _at(curve: Json, severity: float) -> tuple[float, ...]:
+def _at(curve: Mapping[str, Any], severity: float) -> tuple[float, ...]:
     return tuple(float(np.interp(severity, curve["severities"], curve[k])) for k in ("accuracy", "low", "high"))
 
 
-def worst(result: Json, method: str, n: int = 5) -> list[Json]:
-    """The `n` corruptions under which `method` loses most: accuracy lost, the mean over the severities above 0."""
-    found = result["methods"][method]["curves"]
-    names = sorted(found, key=lambda name: (-found[name]["lost"], name))[:n]
-    return [{"stress": name, **{k: found[name][k] for k in ("lost", "falls", "unit")}} for name in names]
-
-
-def table(result: Json) -> str:
-    """Markdown: accuracy at TARGETS; corruptions x methods, at which severity each has lost five points; each method's five
-    worst; and what becomes of uninformative sweeps: on the desktop, and on the box where `result` has its answers as "box"."""
-    entries = {name: entry for name, entry in result["methods"].items() if entry["curves"]}
-    lines = [*_target_lines(entries), ""]
-    rows = [["accuracy lost by .05 at", *entries], ["---"] + ["---:"] * len(entries)]
-    rows.append(["*no stress: accuracy*", *(f"{entry['clean']:.3f}" for entry in entries.values())])
-    every = {k: curve for entry in entries.values() for k, curve in entry["curves"].items()}
-    for name, curve in every.items():
-        cells = [_cell(entry["curves"].get(name)) for entry in entries.values()]
-        rows.append([f"{name} ({curve['unit']})", *cells])
-    lines += [f"| {' | '.join(row)} |" for row in rows] + [""]
-    for name in entries:
-        hardest = ", ".join(f"{w['stress']} −{w['lost']:.2f}" for w in worst(result, name))
-        lines.append(f"- {name}: worst, by the mean loss over all severities: {hardest}")
-    lines += [f"- {name}: {entry['refused']}" for name, entry in result["methods"].items() if entry["refused"]]
-    lines += ["", "Sweeps without information:", ""]
-    for name in dict.fromkeys(name for entry in entries.values() for name in entry["trouble"]):
-        answers = Counter(entry["trouble"][name].split(":")[0] for entry in entries.values())
-        desktop = ", ".join(f"{n} methods {answer}" for answer, n in answers.items())
-        lines.append(f"- {name}: {desktop}" + (f"; the box: {result['box'][name]}" if "box" in result else ""))
-    return "\n".join(lines) + "\n"
-
-
-def _target_lines(entries: Json) -> list[str]:
-    """A line for each of TARGETS with the accuracy of each method, in Markdown."""
-    found = {name: at_targets(entry["curves"]) for name, entry in entries.items()}
-    rows = [["accuracy, per cent [95 %]", *entries], ["---"] + ["---:"] * len(entries)]
-    for key, those in TARGETS.items():
-        cells = [f"{100 * at[key][0]:.1f} [{100 * at[key][1]:.1f}, {100 * at[key][2]:.1f}]" if key in at else ""
-                 for at in found.values()]  # fmt: skip
-        if any(cells):
-            what = " or ".join(f"{name} {severity:g}" for name, severity in those)
-            rows.append([what if key != "none" else "no stress", *cells])
-    return [f"| {' | '.join(row)} |" for row in rows]
+def breaks_first(curves: Mapping[str, Any]) -> list[str]:
+    """The corruptions that cost five points, those first that do so in the smallest share of the range tried."""
+    reach = {
+        name: curve["falls"] / curve["severities"][-1] for name, curve in curves.items() if curve["falls"] is not None
+    }
+    return sorted(reach, key=lambda name: (reach[name], -curves[name]["lost"], name))
 
 
 def uninformative_answers(method: Method, model: Model, test: EvaluationSweeps) -> dict[str, str]:
@@ -254,11 +238,11 @@ def answer(bundle: Bundle, taxels: Array) -> Verdict:
     return Classifier(bundle, clock)(sweep)
 
 
-def _right(method: Method, model: Model, sweeps: Dataset, samples: Array) -> tuple[int, int]:
-    """How many of `samples` are named rightly, and how many answers are not finite (those are wrong)."""
+def _right(method: Method, model: Model, sweeps: Dataset, samples: Array) -> tuple[Array, int]:
+    """Which of `samples` are named rightly, bool [N], and how many answers are not finite (those are wrong)."""
     logits = np.asarray(model.logits(model_inputs(method.input, replace(sweeps, samples=samples))))
     finite = np.isfinite(logits).all(axis=1)
-    return int(np.sum(finite & (logits.argmax(axis=1) == sweeps.labels))), int(np.sum(~finite))
+    return finite & (logits.argmax(axis=1) == sweeps.labels), int(np.sum(~finite))
 
 
 def _entry(tasks: list[Json]) -> Json:
@@ -285,22 +269,15 @@ def _curve(parts: list[Json], totals: Array) -> Json:
     right = np.array([part["right"] for part in parts])  # [tasks, severities]
     shares = right / totals[:, None]
     accuracy = right.sum(axis=0) / totals.sum()
-    band = [wilson(float(a * totals.mean()), float(totals.mean())) for a in accuracy]
-    low = np.minimum([low for low, _ in band], shares.min(axis=0))
-    high = np.maximum([high for _, high in band], shares.max(axis=0))
-    curve = {k: parts[0][k] for k in ("unit", "about", "severities")} | {
+    low = np.minimum(np.mean([part["low"] for part in parts], axis=0), shares.min(axis=0))
+    high = np.maximum(np.mean([part["high"] for part in parts], axis=0), shares.max(axis=0))
+    curve = {k: parts[0][k] for k in ("title", "unit", "about", "severities")} | {
         "right": right.sum(axis=0).tolist(), "total": int(totals.sum()), "accuracy": accuracy.round(6).tolist(),
         "low": low.round(4).tolist(), "high": high.round(4).tolist(),
         "broken": np.sum([part["broken"] for part in parts], axis=0).tolist(),
         "lost": round(float(np.mean(accuracy[0] - accuracy[1:])), 4),
     }  # fmt: skip
     return curve | {"falls": falls(curve)}
-
-
-def _cell(curve: Json | None) -> str:
-    if curve is None:
-        return ""
-    return f"> {curve['severities'][-1]:g}" if curve["falls"] is None else f"{curve['falls']:.2g}"
 
 
 def _uninformative(form: SweepFormat, top: float) -> dict[str, Array]:

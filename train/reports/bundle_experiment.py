@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +18,11 @@ from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
 from appliance.core.types import Status
 from appliance.inference.classifier import Classifier
-from train.data.progress import Progress
 from train.data.sets import Dataset
 from train.evaluation import uncertainty
-from train.evaluation.corruptions import EvaluationSweeps, applicable
-from train.evaluation.robustness import falls
-from train.export import bundle_score, measure
+from train.evaluation.corruptions import EvaluationSweeps
+from train.evaluation.robustness import breaks_first
+from train.export import bundle_score, bundle_stress, measure
 from train.metrics.score import interval
 
 Array = NDArray[Any]
@@ -97,37 +95,10 @@ def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: 
 
     falls: the severity at which five points are lost; None where none is.
     """
-    clean, rows = _named(classifier, test.sweeps), []
-    tried = applicable(test)
-    progress = Progress(len(tried), log)
-    for corruption in tried:
-        named = [clean]
-        for severity in corruption.severities[1:]:
-            samples = corruption.apply(test, severity, seed)
-            named.append(_named(classifier, replace(test.sweeps, samples=samples)))
-        right, wrong = zip(*named, strict=True)
-        accuracy = [n / len(test.sweeps) for n in right]
-        rows.append({
-            "name": corruption.name, "about": corruption.about, "unit": corruption.unit, "right": list(right),
-            "severities": list(corruption.severities), "wrong": list(wrong), "total": len(test.sweeps),
-            "falls": falls({"severities": corruption.severities, "accuracy": accuracy}),
-        })  # fmt: skip
-        progress(
-            f"{corruption.name}: {right[-1]} of {len(test.sweeps)} at {corruption.severities[-1]:g} {corruption.unit}"
-        )
-    return sorted(rows, key=lambda row: (_reach(row), row["right"][-1]))
-
-
-def _reach(row: Json) -> float:
-    """How far a corruption can grow until five points are lost, as a share of its largest severity."""
-    return float("inf") if row["falls"] is None else float(row["falls"] / row["severities"][-1])
-
-
-def _named(classifier: Classifier, sweeps: Dataset) -> tuple[int, int]:
-    """How many sweeps the box names rightly, and how many wrongly."""
-    right = wrong = 0
-    for i, verdict in bundle_score.answers(classifier, sweeps):
-        if verdict.status is Status.OK:
-            hit = verdict.label == sweeps.materials[sweeps.labels[i]]
-            right, wrong = right + hit, wrong + (not hit)
-    return right, wrong
+    given = bundle_stress.under_corruptions(classifier, test, (seed,), log)
+    right, wrong = given["rightly"], given["wrongly"]
+    first = breaks_first(right)
+    others = sorted(right.keys() - set(first), key=lambda name: (right[name]["right"][-1], name))
+    return [{"name": name, "wrong": wrong[name]["right"]}
+            | {k: right[name][k] for k in ("about", "unit", "severities", "right", "total", "falls")}
+            for name in (*first, *others)]  # fmt: skip

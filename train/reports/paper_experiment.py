@@ -9,7 +9,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.inference.classifier import LEAST_PROBABILITY, fuse, softmax
+from appliance.sim import skin
 from train.data import sets
 from train.data.progress import spoken
 from train.data.sets import Dataset
@@ -36,6 +37,13 @@ Log = Callable[[str], None]
 BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
 NETWORKS = ("tactnet2", "recurrent")
+OWN = ("default", "default-reattached")
+BY_METHOD = ("costs", "confusion", "several", "explored", "methods")
+"""Tables of results.json by method."""
+CURVE = "cnn-curve.json"
+"""Beside results.json: what `palpate-train cnn-curve --size whole` wrote, the paper's CNN as printed."""
+CURVE_PARTS = {"lopo": "new", "hard": "hard"}
+"""Its sets by the part that they stand for."""
 SURE = (0.9, 0.95, 0.99)
 """Posteriors at which no more sweeps are added."""
 SEVERAL = 3
@@ -89,12 +97,13 @@ FULL_STEPS = (
     Step(BASELINES, ALL, (1, 2, 3, 4, 5), 1),
     Step(NEIGHBOURS, ALL, (1, 2, 3), 1),
     Step(("minirocket", "filter-bank", "st-hmp"), HARD, (1,), 12),
-    Step(("compact",), HARD, (1,), 32),
+    Step(OWN, ("hard",), (1,), 90),
+    Step(OWN, ("lopo",), (1,), 90),
     Step(NETWORKS, HARD, (1,), 30),
     Step(("paper-cnn",), HARD, (1,), 170, means_removed=True),
     Step(("paper-cnn",), ("hard",), (1,), 170),
     Step(("minirocket", "filter-bank", "st-hmp"), EASY, (1,), 12),
-    Step(("compact",), EASY, (1,), 32),
+    Step(OWN, EASY, (1,), 90),
     Step(NETWORKS, EASY, (1,), 30),
     Step(("paper-cnn",), ("lopo",), (1,), 170),
 )
@@ -107,7 +116,7 @@ QUICK = {
 }
 QUICK_STEPS = (
     Step(BASELINES, ALL, (1, 2), 0.3),
-    Step((*NEIGHBOURS, "minirocket", "filter-bank", "st-hmp", "compact", *NETWORKS), ("lopo", "hard"), (1,), 1),
+    Step((*NEIGHBOURS, "minirocket", "filter-bank", "st-hmp", *OWN, *NETWORKS), ("lopo", "hard"), (1,), 1),
     Step(("paper-cnn",), ("hard", "lopo"), (1,), 15, means_removed=True),
     Step(("paper-cnn",), ("hard",), (1,), 15),
 )
@@ -152,30 +161,101 @@ class Outcome:
         return np.asarray(self.logits.argmax(1) == self.labels)
 
 
-def run(out: Path, quick: bool, where: Where, log: Log = lambda line: None, effort: Effort = FULL_EFFORT) -> Path:
+def run(
+    out: Path,
+    quick: bool,
+    where: Where,
+    log: Log = lambda line: None,
+    effort: Effort = FULL_EFFORT,
+    only: Sequence[str] = (),
+) -> Path:
     """Train and test all of the plan, write results.json, the pictures and the page into `out`; the page's path.
 
-    quick: a few sweeps and iterations of everything, whatever `effort` says. Raises FormatError as evaluate.
+    quick: a few sweeps and iterations of everything, whatever `effort` says. only: methods that are run; all others stay as
+    an earlier run left them in `out`. Raises FormatError as evaluate, and where `only` has none of the plan's methods.
     """
-    start = time.monotonic()
     parts, steps = (QUICK, QUICK_STEPS) if quick else (FULL, FULL_STEPS)
     effort = QUICK_EFFORT if quick else effort
-    outcomes = list(_outcomes(parts, steps, where, effort, log))
-    results = summary(outcomes, parts, effort) | {
-        "quick": quick,
-        **score.provenance(),
-        "took_s": round(time.monotonic() - start),
-    }
-    put(out / "results.json", _lines(results).encode(), parents=True)
+    outcomes = list(_outcomes(parts, narrowed(steps, only) if only else steps, where, effort, log))
+    found = summary(outcomes, parts, effort) | score.provenance() | {"quick": quick}
+    if only:
+        found = joined(found, planned(_results(out), steps))
+    put(out / "results.json", _lines(found).encode(), parents=True)
     return draw(out)
 
 
-def draw(out: Path) -> Path:
-    """The pictures and the page of results.json in `out`; the page's path. Raises FormatError where it is not there."""
+def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
+    """The steps with these methods alone. Raises FormatError for one that no step has."""
+    known = dict.fromkeys(m for step in steps for m in step.methods)
+    for name in only:
+        if name not in known:
+            raise FormatError(f"method {name!r} is not in the paper's experiment; use some of {', '.join(known)}")
+    kept = [replace(step, methods=tuple(m for m in step.methods if m in only)) for step in steps]
+    return [step for step in kept if step.methods]
+
+
+def planned(found: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
+    """What `found` has of methods that are still in the plan."""
+    known = {m for step in steps for m in step.methods}
+    lists = {key: [one for one in found[key] if one["method"].removesuffix(paper_values.CENTRED) in known]
+             for key in ("table", "results")}  # fmt: skip
+    tables = {key: {name: value for name, value in found[key].items() if name.removesuffix(paper_values.CENTRED) in known}
+              for key in BY_METHOD}  # fmt: skip
+    return found | lists | tables
+
+
+def joined(found: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
+    """Two results.json as one: of what both have, `found` counts. Raises FormatError where one of them is a quick run."""
+    if found["quick"] != earlier["quick"]:
+        raise FormatError("a quick run and a whole one cannot be joined; write the quick one to another --out")
+    lists = {key: [*(one for one in earlier[key] if _at(one) not in set(map(_at, found[key]))), *found[key]]
+             for key in ("table", "results")}  # fmt: skip
+    tables = {k: earlier[k] | found[k] for k in BY_METHOD}
+    return earlier | found | tables | lists
+
+
+def _at(one: dict[str, Any]) -> tuple[Any, ...]:
+    """Part, method and world, or worlds, of a line."""
+    return one["part"], one["method"], one.get("means_removed"), one.get("world")
+
+
+def _results(out: Path) -> dict[str, Any]:
+    """results.json in `out`. Raises FormatError where it is not there."""
     try:
         results: dict[str, Any] = json.loads((out / "results.json").read_bytes())
     except (OSError, ValueError) as e:
-        raise FormatError(f"{out}/results.json is not of the paper's experiment: {e}; run it without --draw") from e
+        raise FormatError(f"{out}/results.json is not of the paper's experiment: {e}; run all of it first") from e
+    return results
+
+
+def as_printed(curve: dict[str, Any], parts: dict[str, PaperPart]) -> dict[str, Any]:
+    """A summary of the paper's CNN from what cnn_curve has followed so far, as its newest point."""
+    point, ran = curve["points"][-1], f"{curve['points'][-1]['step']} of {curve['steps']} iterations of 50"
+    outcomes = []
+    for part, name in CURVE_PARTS.items():
+        newest = {k: np.array(v) for k, v in curve["newest"][name].items()}
+        about = {"part": part, "method": paper_values.CNNS[0], "world": curve["about"][1], "means_removed": False, "ran": ran,
+                 "confusion": point[f"{name} confusion"], "fit_s": None, "ms_p50": None, "agreement": None,
+                 "materials": list(skin.MATERIALS), "commit": curve["commit"], "machine": curve["machine"]}  # fmt: skip
+        costs = [np.array([[p["step"], p["cost"]] for p in curve["points"]])] if part == "lopo" else []
+        outcomes.append(Outcome(part, paper_values.CNNS[0], curve["about"][1], newest["labels"],
+                                newest["logits"], newest["position"], costs, about))  # fmt: skip
+    reached = {"step": point["step"], "steps": curve["steps"], "commit": curve["commit"]}
+    return summary(outcomes, parts, Effort(paper_steps=curve["steps"])) | {"curve": reached}
+
+
+def draw(out: Path) -> Path:
+    """The pictures and the page of results.json in `out`, which takes up CURVE where it lies there; the page's path.
+
+    Raises FormatError where results.json is not there, or CURVE is of another training.
+    """
+    results = _results(out)
+    if (out / CURVE).exists():
+        curve = json.loads((out / CURVE).read_bytes())
+        if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
+            raise FormatError(f"{out / CURVE} is not the CNN as printed; run palpate-train cnn-curve --size whole")
+        results = joined(as_printed(curve, FULL) | {"quick": results["quick"]}, results)
+        put(out / "results.json", _lines(results).encode())
     page, pictures = paper_report.render(results, box_on_hard(out.parent / BOX_ON_HARD))
     return html.publish(out, {"index": page}, pictures, provenance.of(results))
 
@@ -233,9 +313,14 @@ def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
         "part": part, "method": method, "worlds": [o.world for o in those], "right": int(right.sum()),
         "total": len(right), "share": estimate(right, place), "printed": paper_values.ACCURACY[part].get(method),
         "attachments": [len(each), round(min(each), 4), round(max(each), 4)], "ran": those[0].about["ran"],
-        **{k: round(float(np.median([o.about[k] for o in those])), 4) for k in ("fit_s", "ms_p50")},
-        "agreement": min(o.about["agreement"] for o in those),
+        **{k: _median([o.about[k] for o in those]) for k in ("fit_s", "ms_p50")},
     }  # fmt: skip
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    """None where one was not measured."""
+    measured = [value for value in values if value is not None]
+    return round(float(np.median(measured)), 4) if len(measured) == len(values) else None
 
 
 def estimate(right: Array, place: Array) -> list[float]:

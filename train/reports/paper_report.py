@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from train.models.methods import SHIPPED
 from train.reports import html, plots, provenance
 from train.reports.formatting import estimate, exact_percent, seconds
 from train.reports.paper_values import CNNS, CONFUSION, COST, FIGURES, SEVERAL, display_name, short_name
@@ -24,9 +23,13 @@ TITLES = {
     "random": "T-REAL, random folds",
 }
 """Hard protocols first."""
+HARD = ("lopo", "hard")
+"""The protocols that the paper is about."""
 COLUMNS = {"lopo": "T-REAL\nleave position", "hard": "T-HARD", "lab": "T-LAB\nrandom", "random": "T-REAL\nrandom"}
 FIVE = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 BEST = "H-svm"
+OWN = ("default-reattached", "default")
+"""Ours, that of the packaged bundle first."""
 NEAR, NEAR_ON_AVERAGE = 0.06, 0.03
 """What the calibration aims at."""
 Row = Mapping[str, Any]
@@ -61,25 +64,24 @@ class PaperReport:
         self.summary = summary
         self.rows: dict[Key, Row] = {(row["part"], row["method"]): row for row in summary["table"]}
         self.cnns = [method for method in CNNS if ("lopo", method) in self.rows]
+        self.own = [method for method in OWN if ("hard", method) in self.rows or ("lopo", method) in self.rows]
 
     def pictures(self) -> dict[str, str]:
         """All pictures by name."""
         drawn = {f"figure-{number}": self._bars(number, part) for part, number in FIGURES.items()}
         if self.cnns:
-            groups = {
-                TITLES[part]: [self._bar(at) for at in self._compared() if at[0] == part] for part in ("lopo", "hard")
-            }
+            groups = {TITLES[part]: [self._bar(at) for at in self._compared() if at[0] == part] for part in HARD}
             names, confusion = self.summary["results"][0]["materials"], self.summary["confusion"]
             drawn |= {
                 "figure-9": plots.curve(self._costs(), COST, "Fig. 9: cost in training"),
-                "figure-10": plots.bars({k: v for k, v in groups.items() if v}, "Fig. 10: H-svm and the CNN"),
+                "figure-10": plots.bars({k: v for k, v in groups.items() if v}, "Fig. 10: H-svm, the CNN and ours"),
                 "figure-11": plots.confusion(
                     np.array(confusion[self.cnns[0]]), names, "Fig. 11: confusion of the CNN", CONFUSION
                 ),
                 "figure-12": plots.confusion(np.array(confusion[BEST]), names, "Fig. 12: confusion of H-svm"),
             }
         several = self.summary["several"]
-        shown = {short_name(m): several[m] for m in (BEST, *self.cnns, "compact") if m in several}
+        shown = {short_name(m): several[m] for m in (BEST, *self.cnns[:1], *self.own[:1]) if m in several}
         printed = {short_name(m): values for m, values in SEVERAL.items()}
         cells: dict[Key, plots.Estimate] = {
             (display_name(method).replace("paper-cnn,", "cnn,"), COLUMNS[part]): tuple(row["share"])
@@ -95,16 +97,16 @@ class PaperReport:
         summary, table = self.summary, self.summary["table"]
         sets = [[TITLES[k], ", ".join(map(_readable, part["sets"])) + (f" ({', '.join(part['only'])})" if part["only"] else ""),
                  part["protocol"]] for k, part in self._ordered(summary["parts"])]  # fmt: skip
-        trained = {row["method"]: row for row in table if row["ran"]}
+        trained = {row["method"]: row for row in table if row["ran"] and row["method"] not in OWN}
         return {
-            "quick": summary["quick"], "shipped": any(method == SHIPPED for _, method in self.rows), "commit": summary["commit"], "machine": summary["results"][0]["machine"],
-            "took_s": summary["took_s"], "evaluations": len(summary["results"]),
+            "quick": summary["quick"], "commits": self._commits(), "machine": summary["results"][0]["machine"],
+"evaluations": len(summary["results"]),
             "method_count": len({method for _, method in self.rows}),
             "world_count": len({world for row in table for world in row["worlds"]}),
             "sets": sets, "own_seeds": any("{a}" in name for part in summary["parts"].values() for name in part["sets"]),
-            "reference": BEST, "networks": [display_name(method) for method in CNNS],
-            "trainings": [[display_name(m), row["ran"], seconds(row["fit_s"])] for m, row in trained.items()],
-            "methods": summary["methods"], "overview": [self._overview(part) for part in TITLES], "match": self._match(),
+            "reference": BEST, "short": [TITLES[part] for part in HARD],
+            "trainings": [[display_name(m), row["ran"], "–" if row["fit_s"] is None else seconds(row["fit_s"])] for m, row in trained.items()],
+            "methods": summary["methods"], "overview": [self._overview(method) for method in (BEST, *self._shown())], "match": self._match(),
         }  # fmt: skip
 
     def figures(self) -> dict[str, Any]:
@@ -137,12 +139,16 @@ class PaperReport:
     def network(self) -> dict[str, Any]:
         """Figs. 9 to 12; `network` is empty where the paper's CNN was not run."""
         if not self.cnns:
-            return {"network": ""}
+            return {"network": "", "curve": None, "own": [short_name(m) for m in self.own]}
         names, confusion, costs = self.summary["results"][0]["materials"], self.summary["confusion"], self._costs()
-        steps = {f"{display_name(m)}: {row['ran']}" for (_, m), row in self.rows.items() if m in CNNS}
+        steps = {row["ran"] for (_, m), row in self.rows.items() if m == self.cnns[0]}
         return {
             "network": display_name(self.cnns[0]),
+            "centred": self.cnns[0] != CNNS[0],
+            "curve": self.summary.get("curve"),
+            "own": [short_name(m) for m in self.own],
             "final_cost": float(np.median([cost[-1, 1] for cost in costs])) if costs else None,
+            "folds": len(costs),
             "iterations": sorted(steps),
             "compared": self._numbers(self._compared()),
             "confusions": {
@@ -151,12 +157,24 @@ class PaperReport:
             },
         }
 
-    def _overview(self, part: str) -> list[str]:
-        """One line of the summary at the top: the reference method, the networks and the best of all."""
-        shares = {method: row["share"] for (its_part, method), row in self.rows.items() if its_part == part}
-        best = max(shares, key=lambda method: shares[method][0])
-        own = [estimate(shares[m], 0) if m in shares else "–" for m in (BEST, *CNNS)]
-        return [TITLES[part], *own, f"{display_name(best)} {estimate(shares[best], 0)}"]
+    def _shown(self) -> list[str]:
+        """The paper's network, or the form of it that was run, and ours."""
+        return [*self.cnns[:1], *self.own]
+
+    def _commits(self) -> list[list[str]]:
+        """Each commit, and the methods whose results are of it; the one with the most results last."""
+        by_commit: dict[str, dict[str, None]] = {}
+        for result in self.summary["results"]:
+            by_commit.setdefault(result["commit"], {})[result["method"]] = None
+        return [
+            [commit, ", ".join(those)] for commit, those in sorted(by_commit.items(), key=lambda item: len(item[1]))
+        ]
+
+    def _overview(self, method: str) -> dict[str, Any]:
+        """One line of the summary at the top: its result in each of HARD, None where there is none."""
+        rows = [self.rows.get((part, method)) for part in HARD]
+        return {"name": display_name(method), "rows": rows,
+                "ran": next((row["ran"] for row in rows if row and method in CNNS), "")}  # fmt: skip
 
     def _match(self) -> dict[str, Any]:
         """How far the simulator is from the printed accuracies of the five classical methods."""
@@ -185,7 +203,7 @@ class PaperReport:
 
     def _compared(self) -> list[Key]:
         """What Fig. 10 compares."""
-        return [(part, m) for part in ("lopo", "hard") for m in (BEST, *CNNS) if (part, m) in self.rows]
+        return [(part, m) for part in HARD for m in (BEST, *self._shown()) if (part, m) in self.rows]
 
     def _costs(self) -> list[NDArray[Any]]:
         return [np.array(cost) for cost in self.summary["costs"][self.cnns[0]]]

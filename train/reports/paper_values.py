@@ -51,4 +51,4 @@ def display_name(method: str) -> str:
 
 def short_name(method: str) -> str:
     """A name that fits beside a bar and above a panel."""
-    return "centred" if method.endswith(CENTRED) else method
+    return "centred" if method.endswith(CENTRED) else method.removeprefix("default-")

@@ -19,10 +19,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, Formatter, NullFormatter, NullLocator
 
 ACCENT, BLACK, GREY, FAINT, WHITE = "#0b66c3", "#1f2328", "#59636e", "#d1d9e0", "#fefefe"
-ROLES = {"accent": ACCENT, "text": BLACK, "grey": GREY, "faint": FAINT, "background": WHITE}
+ORANGE, GREEN, PURPLE = "#b04a00", "#007a5e", "#8b3fb8"
+"""Where pictures need more colours than one; each has a contrast of 5 and more on the background."""
+ROLES = {
+    "accent": ACCENT, "text": BLACK, "grey": GREY, "faint": FAINT, "background": WHITE, "orange": ORANGE, "green": GREEN,
+    "purple": PURPLE,
+}  # fmt: skip
 COLOURS = {colour: f"var(--{role}, {colour})" for role, colour in ROLES.items()}
 """What stands in an SVG for each of them."""
-DARK_ROLES = {"accent": "#58a6ff", "text": "#e6edf3", "grey": "#9ea7b3", "faint": "#343b44", "background": "#0d1117"}
+DARK_ROLES = {
+    "accent": "#58a6ff", "text": "#e6edf3", "grey": "#9ea7b3", "faint": "#343b44", "background": "#0d1117",
+    "orange": "#f0883e", "green": "#3fb68b", "purple": "#c297ff",
+}  # fmt: skip
 """Colours of the same roles for readers who chose dark."""
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu Sans', sans-serif"
 WIDTH = 5.0

@@ -1,4 +1,4 @@
-"""Pictures of results. In: numbers, as evaluate, paper and stress give them. Out: SVG text.
+"""Pictures of results. In: numbers, as evaluate and paper give them. Out: SVG text.
 
 Our results are in the accent colour, values printed in the paper are hollow diamonds; all else is grey.
 """
@@ -27,6 +27,7 @@ from train.reports.plot_style import (
     WIDTH,
     add_axes,
     set_ticks,
+    set_titles,
     single_axes,
     tiles,
     to_svg,
@@ -64,7 +65,7 @@ def bars(groups: Mapping[str, Sequence[Bar]], about: str, chance: float = 0.0) -
     groups: rows by heading ("" for none). chance: share right of a random guess, drawn as a line.
     """
     lines = [line for heading, rows in groups.items() for line in ([heading] if heading else []) + list(rows)]
-    figure, axes = single_axes(len(lines) * 0.29 + 0.6, left=0.21, right=0.63, top=0.32, bottom=0.28)
+    figure, axes = single_axes(len(lines) * 0.29 + 0.75, left=0.21, right=0.63, top=0.32, bottom=0.43)
     for y, line in enumerate(lines):
         if isinstance(line, str):
             write(axes, -0.48, y, line, ha="left", weight="bold")
@@ -77,6 +78,7 @@ def bars(groups: Mapping[str, Sequence[Bar]], about: str, chance: float = 0.0) -
     axes.grid(axis="x", color=FAINT, linewidth=0.7)
     set_ticks(axes.xaxis, [0, 0.25, 0.5, 0.75, 1], percent=True)
     set_ticks(axes.yaxis, [])
+    set_titles(axes, "sweeps named rightly")
     if chance:
         axes.axvline(chance, color=GREY, linewidth=1, linestyle=(0, (2, 2)))
         write(axes, chance, -0.9, "random guess", GREY, SMALL)
@@ -121,8 +123,7 @@ def curve(costs: Sequence[Array], printed: Sequence[tuple[int, float]], about: s
     axes.grid(color=FAINT, linewidth=0.6)
     set_ticks(axes.xaxis, [1, 10, 100, 1000, 4000])
     set_ticks(axes.yaxis, [tick for tick in (1e-5, 1e-4, 1e-3, 0.01, 0.1, 1) if tick >= axes.get_ylim()[0]])
-    axes.set_xlabel("iteration", color=GREY, size=SMALL)
-    axes.set_title("cross entropy of a batch   ◇ printed", color=GREY, size=SMALL, loc="left", pad=5)
+    set_titles(axes, "iteration", "cross entropy   ◇ printed")
     return to_svg(figure, about)
 
 
@@ -153,10 +154,10 @@ def sweeps(
 ) -> str:
     """A panel for each method: share right after one, two, three … sweeps, by "product" and by "vote"."""
     lowest = min(e[1] for rules in ours.values() for line in rules.values() for e in line)
-    bottom, figure = max(np.floor(lowest * 10) / 10, 0), Figure((WIDTH, 2.5))
+    bottom, figure = max(np.floor(lowest * 10) / 10, 0), Figure((WIDTH, 2.7))
     for i, (name, rules) in enumerate(ours.items()):
         left = 0.09 + 0.91 * i / len(ours)
-        axes = add_axes(figure, left, left + 0.91 / len(ours) - 0.04, top=0.86, bottom=0.18)
+        axes = add_axes(figure, left, left + 0.91 / len(ours) - 0.04, top=0.86, bottom=0.24)
         count = _fusion_panel(axes, rules, printed.get(name, ()))
         axes.set_title(name, color=BLACK, size=MEDIUM, loc="left", pad=6)
         axes.set_xlim(0.7, count + 0.3)
@@ -164,11 +165,13 @@ def sweeps(
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
         set_ticks(axes.xaxis, range(1, count + 1))
         set_ticks(axes.yaxis, np.arange(bottom, 1.01, 0.1 if bottom > 0.3 else 0.2), percent=True, bare=i > 0)
+    line: dict[str, Any] = {"y": 0.1, "va": "center", "ha": "left", "color": GREY, "size": SMALL}
+    figure.supxlabel("sweeps of one tube to the right,", x=0.09, **line)
+    figure.supylabel("share named rightly upwards", x=0.51, rotation=0, **line)
     for x, text, colour in (
-        (0.01, "sweeps", GREY),
-        (0.4, "● product", ACCENT),
-        (0.62, "● vote", GREY),
-        (0.78, "◇ printed", BLACK),
+        (0.09, "● product", ACCENT),
+        (0.4, "● vote", GREY),
+        (0.65, "◇ printed", BLACK),
     ):
         figure.text(x, 0.02, text, color=colour, size=SMALL)
     return to_svg(figure, about)
@@ -183,7 +186,7 @@ def _fusion_panel(axes: Axes, rules: Mapping[str, Sequence[Estimate]], printed: 
     for rule, (look, away) in looks.items():
         mean, low, high = np.array(rules[rule]).T
         n = np.arange(1, len(mean) + 1)
-        axes.fill_between(n, low, high, color=look["color"], alpha=0.13, linewidth=0)
+        axes.fill_between(n, low, high, color=look["color"], alpha=0.1, linewidth=0)
         axes.plot(n, mean, marker="o", markersize=3, **look)
         for at in list(zip(n, mean, strict=True))[rule == "vote" :]:  # one sweep is the same by both
             axes.annotate(f"{100 * at[1]:.0f}", at, (0, away), textcoords="offset points", color=look["color"], size=SMALL,
@@ -246,54 +249,6 @@ def _table(axes: Axes, panel: Grid, names: Sequence[str]) -> None:
             if (name, column) in panel:
                 _cell(axes, i, j, panel[name, column])
     tiles(axes, len(names), len(columns))
-
-
-def robustness(
-    results: Mapping[str, Any], strong: Sequence[str], about: str = "methods under stress", columns: int = 3
-) -> str:
-    """What train.evaluation.robustness.merge gives: share right over severity, a small picture for each corruption.
-
-    strong: two methods at most that are shown with their bands; all others are thin.
-    """
-    curves = {name: entry["curves"] for name, entry in results["methods"].items() if entry["curves"]}
-    looks = dict(zip([name for name in strong if name in curves], STRONG, strict=False))
-    named = list(dict.fromkeys(name for those in curves.values() for name in those))
-    rows, above, each = -(-len(named) // columns), 0.3, 1.36
-    figure = Figure((WIDTH, above + rows * each))
-    inch = 1 / figure.get_figheight()
-    for i, (text, colour) in enumerate(
-        [(f"{mark} {name}", look["color"]) for mark, (name, look) in zip("━╍", looks.items(), strict=False)]
-        + [("thin: the others", GREY)]
-    ):
-        figure.text(0.01 + 0.3 * i, 1 - 0.16 * inch, text, color=colour, size=SMALL + 0.5)
-    for i, name in enumerate(named):
-        row, column = divmod(i, columns)
-        left, bottom = 0.09 + 0.91 * column / columns, ((rows - 1 - row) * each + 0.38) * inch
-        axes = add_axes(figure, left, left + 0.91 / columns - 0.045, bottom + 0.72 * inch, bottom)
-        _corruption(axes, name, {method: those[name] for method, those in curves.items() if name in those}, looks)
-        set_ticks(axes.yaxis, [0, 0.5, 1], percent=True, bare=column > 0)
-    return to_svg(figure, about)
-
-
-def _corruption(axes: Axes, name: str, curves: Mapping[str, Any], looks: Mapping[str, Any]) -> None:
-    """One corruption: all methods, those with a look last and with their bands."""
-    for method, result in sorted(curves.items(), key=lambda item: item[0] in looks):
-        x = result["severities"]
-        if method in looks:
-            axes.fill_between(x, result["low"], result["high"], color=looks[method]["color"], alpha=0.13, linewidth=0)
-        axes.plot(x, result["accuracy"], **looks.get(method, THIN))
-    axes.set_title(name, color=BLACK, size=SMALL + 0.5, loc="left", pad=3)
-    axes.set_xlim(x[0], x[-1])
-    axes.set_ylim(0, 1.02)
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
-    unit = result["unit"]
-    if unit.startswith(("share", "of ")):
-        set_ticks(axes.xaxis, [x[0], x[-1]], f"% {unit.removeprefix('share').strip()}".strip(), 100)
-    else:
-        set_ticks(axes.xaxis, [x[0], x[-1]], unit)
-    first, last = axes.get_xticklabels()
-    first.set_horizontalalignment("left")
-    last.set_horizontalalignment("right")
 
 
 def _ease(protocol: str) -> int:

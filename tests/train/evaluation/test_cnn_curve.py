@@ -70,12 +70,19 @@ def test_a_curve_has_all_its_points(tmp_path: Path) -> None:
     assert json.loads(out.read_text()) == json.loads(json.dumps(result))
     assert [point["step"] for point in result["points"]] == [2, 4, 7]
     for point in result["points"]:
+        assert point["cost"] > 0
         for name, total in (("new", 54), ("hard", 12)):
             confusion = np.array(point[f"{name} confusion"])
             share, low, high = point[name]
             assert confusion.sum() == total
             assert share == pytest.approx(np.trace(confusion) / total, abs=1e-4)
             assert 0 <= low <= share <= high <= 1
+    for name in ("new", "hard"):
+        newest = {k: np.array(v) for k, v in result["newest"][name].items()}
+        right = newest["logits"].argmax(1) == newest["labels"]
+        assert right.mean() == pytest.approx(result["points"][-1][name][0], abs=1e-4)
+        assert newest["position"].shape == newest["labels"].shape
+    assert result["steps"] == 7
     assert [path.name for path in out.parent.iterdir()] == ["curve.json"]
     assert follow(out, stop_at=1) == json.loads(out.read_text())
 

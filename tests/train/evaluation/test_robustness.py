@@ -15,7 +15,6 @@ from onnx import TensorProto, helper
 
 from appliance.bundle import bundle
 from appliance.core.errors import FormatError
-from appliance.core.statistics import wilson
 from appliance.core.types import Status, SweepFormat
 from appliance.sim import skin
 from train.data.sets import Dataset
@@ -349,7 +348,9 @@ def test_the_fall_is_between_two_severities():
 
 def task(method: str, seed: int, right: list[int], **more) -> dict:
     """What `evaluate_method` returns, by hand: 20 sweeps under one corruption."""
-    curve = {"unit": "taxels", "about": "", "severities": [0.0, 1.0, 2.0], "right": right, "broken": [0, 0, 1]}
+    ends = {"low": [n / 20 - 0.1 for n in right], "high": [n / 20 + 0.05 for n in right]}
+    curve = {"title": "dead taxels", "unit": "taxels", "about": "", "severities": [0.0, 1.0, 2.0], "right": right,
+             "broken": [0, 0, 1]} | ends  # fmt: skip
     return {"method": method, "seed": seed, "set": "x", "refused": "", "total": 20, "ran": "", "trouble": {},
             "curves": {"dead": curve}} | more  # fmt: skip
 
@@ -362,42 +363,30 @@ def test_merged_by_hand():
     curve = result["methods"]["a"]["curves"]["dead"]
     assert (curve["right"], curve["total"], curve["broken"]) == ([38, 34, 12], 40, [0, 0, 2])
     assert curve["accuracy"] == [0.95, 0.85, 0.3]
-    assert curve["low"] == [round(wilson(19, 20)[0], 4), round(wilson(17, 20)[0], 4), 0.1]
-    assert curve["high"] == [1.0, round(wilson(17, 20)[1], 4), round(wilson(6, 20)[1], 4)]
+    assert curve["low"] == [0.85, 0.75, 0.1], "the mean of both intervals, or the worse seed"
+    assert curve["high"] == [1.0, 0.9, 0.5], "the mean of both intervals, or the better seed"
     assert curve["falls"] == pytest.approx(0.5)
     assert curve["lost"] == pytest.approx((0.1 + 0.65) / 2)
     assert result["methods"]["b"]["curves"]["dead"]["falls"] is None
 
 
-def test_the_worst_come_first():
-    """By the mean loss over the severities; as many as asked for."""
-    found = {name: {"lost": lost, "falls": None, "unit": "x"} for name, lost in (("a", 0.1), ("b", 0.3), ("c", 0.2))}
-    worst = robustness.worst({"methods": {"m": {"curves": found}}}, "m", 2)
-    assert [w["stress"] for w in worst] == ["b", "c"]
+def test_what_breaks_first_comes_first():
+    """By the part of its range that it takes; of two alike what loses more; what never falls is left out."""
+    found = {name: {"lost": lost, "falls": fall, "severities": [0, most]} for name, lost, fall, most in
+             (("a", 0.1, 1.0, 4), ("b", 0.3, 0.1, 0.2), ("c", 0.2, None, 1), ("d", 0.2, 0.25, 1))}  # fmt: skip
+    assert robustness.breaks_first(found) == ["d", "a", "b"]
 
 
-def test_the_table_says_where_each_falls():
-    """A column for each method, a row for each corruption; "never" is more than the severest; a refusal has its reason."""
-    refused = {"method": "c", "seed": 0, "set": "x", "refused": "too short"}
-    text = robustness.table(robustness.merge([task("a", 0, [18, 16, 10]), task("b", 0, [10, 10, 10]), refused]))
-    assert "| accuracy lost by .05 at | a | b |" in text
-    assert "| dead 1 | 80.0 [58.4, 91.9] | 50.0 [29.9, 70.1] |" in text
-    assert "| *no stress: accuracy* | 0.900 | 0.500 |" in text
-    assert "| dead (taxels) | 0.5 | > 2 |" in text
-    assert "- a: worst, by the mean loss over all severities: dead −0.25" in text
-    assert "- c: too short" in text
-
-
-def test_the_table_shows_the_answers_to_uninformative_sweeps():
-    """How many methods give which answer, and the box's status where it is known."""
-    result = robustness.merge(
-        [robustness.evaluate_method(FAKE, small(), EvaluationSweeps(small()), corruptions.find(["hum"]), 0)]
-    )
-    lines = robustness.table(
-        result | {"box": dict.fromkeys(("constant", "saturated"), "x") | {"one-frame": "short", "silent": "no-contact"}}
-    ).splitlines()
-    assert "- one-frame: 1 methods refused; the box: short" in lines
-    assert "- silent: 1 methods finite; the box: no-contact" in lines
+def test_intervals_are_by_attachment():
+    """Sweeps of one attachment fail together: the interval is wider than of as many that do not."""
+    by_place = replace(small(), groups={"position": np.repeat([0, 1, 2], 4)})
+    right = np.repeat([True, True, False], 4)
+    widths = []
+    for sweeps in (small(), by_place):
+        trials = robustness.CorruptionCounts(EvaluationSweeps(sweeps))
+        trials.add(BY_NAME["dead"], [(right, 0)])
+        widths.append(trials.curves["dead"]["high"][0] - trials.curves["dead"]["low"][0])
+    assert widths[1] > widths[0] + 0.2
 
 
 def test_one_task_travels_and_counts():
@@ -421,6 +410,9 @@ def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pyte
     where = Where(jobs=1, cache=tmp_path)
     first = robustness.run(["a", "b"], sweeps, trial, where, seeds=(1, 2), log=lines.append)
     assert [line.split(" done")[0] for line in lines] == ["1/4", "2/4", "3/4", "4/4"]
+    assert [line.partition("a under" if i in (0, 2) else "b under")[1] != "" for i, line in enumerate(lines)] == [
+        True
+    ] * 4
     assert first["methods"]["b"]["seeds"] == [1, 2]
     monkeypatch.setattr(robustness, "evaluate_method", None)
     assert robustness.run(["a", "b"], sweeps, trial, where, seeds=(1, 2)) == first

@@ -45,7 +45,8 @@ def paper_facts(summary: Any) -> Facts:
         mean, low, high = row["share"]
         yield f"{number(mean)} % {number(low)} – {number(high)} %"
         yield f"{row['right']} / {row['total']} {len(row['worlds'])} {row['ms_p50']:.2f}"
-    yield f"Commit {summary['commit']}, on {summary['results'][0]['machine']}"
+    yield from (f"Commit {commit}" for commit in {one["commit"] for one in summary["results"]})
+    yield f"On {summary['results'][0]['machine']}"
     yield f"{len(summary['results'])} evaluations"
     yield from summary["methods"].values()
     yield from (

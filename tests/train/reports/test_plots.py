@@ -10,7 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from train.reports import paper_values, plot_style, plots
+from tests.factories import stress_data
+from train.reports import paper_values, plot_style, plots, stress_plots
 
 SVG = "{http://www.w3.org/2000/svg}"
 ESTIMATE = (0.864, 0.81, 0.903)
@@ -27,12 +28,6 @@ def result(method: str, protocol: str, right: int, means_removed: bool = True, s
     }  # fmt: skip
 
 
-def under_stress(method: str) -> dict:
-    """An entry of what stress.merge gives."""
-    curve = {"severities": [0, 0.25, 0.5], "accuracy": [0.9, 0.8, 0.3], "low": [0.8, 0.7, 0.2], "high": [1, 0.9, 0.4]}
-    return {method: {"curves": {"dead": curve | {"unit": "taxels"}, "gain-up": curve | {"unit": "share"}}}}
-
-
 PICTURES: dict[str, Callable[[], str]] = {
     "bars": lambda: plots.bars({"T-HARD": [plots.Bar("H-svm", ESTIMATE, 0.7)]}, "bars of H & L", chance=1 / 6),
     "curve": lambda: plots.curve([np.array([[0, 1.8], [100, 0.3]])] * 2, [(500, 0.08)], "cost"),
@@ -40,7 +35,10 @@ PICTURES: dict[str, Callable[[], str]] = {
     "confusion": lambda: plots.confusion(COUNTS, NAMES, "confusion", COUNTS / 10),
     "sweeps": lambda: plots.sweeps({"H-svm": dict.fromkeys(("vote", "product"), [ESTIMATE] * 3)}, {}, "sweeps"),
     "matrix": lambda: plots.matrix([result("H-svm", "leave:force", 70)]),
-    "stress": lambda: plots.robustness({"methods": under_stress("compact")}, ["compact"]),
+    "stress": lambda: stress_plots.methods(
+        {name: entry["curves"] for name, entry in stress_data.figures()["methods"].items() if entry["curves"]}
+    ),
+    "box under stress": lambda: stress_plots.box(stress_data.figures()["box"]["curves"]),
 }
 
 
@@ -141,17 +139,10 @@ def test_matrix_takes_the_mean_over_seeds_and_counts_what_it_is_told():
     assert {"40", "31–52"} <= set(words(plots.matrix(results, count="recording")))
 
 
-def test_stress_has_a_picture_each_with_its_unit():
-    """Every stress once, its greatest severity with the unit, shares as per cent; strong methods are named."""
-    shown = words(plots.robustness({"methods": under_stress("compact") | under_stress("L-knn")}, ["compact"]))
-    assert {"dead", "gain-up", "0.5 taxels", "50 %", "━ compact"} <= {text.strip() for text in shown}
-    assert "━ L-knn" not in shown
-
-
 def test_titles_of_panels_do_not_collide():
     """Each title of several sweeps ends before the next begins, by a generous guess of its width."""
     rules = dict.fromkeys(("vote", "product"), [ESTIMATE] * 3)
-    names = ["H-svm", *map(paper_values.short_name, paper_values.CNNS), "compact"]
+    names = ["H-svm", *map(paper_values.short_name, (paper_values.CNNS[0], "default-reattached"))]
     at = places(plots.sweeps(dict.fromkeys(names, rules), {}, "sweeps"))
     ends = [(at[name][0], at[name][0] + 0.65 * plot_style.MEDIUM * len(name)) for name in names]
     assert all(end < begin for (_, end), (begin, _) in pairwise(ends))

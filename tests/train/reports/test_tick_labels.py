@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter
 
 from appliance.core.types import SweepFormat
-from tests.factories import choice_data, development_data
+from tests.factories import choice_data, development_data, stress_data
 from tests.factories.chart_data import DOTS
 from tests.factories.paths import ROOT
 from tests.rig import soak_page
@@ -31,6 +31,7 @@ from train.reports import (
     plots,
     scatter,
     selection_plots,
+    stress_report,
     sweep_plot,
     uncertainty_report,
 )
@@ -58,7 +59,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
     "certainty": lambda: uncertainty_report.render(committed("certainty/results.json")),
     "chart": lambda: scatter.chart(committed("chart/chart.json")),
     "small chart": lambda: scatter.chart(DOTS, ("speed", "lopo")),
-    "stress": lambda: plots.robustness(committed("stress/results.json"), ["compact", "minirocket"]),
+    "stress": lambda: stress_report.render(stress_data.figures()),
     "matrix": lambda: plots.matrix(committed("fabricslide/results.json")),
     "alignment": lambda: contact_plot.draw(committed("alignment/place.json")),
     "choice": lambda: selection_plots.sizes(choice_data.choice()["rungs"], "compact-4k", 0.9, "sizes"),
