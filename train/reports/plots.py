@@ -186,7 +186,7 @@ def _fusion_panel(axes: Axes, rules: Mapping[str, Sequence[Estimate]], printed: 
     for rule, (look, away) in looks.items():
         mean, low, high = np.array(rules[rule]).T
         n = np.arange(1, len(mean) + 1)
-        axes.fill_between(n, low, high, color=look["color"], alpha=0.1, linewidth=0)
+        axes.fill_between(n, low, high, color=look["color"], alpha=0.07, linewidth=0)
         axes.plot(n, mean, marker="o", markersize=3, **look)
         for at in list(zip(n, mean, strict=True))[rule == "vote" :]:  # one sweep is the same by both
             axes.annotate(f"{100 * at[1]:.0f}", at, (0, away), textcoords="offset points", color=look["color"], size=SMALL,
