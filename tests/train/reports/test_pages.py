@@ -19,7 +19,18 @@ from tests.factories import choice_data
 from tests.factories.page_reader import PageReader
 from tests.factories.paths import ROOT
 from tests.rig import soak_page
-from train.reports import chart_page, formatting, html, paper_report, scatter, selection_report, uncertainty_report
+from train.evaluation.robustness import at_targets
+from train.reports import (
+    chart_page,
+    formatting,
+    html,
+    paper_report,
+    scatter,
+    selection_report,
+    stress_report,
+    uncertainty_report,
+)
+from train.reports.method_names import plain_name
 
 Facts = Iterator[str]
 
@@ -86,6 +97,18 @@ def chart_facts(dots: Any) -> Facts:
     yield f"Measured on {dots[0]['machine']}, commit {dots[0]['commit']}"
 
 
+def stress_facts(result: Any) -> Facts:
+    """Each method, its accuracy at every severity that has a limit, what the box answers there; origin."""
+    curves = {plain_name(name): entry["curves"] for name, entry in result["methods"].items()}
+    curves |= {f"box {answer}": result["box"]["curves"][answer] for answer in ("rightly", "wrongly", "network")}
+    for name, those in curves.items():
+        yield name.removeprefix("box ")
+        for mean, low, high in at_targets(those).values():
+            yield f"{number(mean)} % {number(low)} – {number(high)} %"
+    yield f"{result['test_sweeps']} of {result['test']} ({result['test_digest']})"
+    yield f"bundle {result['box']['bundle']['name']} {result['box']['bundle']['version']}, {result['box']['bundle']['id']}"
+
+
 def soak_facts(records: Any) -> Facts:
     """Boxes, sums, faults and what was run."""
     for name, box in records["boxes"].items():
@@ -129,6 +152,10 @@ PAGES: dict[str, tuple[Callable[[], str], Callable[[], Facts]]] = {
         lambda: certainty_facts(committed("certainty/results.json")),
     ),
     "chart": (lambda: chart_page.html(CHART, scatter.chart(CHART)), lambda: chart_facts(CHART)),
+    "stress": (
+        lambda: stress_report.render(committed("stress/results.json"))[0],
+        lambda: stress_facts(committed("stress/results.json")),
+    ),
     "soak": (
         lambda: soak_page.render(committed("soak/results.json"))[0],
         lambda: soak_facts(committed("soak/results.json")),

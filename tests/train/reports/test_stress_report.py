@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 
 from appliance.core.errors import FormatError
-from tests.factories import stress_data
+from tests.factories import rendered, stress_data
 from tests.factories.page_reader import PageReader
 from train.cli.main import main
 from train.reports import html, stress_plots, stress_report
@@ -121,3 +122,12 @@ def test_the_page_is_drawn_again(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main(["stress", "--draw", "--out", str(tmp_path)]) == 0
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == made
     assert json.loads(made["results.json"])["test_sweeps"] == 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", rendered.WIDTHS)
+@pytest.mark.parametrize("scheme", rendered.SCHEMES)
+def test_a_reader_sees_all_of_it(browser: Any, tmp_path: Path, width: int, scheme: str):
+    """On a phone and on a wide screen, light and dark: nothing is cut off, every axis has a title, all can be read."""
+    page = stress_report.write(stress_data.figures(), tmp_path)
+    assert rendered.faults(browser, rendered.address(page), width, scheme) == {}
