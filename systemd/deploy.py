@@ -31,7 +31,7 @@ LIMIT_S = 300
 
 @dataclass(frozen=True)
 class BundleArchive:
-    """A bundle as it is copied to boxes. sha: of its manifest, hexadecimal. name: for a person. archive: a tar of its
+    """A bundle as it is copied to boxes. sha: its name in their stores. name: for a person. archive: a tar of its
     files."""
 
     sha: str
@@ -74,7 +74,7 @@ def checked(folder: Path, signers: Path | None) -> BundleArchive:
             member.size = len(data)
             tar.addfile(member, io.BytesIO(data))
     m = loaded.manifest
-    sha = bundle.digest(files[bundle.MANIFEST])
+    sha = bundle.name(files)
     return BundleArchive(sha, f"{m.name} {m.version} ({loaded.id})", archive.getvalue())
 
 

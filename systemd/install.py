@@ -13,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from enrolment_key import make as make_enrolment_key
 from fleet import Failed, FleetBox, each, options, remedy
 from page_secrets import make as make_page_secrets
 from release import ROOT, ReleaseArchives
@@ -181,6 +182,7 @@ def prepare(release: str, board: str, signers: str) -> str:
         f"systemd-sysusers {share}/palpate.sysusers",
         f"systemd-tmpfiles --create {share}/palpate.tmpfiles",
         make_page_secrets(),
+        make_enrolment_key(),
     ]
     if signers:
         file, text = "/etc/palpate/allowed_signers", shlex.quote(signers)

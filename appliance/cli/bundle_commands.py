@@ -17,7 +17,7 @@ from appliance.cli.commands import load_settings
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError, BundleError
 from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
-from appliance.deployment.store import SHA, Store
+from appliance.deployment.store import PACKAGER, SHA, Store
 from appliance.io.usb_sensor import fits
 from appliance.runtime import assembly
 from appliance.service import status
@@ -69,7 +69,7 @@ def _entry(store: Store, sha: str, current: str, state: StoreState) -> ListedBun
     role, detail = _role(sha, current, state, store.settings)
     try:
         if sha == PACKAGED:
-            loaded, signer = bundle.load(bundle.DEFAULT), "palpate"
+            loaded, signer = bundle.load(bundle.DEFAULT), PACKAGER
         else:
             signed = store.bundles.get(sha)
             loaded, signer = signed.bundle, signed.signer
@@ -125,7 +125,7 @@ def streaming(settings: Config, store: Store) -> SweepFormat | None:
     known."""
     try:
         report = status.read(Path(settings.store.status), SystemClock().now_ns())
-        running = store.running()
+        running = store.running().bundle
     except ApplianceError:  # `palpate status` and `palpate bundles` say what is wrong with them
         return None
     return running.format if report["running"] and report["streams"] and report["bundle"] == running.id else None

@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
 from appliance.core import config
 from appliance.core.clock import SystemClock
@@ -26,6 +25,7 @@ from appliance.core.errors import ApplianceError, BundleError, ConfigError, Form
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
+from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.io import skin_profile, skins
 from appliance.io.robot_link import Command, Port
 from appliance.io.usb_sensor import fits
@@ -36,6 +36,8 @@ from appliance.service.status import StatusFile
 from appliance.service.systemd import Notifier, VerdictLog
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from appliance.alignment.live import Expected
     from appliance.deployment.shadow import Shadow
     from appliance.recording.recording import RecordingSession
@@ -66,11 +68,9 @@ def load_settings(args: argparse.Namespace) -> Config:
     return config.load(args.board, sets, folder=args.config_dir)
 
 
-def load_bundle(settings: Config) -> Bundle:
-    """The bundle that the settings ask for: the one named, the one deployed, or the packaged one."""
-    if settings.classifier.bundle:
-        return bundle.load(Path(settings.classifier.bundle))
-    return assembly.store(settings).running()
+def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
+    """The bundle that the settings ask for; see assembly.running."""
+    return assembly.running(settings, answers=answers).bundle
 
 
 def stop_flag() -> Callable[[], bool]:
@@ -87,14 +87,17 @@ def run(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     choice = None if settings.classifier.bundle else assembly.store(settings).choose()
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
-        current = choice.bundle if choice else load_bundle(settings)
+        current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
+        if settings.classifier.allow_unsigned:
+            log.warning(f"unsigned {assembly.UNSIGNED}")
         devices = open_devices(lambda: current.format)
         port = assembly.port(settings, devices)
         # not beside a trial: where the program dies, it must be clear which bundle it was
-        shadow = None if trial else _shadow(settings, current, devices, args.shadow)
+        shadow = None if trial else _shadow(args, settings, current, devices)
         facts = {
             "trial": lambda: trial.text if trial else "",
             "shadow": lambda: shadow.agreement.text if shadow else "",
+            "unsigned": lambda: assembly.UNSIGNED if settings.classifier.allow_unsigned else "",
         }
         observers: list[Observer | None] = [
             Notifier(SystemClock()), trial, shadow, *_reports(settings, current, devices.source, facts, stack),
@@ -248,12 +251,14 @@ def _feed(settings: Config, fmt: SweepFormat, source: str, model: Mapping[str, A
     return [FeedServer(path, fmt, known, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
 
 
-def _shadow(settings: Config, current: Bundle, devices: Devices, named: str | None) -> Shadow | None:
+def _shadow(args: argparse.Namespace, settings: Config, current: Bundle, devices: Devices) -> Shadow | None:
     """A candidate that classifies beside the current bundle, where one is asked for and there is one."""
     try:
         candidate = None
-        if named is not None:
-            candidate = bundle.load(Path(named)) if named else assembly.store(settings).candidate()
+        if args.shadow:
+            candidate = assembly.named(settings, Path(args.shadow), answers=not args.sim).bundle
+        elif args.shadow is not None:
+            candidate = assembly.store(settings).candidate()
         if candidate is None:
             return None
         from appliance.deployment.shadow import Shadow
@@ -270,7 +275,7 @@ def _shadow(settings: Config, current: Bundle, devices: Devices, named: str | No
 def _open_any(open_devices: OpenDevices, settings: Config) -> Devices:
     """The devices; a simulated skin sends what the bundle wants, where there is one and the skin can."""
     try:
-        return open_devices(lambda: load_bundle(settings).format)
+        return open_devices(lambda: load_bundle(settings, answers=False).format)
     except (BundleError, FormatError):
         return open_devices(None)
 
@@ -280,39 +285,73 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     settings = load_settings(args)
     devices = _open_any(open_devices, settings)
     failed = 0
-    for result in check(devices.wire(settings), lambda: load_bundle(settings), devices):
+    for result in check(devices.wire(settings), lambda: load_bundle(settings, answers=not args.sim), devices):
         print(f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}", flush=True)
         failed += not result.ok
     return 1 if failed else 0
 
 
 def run_enrol(args: argparse.Namespace, open_devices: OpenDevices) -> int:
-    """`palpate enrol`: the box takes sweeps as always; of the good ones it makes a bundle with one label more."""
+    """`palpate enrol`: the box takes sweeps as always; of the good ones it learns one label more."""
     from appliance.inference import enrolment
 
     settings = load_settings(args)
-    settings = replace(settings, classifier=replace(settings.classifier, early=False))
-    current = load_bundle(settings)
-    enrolment.admit(current, args.label)
-    enrolment.check_target(args.out, args.replace)
-    devices = open_devices(lambda: current.format)
-    stopped = stop_flag()
-    with ExitStack() as stack:
-        taken = enrolment.SweepCollector(args.good)
-        port = assembly.port(settings, devices)
-        box = assembly.box(settings, current, devices, port, stack, observers=[taken], labels=(args.label,))
-        box.run(lambda: taken.enough or stopped() or devices.finished(box.answered))
-    new = enrolment.enrol(current, args.label, taken.windows())
+    start = assembly.running(settings, answers=not args.sim)
+    key = _enrolment_key(args, settings)
+    enrolment.admit(start.bundle, args.label)
+    if args.out:
+        enrolment.check_target(args.out, args.replace)
+    new = enrolment.enrol(start.bundle, args.label, _good_sweeps(args, settings, start.bundle, open_devices))
     if new.disagreement and not args.scattered:
         raise BundleError(f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was written")
     for warning in filter(None, (new.disagreement, *new.warnings)):
         log.warning(f"warning: {warning}")
-    enrolment.write(new.files, args.out, args.replace)
+    files = enrolment.files(start.files, new, key.sign(new.file) if key else None)
+    if args.out:
+        enrolment.write(files, args.out, args.replace)
+    else:
+        assembly.store(settings).enrol(files)
     m = new.bundle.manifest
-    log.info(
-        f"{args.out}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)} labels; use it with classifier.bundle"
-    )
+    use = f"palpate install {args.out}" if key else "classifier.bundle; it is not signed"
+    how = f"use it with {use}" if args.out else "it runs on trial from the next start on: systemctl restart palpate"
+    log.info(f"{args.out or 'installed'}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)} labels; {how}")
     return 0
+
+
+def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey | None:
+    """The key that signs what is enrolled, checked before the robot sweeps. None where it is not signed: what a simulated
+    skin taught, and on a bench that allows unsigned bundles. Raises ConfigError."""
+    unsigned = "--sim" if args.sim else "classifier.allow_unsigned" if settings.classifier.allow_unsigned else ""
+    if unsigned:
+        if not args.out:
+            raise ConfigError(
+                f"with {unsigned} what is enrolled is not signed, and a box takes none such; give --out DIR"
+            )
+        return None
+    if not args.out and settings.classifier.early:
+        raise ConfigError(
+            "early answers end with an enrolment, whose labels they do not know; set classifier.early = false"
+        )
+    key = EnrolmentKey(Path(settings.store.enrolment_key))
+    key.check()
+    return key
+
+
+def _good_sweeps(
+    args: argparse.Namespace, settings: Config, current: Bundle, open_devices: OpenDevices
+) -> NDArray[Any]:
+    """The windows of as many good sweeps as are asked for. Raises ApplianceError where there are too few."""
+    from appliance.inference.enrolment import SweepCollector
+
+    settings = replace(settings, classifier=replace(settings.classifier, early=False))
+    devices = open_devices(lambda: current.format)
+    stopped = stop_flag()
+    taken = SweepCollector(args.good)
+    with ExitStack() as stack:
+        port = assembly.port(settings, devices)
+        box = assembly.box(settings, current, devices, port, stack, observers=[taken], labels=(args.label,))
+        box.run(lambda: taken.enough or stopped() or devices.finished(box.answered))
+    return taken.windows()
 
 
 def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer]:
@@ -351,7 +390,7 @@ def _expected(settings: Config, devices: Devices) -> Expected:
 
     current, fingertip = None, settings.sensor.fingertip
     try:
-        current = load_bundle(settings)
+        current = load_bundle(settings, answers=False)
     except BundleError as e:
         log.warning(f"no bundle: {e}")
     try:
@@ -370,7 +409,8 @@ def run_replay(args: argparse.Namespace) -> int:
     from appliance.runtime.replay import replay
 
     settings = load_settings(args)
-    return replay(args.file, settings, load_bundle(settings), lambda text: print(text, end="", flush=True))
+    bundle = load_bundle(settings, answers=False)
+    return replay(args.file, settings, bundle, lambda text: print(text, end="", flush=True))
 
 
 def run_config(args: argparse.Namespace) -> int:

@@ -17,6 +17,8 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from appliance.bridges import options as bridges
+from appliance.bundle import bundle as bundles
+from appliance.bundle.bundle import Bundle
 from appliance.cli import bundle_commands, commands, skin_commands, watch_commands
 from appliance.cli.commands import OpenDevices, load_bundle, load_settings, stop_flag
 from appliance.cli.parser import parser
@@ -25,7 +27,7 @@ from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.interrupts import INTERRUPTED
-from appliance.core.log import to_stderr
+from appliance.core.log import log, to_stderr
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.io import skins
@@ -94,19 +96,28 @@ def _simulated(
     return terminal.build(settings.sensor.skin, profile, fmt, acts, clock, source, remember=remember)
 
 
+def _played_bundle(settings: Config) -> Bundle:
+    """The bundle for simulated sweeps: that of the settings, or the packaged one where only others may read what was deployed."""
+    try:
+        return load_bundle(settings, answers=False)
+    except PermissionError as e:
+        log.warning(f"{e.filename}: {e.strerror}, so the packaged bundle plays; the deployed one with sudo -u palpate")
+        return bundles.load(bundles.DEFAULT)
+
+
 def run_demo(args: argparse.Namespace) -> int:
     """`palpate demo`: a dozen sweeps through a pseudo-terminal, seen from both ends."""
     from appliance.tools import demo, pseudo_terminal
 
     settings = load_settings(args)
-    bundle = load_bundle(settings)
+    bundle = _played_bundle(settings)
     args.sweeps = args.sweeps or 12
     devices = _simulated(args.sim or "skin", bundle.format, args, settings, spread=True)
     stopped = stop_flag()
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
-        show = demo.Demo(devices.robot.played, far_end, devices.clock, sys.stdout, raw=args.raw)
+        show = demo.Demo(devices.robot.played, far_end, devices.clock, sys.stdout, bundle.manifest.labels, raw=args.raw)
         box = assembly.box(_on_lines(settings), bundle, devices, port, stack)
         show.run(box, args.sweeps, lambda: stopped() or devices.finished(box.answered))
     return 0
@@ -117,7 +128,7 @@ def run_bench(args: argparse.Namespace) -> int:
     from appliance.tools import bench_process, pseudo_terminal
 
     settings = load_settings(args)
-    bundle = load_bundle(settings)
+    bundle = _played_bundle(settings)
 
     def build(devices: SimDevices, stack: ExitStack, observers: Iterable[Observer] = ()) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())

@@ -130,10 +130,13 @@ def _service_commands(
         command.add_argument("--capture", type=Path, metavar="FILE", help="write all input to FILE, for replay")
     _record_options(record)
     enrol = add(
-        "enrol", "learn one more material from a few sweeps, without training; write a new bundle", devices, trigger
+        "enrol",
+        "learn one more material from a few sweeps, without training; it runs on trial from the next start on",
+        devices,
+        trigger,
     )
     enrol.add_argument("label", metavar="LABEL", help="its name; all sweeps from now on are of this material")
-    enrol.add_argument("--out", type=Path, required=True, metavar="DIR", help="the new bundle's folder")
+    enrol.add_argument("--out", type=Path, metavar="DIR", help="write the new bundle to DIR instead of installing it")
     enrol.add_argument("--replace", action="store_true", help="replace a bundle at DIR")
     enrol.add_argument(
         "--sweeps", type=int, choices=range(1, MOST_SWEEPS + 1), default=5, dest="good", metavar="N",

@@ -133,6 +133,7 @@ class SerialConfig:
 @dataclass(frozen=True, slots=True)
 class ClassifierConfig:
     """The network. bundle: path of a bundle; "" for the one that was deployed last, or else the packaged one.
+    allow_unsigned: let a robot be answered by a `bundle` that nobody signed.
 
     fuse: rule by which the sweeps of one object are fused into one answer; "none" answers each by itself. early: answer
     while the finger still slides, as soon as the bundle's rule allows. min_probability: least probability for status
@@ -141,6 +142,7 @@ class ClassifierConfig:
     """
 
     bundle: str = ""
+    allow_unsigned: bool = False
     fuse: Literal["product", "vote", "none"] = "product"
     early: bool = False
     min_probability: float = number(0.0, 0.0, 1.0)
@@ -151,13 +153,15 @@ class ClassifierConfig:
 class StoreConfig:
     """What the box stores. folder: bundles, recordings and black box (layout: deployment/store.py).
 
-    signers: file of the keys whose bundles are accepted, in the format ALLOWED SIGNERS of ssh-keygen. status: the file
+    signers: file of the keys whose bundles are accepted, in the format ALLOWED SIGNERS of ssh-keygen. enrolment_key:
+    folder of the key with which this box signs the labels that it enrolled (deployment/enrolment_key.py). status: the file
     that `palpate status` reads, "" for none. trial_sweeps, trial_s: a new bundle is committed once it has named this
     many sweeps, or the skin has streamed for this long. black_box: number of latest sweeps to keep, 0 for none.
     """
 
     folder: str = "/var/lib/palpate"
     signers: str = "/etc/palpate/allowed_signers"
+    enrolment_key: str = "/etc/palpate/enrolment"
     status: str = "/run/palpate/status.json"
     trial_sweeps: int = number(20, 1, 100_000)
     trial_s: float = number(600.0, 1.0, 1e6)

@@ -38,8 +38,8 @@ a box must know the time."""
 DATED = re.compile(r"valid-after|valid-before|cert-authority", re.IGNORECASE)
 
 
-def verify(message: bytes, signature: bytes, signers: Path) -> str:
-    """The name of the signer, one of `signers`, who signed `message` as a bundle's manifest.
+def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAMESPACE) -> str:
+    """The name of the signer, one of `signers`, who signed `message` for this use, by default as a bundle's manifest.
 
     Raises BundleError where none of them did, and ConfigError where this cannot be checked: the file of signers is
     missing, empty or holds a line that is not understood, or ssh-keygen fails.
@@ -54,7 +54,7 @@ def verify(message: bytes, signature: bytes, signers: Path) -> str:
                 f"bundle is signed by none of those in {signers} ({_output(found)}); sign it with a key that is "
                 "there (palpate-train sign), or have the administrator add the key"
             )
-        checked = _keygen("verify", "-f", allowed, "-I", names[0], "-n", NAMESPACE, "-s", signed, message=message)
+        checked = _keygen("verify", "-f", allowed, "-I", names[0], "-n", namespace, "-s", signed, message=message)
     if checked.returncode:
         raise BundleError(
             f"signature of {names[0]} does not fit the manifest ({_output(checked)}); copy the bundle again, or sign it "
@@ -63,12 +63,13 @@ def verify(message: bytes, signature: bytes, signers: Path) -> str:
     return names[0]
 
 
-def sign(message: bytes, key: Path) -> bytes:
-    """The signature of `message`, a bundle's manifest. Asks on the terminal for what the key wants.
+def sign(message: bytes, key: Path, namespace: str = NAMESPACE, *, interactive: bool = True) -> bytes:
+    """The signature of `message`, by default as a bundle's manifest.
 
-    key: a private key, or a public one whose private key an agent holds. Raises ConfigError where it does not sign.
+    key: a private key, or a public one whose private key an agent holds. interactive: ask on the terminal for what the key
+    wants. Raises ConfigError where it does not sign.
     """
-    done = _keygen("sign", "-f", str(key), "-n", NAMESPACE, "-q", message=message, interactive=True)
+    done = _keygen("sign", "-f", str(key), "-n", namespace, "-q", message=message, interactive=interactive)
     if done.returncode or not done.stdout:
         raise ConfigError(f"{key} does not sign; name a key of yours, or make one with ssh-keygen -t ed25519")
     return bytes(done.stdout)

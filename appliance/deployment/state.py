@@ -18,6 +18,8 @@ PACKAGED = ""
 """The bundle that comes with the program. It is never on trial."""
 MOST_STARTS = 3
 """A bundle is started at most so often without being committed; the next start goes back."""
+MOST_CUTS = 10
+"""Nor may the computer be switched off so often while it is on trial: a bundle that did that would else stay for ever."""
 MOST_WHY = 300
 """Characters of the reason for leaving a bundle that are kept."""
 
@@ -28,7 +30,8 @@ class Standing:
 
     previous: the bundle to go back to while this one is current. counter: its manifest's. starts: how often it was
     started on trial, less those that ended in order. sweeps, streamed_s: how far its trial has come, as of the last
-    such end. why: why it was left, "" where it was not.
+    such end. why: why it was left, "" where it was not. boot: id of the boot in which the last of these starts was made, ""
+    where it was taken back. cuts: how many starts ended with their boot: the power was cut, or the computer reset.
     """
 
     previous: str = PACKAGED
@@ -38,6 +41,14 @@ class Standing:
     sweeps: int = 0
     streamed_s: float = 0.0
     why: str = ""
+    boot: str = ""
+    cuts: int = 0
+
+    def since(self, boot: str) -> Standing:
+        """As it is at a start in this boot: a start that another boot did not outlast was ended by no fault of the bundle."""
+        if not self.boot or not boot or self.boot == boot:
+            return self
+        return replace(self, starts=self.starts - 1, cuts=self.cuts + 1, boot="")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +84,7 @@ class StoreState:
 
     def committed(self, sha: str) -> StoreState:
         """With the trial of `sha` passed: bundles with a lower counter are refused from now on."""
-        made = self.changed(sha, committed=True, starts=0, why="")
+        made = self.changed(sha, committed=True, starts=0, why="", boot="", cuts=0)
         counter = self.of(sha).counter
         return replace(made, counter=counter, highest=sha) if counter >= self.counter else made
 
@@ -81,7 +92,7 @@ class StoreState:
         """With the trial of `sha` failed for this reason. Its starts are used up, in case the power goes before
         `current` changes."""
         text = "".join(c if c.isprintable() else " " for c in why)
-        return self.changed(sha, starts=MOST_STARTS, why=text[:MOST_WHY])
+        return self.changed(sha, starts=MOST_STARTS, why=text[:MOST_WHY], boot="")
 
     def exchanged(self, sha: str) -> StoreState:
         """As it must be before the bundle that `sha` goes back to becomes current: going back twice returns to

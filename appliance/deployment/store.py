@@ -1,7 +1,7 @@
 """What the box runs. In: bundles that were copied to it. Out: the one for this start, old or new, whole at every
 moment.
 
-In the store's folder, `bundles/SHA/` are whole, verified bundles, the symlink `current` names the one that runs
+In the store's folder, `bundles/SHA/` (bundle.name) are whole, verified bundles, the symlink `current` names the one that runs
 (missing: the packaged one), and `ledger.json` holds all else (StoreState). Each step is one atomic rename of a file, a
 folder or the link, and what the step relies on is on the disk before:
 
@@ -21,7 +21,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,11 +35,16 @@ from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, BundleError, ConfigError
 from appliance.core.log import log
 from appliance.deployment import signature
+from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.deployment.sandbox import run_limited
-from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
+from appliance.deployment.state import MOST_CUTS, MOST_STARTS, PACKAGED, StoreState
 from appliance.deployment.trial import Trial
 
+BOOT = Path("/proc/sys/kernel/random/boot_id")
+"""Another text after each boot (random(4))."""
 SHA = re.compile(r"[0-9a-f]{64}")
+PACKAGER = "palpate"
+"""Who is named as the signer of the packaged bundle."""
 INCOMPLETE = "."
 """First character of a folder's name while it is being written or removed."""
 LOCK_S, STEP_NS = 10.0, 20_000_000
@@ -56,16 +61,21 @@ class SignedBundle:
 
     @property
     def sha(self) -> str:
-        """The sha256 of its manifest."""
-        return bundle.digest(self.files[bundle.MANIFEST])
+        """Its name in the store."""
+        return bundle.name(self.files)
+
+    @property
+    def base(self) -> str:
+        """The sha256 of its manifest: for a bundle with enrolled labels that of the one that they were enrolled into."""
+        return self.bundle.base
 
 
 class BundleFolder:
-    """Whole, verified bundles in `folder`, each under the sha256 of its manifest. signers: the file of trusted
-    signers."""
+    """Whole, verified bundles in `folder`, each under its name. signers: the file of trusted signers. key: of this box, for
+    labels that it enrolled."""
 
-    def __init__(self, folder: Path, signers: Path) -> None:
-        self.folder, self._signers = folder, signers
+    def __init__(self, folder: Path, signers: Path, key: EnrolmentKey) -> None:
+        self.folder, self._signers, self._key = folder, signers, key
 
     def at(self, sha: str) -> Path:
         """The folder of a bundle."""
@@ -73,16 +83,40 @@ class BundleFolder:
 
     def read(self, folder: Path) -> SignedBundle:
         """The bundle in any `folder`, checked but not run. Raises BundleError, and ConfigError as signature.verify."""
-        files = bundle.files(folder)
-        if bundle.SIGNATURE not in files:
-            raise BundleError(f"{folder} is not signed; sign the bundle (palpate-train sign)")
-        signer = signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers)
+        return self.checked(bundle.files(folder), folder)
+
+    def checked(self, files: Mapping[str, bytes], folder: Path) -> SignedBundle:
+        """The bundle of these files, which were read in `folder`: as `read`."""
+        signer = self._signer(files, folder)
         loaded = bundle.from_files(files, str(folder))
         if version(loaded.manifest.runtime) > version(__version__):
             raise BundleError(
                 f"bundle needs palpate {loaded.manifest.runtime} and this is {__version__}; update the box (make install)"
             )
         return SignedBundle(loaded, signer, files)
+
+    def _signer(self, files: Mapping[str, bytes], folder: Path) -> str:
+        """Who signed it. Labels that were enrolled need this box's signature, and what they were enrolled into is either
+        signed as every bundle is, or the packaged bundle, which is believed like the program that it comes with."""
+        enrolled = bundle.ENROLMENT in files
+        if enrolled:
+            if bundle.ENROLMENT_SIGNATURE not in files:
+                raise BundleError(
+                    f"{folder}: {bundle.ENROLMENT} is not signed; enrol again on this box (palpate enrol)"
+                )
+            self._key.verify(files[bundle.ENROLMENT], files[bundle.ENROLMENT_SIGNATURE])
+        if bundle.SIGNATURE in files:
+            signer = signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers)
+        elif not enrolled:
+            raise BundleError(f"{folder} is not signed; sign the bundle (palpate-train sign)")
+        elif files[bundle.MANIFEST] != (bundle.DEFAULT / bundle.MANIFEST).read_bytes():
+            raise BundleError(
+                f"{folder}: the bundle that {bundle.ENROLMENT} adds labels to is not signed, and is not the one that this "
+                "version of the program has; enrol again"
+            )
+        else:
+            signer = PACKAGER
+        return f"{signer}, enrolled here" if enrolled else signer
 
     def get(self, sha: str) -> SignedBundle:
         """The bundle `sha`, checked again. Raises BundleError where another one is in its place."""
@@ -124,15 +158,18 @@ class Store:
     """The bundles on this box and which of them runs.
 
     prove: raises where this machine does not run a bundle as it should: golden sweeps, and whether it fits the
-    settings. The methods raise OSError for trouble with the disk, BundleError for a bundle that must not run,
+    settings. boot: the file with the id of this boot. The methods raise OSError for trouble with the disk, BundleError for a bundle that must not run,
     ConfigError where the settings name no trusted signers, and ApplianceError where another command holds the lock.
     """
 
-    def __init__(self, settings: StoreConfig, prove: Callable[[Bundle], object], clock: Clock | None = None) -> None:
+    def __init__(
+        self, settings: StoreConfig, prove: Callable[[Bundle], object], clock: Clock | None = None, boot: Path = BOOT
+    ) -> None:
         self.settings, self.folder, self._prove = settings, Path(settings.folder), prove
-        self.bundles = BundleFolder(self.folder / "bundles", Path(settings.signers))
+        key = EnrolmentKey(Path(settings.enrolment_key))
+        self.bundles = BundleFolder(self.folder / "bundles", Path(settings.signers), key)
         self._link, self._state_file = self.folder / "current", self.folder / "ledger.json"
-        self._clock = clock or SystemClock()
+        self._clock, self._boot_file = clock or SystemClock(), boot
 
     @property
     def current(self) -> str:
@@ -161,24 +198,34 @@ class Store:
 
     def examine(self, folder: Path) -> SignedBundle:
         """The bundle in `folder`, checked in every way but its counter; nothing is changed."""
-        signed = self.bundles.read(folder)
+        return self._proven(self.bundles.read(folder))
+
+    def _proven(self, signed: SignedBundle) -> SignedBundle:
         run_limited(lambda: self._prove(signed.bundle))
         return signed
 
     def install(
         self, incoming: Path, shadow: bool = False, admit: Callable[[Bundle], object] = lambda bundle: None
     ) -> str:
-        """Install the bundle in `incoming`, so that it runs on trial from the next start on; its sha256.
+        """Install the bundle in `incoming`, so that it runs on trial from the next start on; its name.
 
         shadow: it becomes the candidate instead. admit: raises BundleError for one that is not wanted now. Other files
         in `incoming` are ignored. Somebody else may own the folder and change it meanwhile: the files are read once,
         and what was checked is what is written.
         """
-        signed = self.examine(incoming)
+        return self._install(self.examine(incoming), shadow, admit)
+
+    def enrol(self, files: Mapping[str, bytes]) -> str:
+        """Install the files of a bundle that this box has enrolled a label into, as `install`; its name."""
+        return self._install(self._proven(self.bundles.checked(files, self.folder)))
+
+    def _install(
+        self, signed: SignedBundle, shadow: bool = False, admit: Callable[[Bundle], object] = lambda bundle: None
+    ) -> str:
         admit(signed.bundle)
         self.bundles.folder.mkdir(parents=True, exist_ok=True)
         with self._locked() as state:
-            state.admit(signed.sha, signed.bundle.manifest.counter)
+            self._admit(signed, state)
             needed = (signed.sha, *state.chain(self.current), state.candidate)
             self.bundles.keep(*needed)
             self.bundles.put(signed)
@@ -190,13 +237,13 @@ class Store:
         return signed.sha
 
     def promote(self) -> str:
-        """Make the candidate run on trial from the next start on; its sha256."""
+        """Make the candidate run on trial from the next start on; its name."""
         sha = self.state.candidate
         if sha == PACKAGED:
             raise BundleError("there is no candidate; deploy one with SHADOW=1 (palpate install --shadow)")
         signed = self.bundles.get(sha)
         with self._locked() as state:
-            state.admit(sha, signed.bundle.manifest.counter)
+            self._admit(signed, state)
             self._activate(signed, state)
         return sha
 
@@ -205,9 +252,9 @@ class Store:
         sha = self.state.candidate
         return None if sha == PACKAGED else self.bundles.get(sha).bundle
 
-    def running(self) -> Bundle:
+    def running(self) -> SignedBundle:
         """The current bundle, checked. This counts no start."""
-        return self._committed(self.current).bundle
+        return self._kept(self.current)
 
     def choose(self) -> Choice:
         """What this start runs, checked. A bundle on trial that was started MOST_STARTS times, or is refused, gives way
@@ -240,7 +287,7 @@ class Store:
         return True
 
     def rollback(self) -> str:
-        """Go back to the bundle that was committed before, from the next start on; its sha256 or PACKAGED. Going back
+        """Go back to the bundle that was committed before, from the next start on; its name or PACKAGED. Going back
         twice returns to the first one, unless that had failed its trial."""
         with self._locked() as state:
             sha = self.current
@@ -254,18 +301,25 @@ class Store:
             self._set_current(back)
         return back
 
-    def note(self, sha: str, starts: int, sweeps: int, streamed_s: float) -> None:
-        """Write down how far the trial of `sha` has come. Does not wait: ApplianceError where another command is at
-        work."""
+    def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
+        """Write down how far the trial of `sha` has come, and whether this start is one of `starts`. Does not wait:
+        ApplianceError where another command is at work."""
+        boot = self._boot if counted else ""
         with self._locked(0.0) as state:
-            self._write(state.changed(sha, starts=starts, sweeps=sweeps, streamed_s=round(streamed_s, 1)))
+            self._write(state.changed(sha, starts=starts, boot=boot, sweeps=sweeps, streamed_s=round(streamed_s, 1)))
 
     def _committed(self, sha: str) -> Choice:
         """A committed bundle for this start."""
+        folder = bundle.DEFAULT if sha == PACKAGED else self.bundles.at(sha)
+        return Choice(self._kept(sha).bundle, folder, None)
+
+    def _kept(self, sha: str) -> SignedBundle:
+        """A bundle that is current or was, checked."""
         if sha == PACKAGED:
-            return Choice(bundle.load(bundle.DEFAULT), bundle.DEFAULT, None)
+            files = bundle.files(bundle.DEFAULT)
+            return SignedBundle(bundle.from_files(files, str(bundle.DEFAULT)), PACKAGER, files)
         try:
-            return Choice(self.bundles.get(sha).bundle, self.bundles.at(sha), None)
+            return self.bundles.get(sha)
         except BundleError as e:
             raise BundleError(f"{e} (this bundle is committed; `palpate rollback` goes back to the one before)") from e
 
@@ -283,11 +337,21 @@ class Store:
     def _count(self, sha: str) -> str:
         """Count a start of `sha`; the reason where it must not be started again, else ""."""
         with self._locked() as state:
-            standing = state.of(sha)
+            standing = state.of(sha).since(self._boot)
             if standing.starts >= MOST_STARTS:
                 return standing.why or f"it was started {MOST_STARTS} times without being committed"
-            self._write(state.changed(sha, starts=standing.starts + 1))
+            if standing.cuts >= MOST_CUTS:
+                return f"the box was switched off {MOST_CUTS} times while it was on trial"
+            self._write(state.changed(sha, starts=standing.starts + 1, boot=self._boot, cuts=standing.cuts))
         return ""
+
+    @property
+    def _boot(self) -> str:
+        """The id of this boot, "" where it cannot be read: then each start counts."""
+        try:
+            return self._boot_file.read_text().strip()
+        except OSError:
+            return ""
 
     def _go_back(self, sha: str, why: str) -> None:
         """Let the bundle that `sha` goes back to run instead."""
@@ -295,6 +359,15 @@ class Store:
             if self.current == sha:
                 self._write(state.left(sha, why))
                 self._set_current(state.of(sha).previous)
+
+    def _admit(self, signed: SignedBundle, state: StoreState) -> None:
+        """Raise BundleError where it is older than one that was committed, unless it is the one that runs but for labels
+        that were enrolled."""
+        with suppress(BundleError, ConfigError):  # what is damaged gives way
+            running = self.running()
+            if signed.base == running.base and (signed.bundle.added or running.bundle.added):
+                return
+        state.admit(signed.sha, signed.bundle.manifest.counter)
 
     def _activate(self, signed: SignedBundle, state: StoreState) -> None:
         self._write(state.activated(signed.sha, signed.bundle.manifest.counter, self.current))

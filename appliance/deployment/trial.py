@@ -1,8 +1,8 @@
 """A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store records: starts that
 count against the bundle, its progress, and the commit once enough went well.
 
-`Store.choose` counts a start before the bundle is touched. The count is taken back while the skin is away, and when the
-program ends in order or because a device is missing.
+`Store.choose` counts a start before the bundle is touched. The count is taken back while the skin is away, when the
+program ends in order or because a device is missing, and at the next start where the computer was booted in between.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class TrialStore(Protocol):
     def settings(self) -> StoreConfig:
         """How many sweeps and seconds a trial lasts."""
 
-    def note(self, sha: str, starts: int, sweeps: int, streamed_s: float) -> None:
-        """Write down how far the trial of `sha` has come."""
+    def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
+        """Write down how far the trial of `sha` has come, and whether this start is one of `starts`."""
 
     def commit(self, sha: str | None, wait_s: float) -> bool:
         """End the trial of `sha`; whether it was on trial."""
@@ -102,7 +102,7 @@ class Trial(Observer):
 
     def _note(self, counts: bool) -> None:
         starts = self._starts - (not counts)
-        self._store.note(self._sha, starts, self._sweeps, self._streamed_ns / 1e9)
+        self._store.note(self._sha, starts, counts, self._sweeps, self._streamed_ns / 1e9)
         self._counted = counts
 
     def _commit(self) -> None:

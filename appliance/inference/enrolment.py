@@ -1,12 +1,11 @@
-"""Enrolment: the box learns a material without training. In: a bundle, a label, one to ten sweeps. Out: a new bundle.
+"""Enrolment: the box learns a material without training. In: a bundle, a label, one to ten sweeps. Out: enrolment.npz.
 
 In the embedding the sweeps of every material have covariance 1 around their mean. A new material therefore needs only a
-mean, that of its sweeps; everything that was trained stays as it is.
+mean, that of its sweeps; everything that was trained stays as it is, and so do the files of the bundle (bundle/enrolled.py).
 """
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle, Classes, Manifest, MovedClasses
+from appliance.bundle import bundle, enrolled
+from appliance.bundle.bundle import AddedLabels, Bundle, Classes
 from appliance.core import storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError, BundleError, FormatError
@@ -30,11 +29,11 @@ from appliance.inference.novelty import Means
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
-    """A bundle with one more label, and its files by name. warnings: for the person who enrols. disagreement: why the
+    """A bundle with one more label, and its enrolment.npz. warnings: for the person who enrols. disagreement: why the
     sweeps may not be of one material, "" if they agree."""
 
     bundle: Bundle
-    files: dict[str, bytes]
+    file: bytes
     warnings: tuple[str, ...]
     disagreement: str
 
@@ -70,17 +69,11 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     z, golden = (np.stack([run.embedding(s) for s in of]).astype(np.float64) for of in (sweeps, old.golden))
     if not np.isfinite(z).all():
         raise FormatError("the model gives no number for some of the sweeps; look at the skin and take others")
-    manifest = replace(
-        m, labels=(*m.labels, label), version=f"{m.version}+{label}", early=None, figures={},
-        made=m.made | {"enrolled": old.enrolled | {label: len(z)}},
-    )  # fmt: skip
     classes = extended(old.classes, z)
-    means = Means(classes, m.known, manifest.labels)
+    means = Means(classes, m.known, (*m.labels, label))
     median = _median(softmax(means.logits(means.distances(z))))
-    new = replace(
-        old, manifest=manifest, classes=classes, golden=np.concatenate([old.golden, sweeps[median : median + 1]]),
-        golden_logits=means.logits(means.distances(np.vstack([golden, z[median]]))),
-    )  # fmt: skip
+    logits = means.logits(means.distances(np.vstack([golden, z[median]])))
+    new, file = _added(old, label, classes, sweeps[median], logits)
     trained, warnings = Means(old.classes, m.known, m.labels), []
     if close := _closeness(trained, label, z):
         warnings.append(close)
@@ -88,39 +81,36 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
         warnings.append(
             f"early answers end with this bundle: their heads do not know {label!r}; set classifier.early = false"
         )
-    return _packed(new, tuple(warnings), _disagreement(trained, label, z))
+    return Enrolment(new, file, tuple(warnings), _disagreement(trained, label, z))
 
 
 def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
     """`classes` with one more label, from the embeddings `z` float64 [n, r] of its sweeps.
 
-    Its mean m is that of the sweeps. Its bias is -|m|^2 / 2 + r / (2 n), since |m|^2 of a mean of n sweeps is on
-    average larger than that of the true mean, by r / n. Its spread is computed from the sweeps and one assumed sweep at
-    squared distance r, the average of trained labels, and is at least 1, that of trained labels: the embedding of
-    materials that were not in training scatters more. Its shape is that of all materials together. A moved skin is
-    assumed to change its mean as it changes those of the trained labels on average.
+    Its mean is that of the sweeps. Its spread is computed from the sweeps and one assumed sweep at squared distance r, the
+    average of trained labels, and is at least 1, that of trained labels: the embedding of materials that were not in
+    training scatters more. For the rest see `enrolled.extended`.
     """
     n, r = z.shape
-    mean, moved = z.mean(axis=0), classes.moved
+    mean = z.mean(axis=0)
     spread = max(1.0, (r + ((z - mean) ** 2).sum()) / (r * n))
-    if moved:
-        trained = classes.sweeps == 0
-        change = (moved.means - classes.means.astype(np.float64) @ moved.turn)[trained].mean(axis=0)
-        means = np.vstack([moved.means, mean @ moved.turn + change]).astype(np.float32)
-        moved = MovedClasses(moved.turn, means, _one_more(moved.shapes))
-    return Classes(
-        np.vstack([classes.means, mean]).astype(np.float32),
-        np.append(classes.bias, -(mean @ mean) / 2 + r / (2 * n)).astype(np.float32),
-        np.append(classes.sweeps, n),
-        np.append(classes.spread, spread).astype(np.float32),
-        _one_more(classes.shapes),
-        moved,
-    )
+    return enrolled.extended(classes, mean, n, spread)
 
 
-def _one_more(shapes: NDArray[np.float16]) -> NDArray[np.float16]:
-    """`shapes` [K, b, b] with that of all materials together as the last one [K + 1, b, b]."""
-    return np.concatenate([shapes, np.eye(shapes.shape[1], dtype=np.float16)[None]])
+def _added(
+    old: Bundle, label: str, classes: Classes, golden: NDArray[Any], logits: NDArray[np.float32]
+) -> tuple[Bundle, bytes]:
+    """`old` with the last label of `classes`, and the enrolment.npz that makes it of the bundle that was signed."""
+    before, mean, sweeps, spread = old.added, classes.means[-1:], classes.sweeps[-1:], classes.spread[-1:]
+    added = AddedLabels(old.base, (label,), mean, sweeps, spread, golden[None], logits)
+    if before:
+        added = AddedLabels(
+            old.base, (*before.labels, label), np.vstack([before.means, mean]), np.append(before.sweeps, sweeps),
+            np.append(before.spread, spread), np.concatenate([before.golden, golden[None]]), logits,
+        )  # fmt: skip
+    file = enrolled.file(added)
+    new = enrolled.with_label(old, label, mean[0], int(sweeps[0]), float(spread[0]), golden)
+    return replace(new, golden_logits=logits, id=bundle.identity(file), added=added), file
 
 
 def _median(scores: NDArray[np.float64]) -> int:
@@ -133,24 +123,11 @@ def _median(scores: NDArray[np.float64]) -> int:
     return int(pick[np.argsort(scores[pick, -1], kind="stable")[len(pick) // 2]])
 
 
-def _packed(new: Bundle, warnings: tuple[str, ...], disagreement: str) -> Enrolment:
-    """`new` with its files and a manifest that names them."""
-    assert new.classes
-    files = {
-        bundle.MODEL: new.model,
-        bundle.GOLDEN: bundle.golden_file(new.golden, new.golden_logits),
-        bundle.MEANS: _npz(**new.classes.arrays()),
-    }
-    manifest: Manifest = replace(new.manifest, files={k: bundle.file_entry(v) for k, v in files.items()})
-    files[bundle.MANIFEST] = manifest.json()
-    made = replace(new, manifest=manifest, id=bundle.identity(manifest.json()))
-    return Enrolment(made, files, warnings, disagreement)
-
-
-def _npz(**arrays: NDArray[Any]) -> bytes:
-    packed = io.BytesIO()
-    np.savez_compressed(packed, allow_pickle=False, **arrays)
-    return packed.getvalue()
+def files(old: Mapping[str, bytes], new: Enrolment, signature: bytes | None) -> dict[str, bytes]:
+    """The files of the enrolled bundle: those of the one that it was made from as they are, and its enrolment, with its
+    signature where it has one."""
+    kept = {name: data for name, data in old.items() if name not in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)}
+    return kept | {bundle.ENROLMENT: new.file} | ({bundle.ENROLMENT_SIGNATURE: signature} if signature else {})
 
 
 def _disagreement(means: Means, label: str, z: NDArray[np.float64]) -> str:

@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from appliance.bundle import bundle as bundles
 from appliance.bundle.bundle import Bundle
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import Config, TriggerConfig
 from appliance.core.devices import Devices
-from appliance.core.errors import ConfigError, FormatError
+from appliance.core.errors import ApplianceError, ConfigError, FormatError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
-from appliance.deployment.store import Store
+from appliance.deployment.store import SignedBundle, Store
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import Decider
 from appliance.io import skins
@@ -37,6 +39,10 @@ from appliance.recording.sweep_check import SweepCheck
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Answerer, Box, CommandHandler, Pipeline
 
+UNSIGNED = (
+    "bundles are allowed: classifier.allow_unsigned = true; take it out of the settings once the bundle is signed"
+)
+"""What is told with "unsigned" before it while that setting is on."""
 NO_COMMANDS: Mapping[str, CommandHandler] = MappingProxyType({})
 
 
@@ -176,6 +182,27 @@ def prove(settings: Config, bundle: Bundle) -> None:
 def store(settings: Config) -> Store:
     """The store of bundles that the settings name."""
     return Store(settings.store, lambda bundle: prove(settings, bundle))
+
+
+def running(settings: Config, *, answers: bool = True) -> SignedBundle:
+    """The bundle that the settings ask for: the one named, the one deployed, or the packaged one.
+
+    answers: whether a robot gets what it says. Then it has to be signed, unless classifier.allow_unsigned is set. Raises
+    BundleError or ConfigError.
+    """
+    name = settings.classifier.bundle
+    return named(settings, Path(name), answers=answers) if name else store(settings).running()
+
+
+def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
+    """The bundle in `folder`, which a setting or an option names; otherwise as `running`."""
+    if settings.classifier.allow_unsigned or not answers:
+        files = bundles.files(folder)
+        return SignedBundle(bundles.from_files(files, str(folder)), "", files)
+    try:
+        return store(settings).bundles.read(folder)
+    except ApplianceError as e:
+        raise type(e)(f"{e}; a bench may allow unsigned bundles, by classifier.allow_unsigned = true") from e
 
 
 def port(settings: Config, devices: Devices) -> Port | None:

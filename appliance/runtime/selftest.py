@@ -20,7 +20,7 @@ from appliance.io.gpio_lines import Lines
 from appliance.io.robot_link import SerialSink
 from appliance.io.trigger import GpioTrigger
 from appliance.io.usb_sensor import fits
-from appliance.runtime.assembly import gpio
+from appliance.runtime.assembly import UNSIGNED, gpio
 
 LISTEN_S = 1.0
 """How long frames of the skin are counted."""
@@ -53,6 +53,8 @@ def check(settings: Config, load: Callable[[], Bundle], devices: Devices) -> Ite
         return f"{len(loaded[0].golden)} sweeps, largest difference of a probability {worst:.2g}"
 
     yield _try("bundle", bundle)
+    if settings.classifier.allow_unsigned:
+        yield CheckResult("signatures", True, f"warning: unsigned {UNSIGNED}")
     if loaded:
         yield _try("golden sweeps", golden)
     yield _try("skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices))

@@ -1,7 +1,8 @@
 """Alters a signed bundle in every way. In: a signed bundle. Out: how many alterations a box accepted; any is a failure.
 
 `python -m tests.campaigns.flips --out build/flips.json` flips every bit of a manifest, random bits of the other files,
-swaps each file with that of another signed bundle, and tries bundles that are unsigned, wrongly signed, cut or older.
+swaps each file with that of another signed bundle, and tries bundles that are unsigned, wrongly signed, cut or older. The
+same of a bundle into which the box has enrolled a label, all bits of its enrolment among them, or some of them.
 Each one goes the way of a delivered bundle, `Store.install`. Bits of the signature's own file are not counted: some of its
 line ends, say, may be others, and it is the same signature of the same manifest.
 """
@@ -26,13 +27,16 @@ from appliance.core.errors import BundleError
 from appliance.core.provenance import commit
 from appliance.core.storage import put
 from appliance.deployment import signature
-from tests.factories import deliveries
+from appliance.deployment.enrolment_key import KEY
+from tests.factories import deliveries, install_scripts
 from tests.factories.deliveries import Delivery
 
 Files = dict[str, bytes]
 Case = tuple[str, str, Files]
 """Of an alteration: its kind, which it is, and the files."""
 FLIPS = 1000
+ENROLLED = "enrolled: "
+"""Begins the kinds of alterations of a bundle with an enrolled label."""
 FLIPPED = f"a bit of {bundle.MANIFEST} flipped"
 
 
@@ -74,6 +78,34 @@ def another(key: Path) -> Files:
     return deliveries.signed(held, key)
 
 
+def enrolled(box: Delivery, bits: int | None, seed: int) -> Iterator[Case]:
+    """All alterations of a bundle into which the box has enrolled a label."""
+    one, other = (
+        deliveries.enrolled(made, box.enrolment_key) for made in (deliveries.files(3, box.key), another(box.key))
+    )
+    parts = (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
+    yield "not signed", "", {name: data for name, data in one.items() if name != bundle.ENROLMENT_SIGNATURE}
+    yield "a base not signed", "", {name: data for name, data in one.items() if name != bundle.SIGNATURE}
+    foreign = install_scripts.enrolment_key(box.folder / "foreign")
+    for who, signed in (
+        ("another box", foreign.sign(one[bundle.ENROLMENT])), ("a signer", signature.sign(one[bundle.ENROLMENT], box.key)),
+        ("the box, for bundles", signature.sign(one[bundle.ENROLMENT], box.enrolment_key.folder / KEY)),
+    ):  # fmt: skip
+        yield "wrongly signed", who, one | {bundle.ENROLMENT_SIGNATURE: signed}
+    for version in (1, 0):
+        yield "older", str(version), deliveries.enrolled(deliveries.files(version, box.key), box.enrolment_key)
+    by_box = deliveries.signed(deliveries.files(3, None, name="by the box"), box.enrolment_key.folder / KEY)
+    yield "a base signed by the box", "", deliveries.enrolled(by_box, box.enrolment_key)
+    yield "labels of another bundle", "", one | {name: other[name] for name in parts}
+    for name in sorted(one.keys() - set(parts)):
+        yield "a file swapped", name, one | {name: other[name]}
+    for cut in (0, 1, len(one[bundle.ENROLMENT]) // 2, len(one[bundle.ENROLMENT]) - 1):
+        yield "a file cut", str(cut), one | {bundle.ENROLMENT: one[bundle.ENROLMENT][:cut]}
+    yield "a file longer", "", one | {bundle.ENROLMENT: one[bundle.ENROLMENT] + b"\0"}
+    for name in sorted(one.keys() - {bundle.SIGNATURE, bundle.ENROLMENT_SIGNATURE}):
+        yield from flips(one, name, FLIPS if bits is None else 10, seed)
+
+
 def others(files: Files, box: Delivery) -> Iterator[Case]:
     """Unsigned, wrongly signed, cut, older."""
     text = files[bundle.MANIFEST]
@@ -81,7 +113,7 @@ def others(files: Files, box: Delivery) -> Iterator[Case]:
     unknown = deliveries.key(box.folder / "unknown")
     yield "signed by an unknown key", "", files | {bundle.SIGNATURE: signature.sign(text, unknown)}
     for space in ("file", "git", "palpate", "palpate-bundle2", " "):
-        yield "signed for another use", space, files | {bundle.SIGNATURE: _signed_for(space, text, box.key)}
+        yield "signed for another use", space, files | {bundle.SIGNATURE: signature.sign(text, box.key, space)}
     for name, data in sorted(files.items()):
         yield "a file missing", name, {n: d for n, d in files.items() if n != name}
         for kept in (0, 1, len(data) // 2, len(data) - 1)[: 4 - (name == bundle.SIGNATURE)]:
@@ -94,15 +126,6 @@ def others(files: Files, box: Delivery) -> Iterator[Case]:
     yield "runtime too new", "", deliveries.files(9, box.key, runtime="99.0.0")
 
 
-def _signed_for(space: str, text: bytes, key: Path) -> bytes:
-    """A signature of ours for another use."""
-    made, signature.NAMESPACE = signature.NAMESPACE, space
-    try:
-        return signature.sign(text, key)
-    finally:
-        signature.NAMESPACE = made
-
-
 def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]:
     """All alterations of a bundle that the box would take. manifest_bits: of all bits of its manifest so many are drawn."""
     good, other = deliveries.files(3, box.key), another(box.key)
@@ -112,6 +135,7 @@ def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]
     yield from flips(good, bundle.MANIFEST, manifest_bits, seed)
     for name in sorted(good.keys() - {bundle.MANIFEST, bundle.SIGNATURE}):
         yield from flips(good, name, FLIPS if manifest_bits is None else 10, seed)
+    yield from ((f"{ENROLLED}{kind}", which, files) for kind, which, files in enrolled(box, manifest_bits, seed))
 
 
 def tried(box: Delivery, case: Case) -> str:
@@ -156,7 +180,8 @@ def campaign(folder: Path, manifest_bits: int | None, seed: int, every: int = 0)
         if every and n % every == 0:
             print(f"{n}: {case[0]}, {case[1]}", flush=True)
     for n, good in enumerate((deliveries.files(3, box.key), another(box.key))):  # else all of this would prove nothing
-        box.store.install(deliveries.put(folder / f"good{n}", good))
+        box.store.install(deliveries.put(folder / f"good{n}", deliveries.enrolled(good, box.enrolment_key)))
+        box.store.install(deliveries.put(folder / f"plain{n}", good))
     return {kind: dict(count) for kind, count in counts.items()}
 
 

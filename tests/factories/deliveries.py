@@ -15,7 +15,10 @@ from appliance.bundle.bundle import Bundle
 from appliance.bundle.manifest import SCHEMA, Manifest
 from appliance.core.config import StoreConfig
 from appliance.deployment import signature
+from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.deployment.store import Store
+from appliance.inference import enrolment
+from tests.factories.install_scripts import enrolment_key
 
 SIGNER = "anna@lab"
 NEEDED = pytest.mark.skipif(not shutil.which("ssh-keygen"), reason="ssh-keygen is missing: apt install openssh-client")
@@ -49,6 +52,13 @@ def signed(held: dict[str, bytes], key: Path) -> dict[str, bytes]:
     return held | {bundle.MANIFEST: text, bundle.SIGNATURE: signature.sign(text, key)}
 
 
+def enrolled(held: dict[str, bytes], key: EnrolmentKey | None, label: str = "cork") -> dict[str, bytes]:
+    """The files of a bundle with one more label, learned from the first golden sweep, as the box makes them."""
+    made = bundle.from_files(held, "a test")
+    new = enrolment.enrol(made, label, made.golden[:1])
+    return enrolment.files(held, new, key.sign(new.file) if key else None)
+
+
 def put(folder: Path, files: dict[str, bytes]) -> Path:
     """Write the files of a bundle to a new folder."""
     folder.mkdir(parents=True)
@@ -63,7 +73,10 @@ class Delivery:
     def __init__(self, folder: Path, prove: Callable[[Bundle], object] = lambda bundle: None) -> None:
         self.folder = folder
         self.key = key(folder / "keys")
-        self.how = StoreConfig(str(folder / "store"), str(folder / "allowed_signers"), trial_sweeps=5)
+        self.enrolment_key = enrolment_key(folder / "enrolment")
+        self.how = StoreConfig(
+            str(folder / "store"), str(folder / "allowed_signers"), str(folder / "enrolment"), trial_sweeps=5
+        )
         Path(self.how.folder).mkdir()
         Path(self.how.signers).write_text(line(self.key))
         self.store = Store(self.how, prove)
@@ -71,8 +84,12 @@ class Delivery:
 
     def made(self, counter: int, **changes: object) -> Path:
         """A folder with a signed bundle, as deploy has copied it."""
+        return self.copied(files(counter, self.key, **changes))
+
+    def copied(self, held: dict[str, bytes]) -> Path:
+        """A folder with these files."""
         self._made += 1
-        return put(self.folder / "incoming" / str(self._made), files(counter, self.key, **changes))
+        return put(self.folder / "incoming" / str(self._made), held)
 
     def installed(self, counter: int) -> str:
         """A bundle that was installed; its sha256."""

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from appliance.deployment.enrolment_key import EnrolmentKey
 from tests.factories.paths import ROOT
 
 SCRIPTS = ROOT / "systemd"
@@ -19,6 +20,13 @@ def run_here(code: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
+
+
+def enrolment_key(folder: Path) -> EnrolmentKey:
+    """The box's key for enrolments, as the install makes it, but for this user."""
+    code = f"import enrolment_key, os; print(enrolment_key.make({str(folder)!r}, os.getuid(), os.getgid()))"
+    subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True)
+    return EnrolmentKey(folder)
 
 
 def page_secrets(folder: Path) -> None:

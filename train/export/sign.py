@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from appliance.bundle import bundle
+from appliance.bundle import arrays, bundle
+from appliance.bundle.bundle import Bundle
 from appliance.bundle.manifest import SCHEMA, Manifest
 from appliance.core import storage
 from appliance.core.errors import BundleError
@@ -19,9 +20,13 @@ from appliance.deployment import signature
 def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
     """Sign the bundle in `folder`; its manifest. counter: is written into the manifest first, so the bundle's id changes.
 
-    Raises BundleError where the bundle is incomplete or has no counter yet, and ConfigError where `key` does not sign.
+    Labels that a box has enrolled become part of the bundle, so that other boxes take them, too. Raises BundleError where the
+    bundle is incomplete or has no counter yet, and ConfigError where `key` does not sign.
     """
-    manifest = bundle.load(folder).manifest
+    loaded = bundle.load(folder)
+    held = _with_labels(loaded) if loaded.added else {}
+    entries = {name: bundle.file_entry(data) for name, data in held.items()}
+    manifest = replace(loaded.manifest, files=loaded.manifest.files | entries)
     if counter is not None:
         manifest = replace(manifest, counter=counter, schema=SCHEMA)
     if manifest.counter < 1:
@@ -30,5 +35,20 @@ def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
             "before: --counter N, from 1 on"
         )
     text = manifest.json()
-    storage.put_all({folder / bundle.SIGNATURE: signature.sign(text, key), folder / bundle.MANIFEST: text})
+    signed = {bundle.SIGNATURE: signature.sign(text, key), bundle.MANIFEST: text}
+    if not held:
+        storage.put_all({folder / name: data for name, data in signed.items()})
+        return manifest
+    with storage.folder(folder.resolve()) as new:
+        for name, data in ({bundle.MODEL: loaded.model} | held | signed).items():
+            (new / name).write_bytes(data)
     return manifest
+
+
+def _with_labels(loaded: Bundle) -> dict[str, bytes]:
+    """Golden sweeps and class means with those of enrolled labels, as a bundle holds them without an enrolment beside it."""
+    assert loaded.classes
+    return {
+        bundle.GOLDEN: bundle.golden_file(loaded.golden, loaded.golden_logits),
+        bundle.MEANS: arrays.packed(**loaded.classes.arrays()),
+    }

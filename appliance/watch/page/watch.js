@@ -76,6 +76,7 @@ function drawHeader() {
   const source = (known.hello ?? known.view)?.source ?? "usb", {health, view} = known;
   byId("simulated").hidden = source === "usb";
   put("simulated", source === "replay" ? "REPLAYED" : "SIMULATED");
+  byId("unsigned").hidden = !health?.unsigned;
   const bundle = known.box ? health?.model ?? "" : view?.bundle ?? "";
   byId("bundle").hidden = !bundle;
   put("bundle", bundle);

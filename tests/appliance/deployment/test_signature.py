@@ -9,8 +9,10 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.bundle.manifest import Manifest
+from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, ConfigError
 from appliance.deployment import signature
+from appliance.inference.classifier import Classifier
 from tests.factories import deliveries
 from tests.factories.deliveries import SIGNER, line
 from train.export import sign
@@ -138,6 +140,23 @@ def test_a_key_that_cannot_sign_is_named(tmp_path: Path, capfd: pytest.CaptureFi
     with pytest.raises(ConfigError, match="none does not sign"):
         signature.sign(MESSAGE, tmp_path / "none")
     assert "No such file" in capfd.readouterr().err
+
+
+def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path: Path, signers: Signers):
+    """`palpate-train sign` makes an ordinary bundle of one with an enrolment: the same labels and answers, another signer."""
+    folder = deliveries.put(tmp_path / "bundle", deliveries.enrolled(deliveries.files(1, None), None))
+    before = bundle.load(folder)
+    made = sign.sign(folder, signers.ours, 2)
+    after, text = bundle.load(folder), (folder / bundle.MANIFEST).read_bytes()
+    assert signature.verify(text, (folder / bundle.SIGNATURE).read_bytes(), signers.file) == SIGNER
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*made.files, bundle.MANIFEST, bundle.SIGNATURE])
+    assert (after.added, after.enrolled, made.labels) == (None, {"cork": 1}, before.manifest.labels)
+    assert before.classes
+    assert after.classes
+    for name, values in before.classes.arrays().items():
+        assert after.classes.arrays()[name].tobytes() == values.tobytes()
+    assert after.golden_logits.tobytes() == before.golden_logits.tobytes()
+    Classifier(after, SystemClock()).self_test()
 
 
 def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.CaptureFixture[str]):

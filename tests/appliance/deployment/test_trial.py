@@ -14,6 +14,7 @@ from appliance.core.errors import ApplianceError, BundleError, LineError
 from appliance.core.health import Health
 from appliance.core.types import Status, Verdict
 from appliance.deployment.state import MOST_STARTS, Standing
+from appliance.deployment.store import Store
 from appliance.deployment.trial import Trial
 from appliance.sim import devices, rig, script, skin
 from tests.factories import deliveries
@@ -62,6 +63,51 @@ class Trying(Delivery):
 def box(tmp_path: Path) -> Trying:
     """A box with a bundle on trial."""
     return Trying(tmp_path)
+
+
+def booted(box: Trying, name: str) -> None:
+    """The power was cut, and is back: another boot of the kernel."""
+    file = box.folder / "boot_id"
+    file.write_text(f"{name}\n")
+    box.store = Store(box.how, lambda bundle: None, boot=file)
+
+
+def test_power_cuts_do_not_count_against_the_bundle(box: Trying):
+    """Nine in its trial: it is still the one that runs; a crash within one boot counts as before, whatever came between."""
+    for cut in range(9):
+        booted(box, f"boot {cut}")
+        assert box.start() == box.two
+        assert (box.standing.starts, box.standing.cuts) == (1, cut)
+    assert [box.start(), box.start()] == [box.two] * 2
+    assert box.start() == box.one
+    booted(box, "the next")
+    assert box.start() == box.one
+
+
+def test_an_orderly_end_before_the_power_goes_is_not_taken_back_twice(box: Trying):
+    """A crash stays counted through shutdowns: those were taken back when they ended."""
+    booted(box, "first")
+    box.tried()
+    for boot in ("second", "third"):
+        box.tried().stopping()
+        booted(box, boot)
+    assert (box.standing.starts, box.standing.cuts) == (1, 0)
+
+
+def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(box: Trying, logged: list[str]):
+    """After ten times: else one that resets it would stay for ever."""
+    for cut in range(10):
+        booted(box, f"boot {cut}")
+        assert box.start() == box.two
+    booted(box, "the last")
+    assert box.start() == box.one
+    assert "switched off 10 times while it was on trial" in logged[-1]
+
+
+def test_without_the_id_of_the_boot_each_start_counts(box: Trying):
+    """It cannot be read: as if the program had crashed, never the other way round."""
+    box.store = Store(box.how, lambda bundle: None, boot=box.folder / "none")
+    assert [box.start() for _ in range(MOST_STARTS + 1)] == [box.two] * MOST_STARTS + [box.one]
 
 
 def test_a_start_counts_until_the_program_ends_in_order(box: Trying):

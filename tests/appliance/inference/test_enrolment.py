@@ -61,7 +61,7 @@ def test_a_label_is_added_by_arithmetic(old: Bundle, tmp_path: Path):
     assert new.bundle.enrolled == {"felt": 5}
     assert new.bundle.golden[:2].tolist() == old.golden.tolist()
     assert new.bundle.golden_logits.shape == (3, 4)
-    assert new.files[bundle.MODEL] == old.model
+    assert enrolment.files(toy_bundle.files(), new, None) == toy_bundle.files() | {bundle.ENROLMENT: new.file}
 
 
 def test_a_label_for_a_skin_with_axes(tmp_path: Path):
@@ -69,7 +69,8 @@ def test_a_label_for_a_skin_with_axes(tmp_path: Path):
     old = toy_bundle.load(tmp_path / "old", fmt=toy_bundle.THREE_AXES)
     sweeps = np.stack([toy_bundle.window(*z, fmt=toy_bundle.THREE_AXES) for z in FELT])
     new = enrolment.enrol(old, "felt", sweeps)
-    enrolment.write(new.files, tmp_path / "new", False)
+    files = enrolment.files(toy_bundle.files(fmt=toy_bundle.THREE_AXES), new, None)
+    enrolment.write(files, tmp_path / "new", False)
     it = Classifier(bundle.load(tmp_path / "new"), VirtualClock())
     assert it(toy_bundle.sweep(7, 8, fmt=toy_bundle.THREE_AXES)).label == "felt"
     for wrong in (sweeps[..., 2], sweeps[0], sweeps[:0]):
@@ -80,7 +81,7 @@ def test_a_label_for_a_skin_with_axes(tmp_path: Path):
 def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
     """Written, read, self-tested: equal to what `enrol` gave; it gives the new label, the old ones, and unknown."""
     new = enrolment.enrol(old, "felt", counts(*FELT))
-    enrolment.write(new.files, tmp_path / "new", False)
+    enrolment.write(enrolment.files(toy_bundle.files(), new, None), tmp_path / "new", False)
     read = bundle.load(tmp_path / "new")
     assert (read.id, read.manifest) == (new.bundle.id, new.bundle.manifest)
     for name in ("golden", "golden_logits"):
@@ -94,7 +95,7 @@ def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
 
 def test_same_sweeps_same_bytes(old: Bundle):
     """The files depend on neither clock nor random numbers."""
-    assert enrolment.enrol(old, "felt", counts(*FELT)).files == enrolment.enrol(old, "felt", counts(*FELT)).files
+    assert enrolment.enrol(old, "felt", counts(*FELT)).file == enrolment.enrol(old, "felt", counts(*FELT)).file
 
 
 def test_a_material_that_scatters_is_kept(old: Bundle):
@@ -152,10 +153,9 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
 def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path: Path):
     """Its shape is 1; where the skin has moved, its mean is turned and shifted as the trained labels' means are."""
     arrays = toy_bundle.means(**toy_bundle.moved_arrays())
-    old = toy_bundle.load(tmp_path / "old", arrays=arrays, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE)
-    new = enrolment.enrol(old, "felt", counts(*FELT))
-    (folder := tmp_path / "new").mkdir()
-    classes = bundle.load(toy_bundle.put(folder, new.files)).classes
+    signed = toy_bundle.files(arrays=arrays, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE)
+    new = enrolment.enrol(bundle.load(toy_bundle.put(tmp_path / "old", signed)), "felt", counts(*FELT))
+    classes = bundle.load(toy_bundle.put(tmp_path / "new", enrolment.files(signed, new, None))).classes
     assert classes is not None
     assert classes.moved is not None
     assert classes.shapes.ravel().tolist() == [0.5, 1, 1, 1]
@@ -243,7 +243,7 @@ def test_sweeps_that_give_no_number(tmp_path: Path):
 @pytest.fixture
 def made(old: Bundle) -> dict[str, bytes]:
     """Files of a bundle with "felt"."""
-    return enrolment.enrol(old, "felt", counts(*FELT)).files
+    return enrolment.files(toy_bundle.files(), enrolment.enrol(old, "felt", counts(*FELT)), None)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -321,8 +321,8 @@ def test_the_disk_has_it_before_the_name(tmp_path: Path, made: dict[str, bytes],
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(storage, "exchange", swapped)
     enrolment.write(made, target, True)
-    assert sorted(steps[:4]) == sorted(made)
-    assert steps[4:] == ["new", "swap", tmp_path.name]
+    assert sorted(steps[:5]) == sorted(made)
+    assert steps[5:] == ["new", "swap", tmp_path.name]
 
 
 def test_a_link_to_a_bundle_stays_one(tmp_path: Path, made: dict[str, bytes]):
@@ -364,7 +364,8 @@ def test_the_command_enrols(rig, old: Bundle, tmp_path: Path, capsys: pytest.Cap
     silent = np.zeros((1, 20, 2, 2), np.int16)
     assert rig(np.concatenate([counts(*FELT[:2]), silent, counts(*FELT[2:], (0, 0))])) == 0
     output = capsys.readouterr()
-    assert content(tmp_path / "new") == enrolment.enrol(old, "felt", counts(*FELT)).files
+    new = enrolment.enrol(old, "felt", counts(*FELT))
+    assert content(tmp_path / "new") == enrolment.files(toy_bundle.files(), new, None)
     assert output.out.count(",RES,") == 6
     assert "sweep 2 taken: 2 of 5" in output.err
     assert "sweep 3 not taken: no-contact strongest taxel 0.0 digits" in output.err

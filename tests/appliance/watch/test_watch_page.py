@@ -231,6 +231,21 @@ def test_loss_latency_and_the_box(browser: Any, shown: Shown):
     until(lambda: "at least 2" in seen.text("#loss-said"))
 
 
+def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
+    """While a setting allows them, at every size, without scrolling and beside whatever else is there; else not."""
+    for text in ("", "bundles are allowed: classifier.allow_unsigned = true"):
+        shown.board.take(feed_lines.health(380.0, unsigned=text))
+        for width, height in SIZES:
+            seen = opened(browser, shown, width, height)
+            until(lambda: seen.page.locator("#unsigned").is_visible() == bool(text))  # noqa: B023
+            if text:
+                box = seen.page.locator("#unsigned").bounding_box()
+                assert 0 <= box["x"] < box["x"] + box["width"] <= width
+                assert box["y"] < height / 2
+                assert "allow_unsigned" in seen.text("#facts")
+            seen.page.context.close()
+
+
 def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, shown: Shown):
     """It says so at once, why, and how old what it shows is; the box is there again by itself, with its new bundle."""
     seen = opened(browser, shown)

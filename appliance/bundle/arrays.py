@@ -1,0 +1,88 @@
+"""Arrays in the files of a bundle: .npz in and out, sweeps packed as their changes, the form of class means.
+
+In: bytes, arrays. Out: arrays, bytes; a BundleError where they are not as they must be. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.bundle.manifest import MEANS, MOST_BYTES
+from appliance.core.errors import BundleError
+from appliance.core.types import UNREADABLE, SweepFormat
+
+
+def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
+    """Arrays of the .npz `data` by name, `names` among them; pickled objects are refused. Raises BundleError naming `file`."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as packed:
+            size = sum(entry.file_size for entry in packed.infolist())
+        if size > MOST_BYTES:
+            raise BundleError(
+                f"{file} unpacks to {size} bytes, {MOST_BYTES} are allowed; export the bundle with fewer sweeps"
+            )
+        with np.load(io.BytesIO(data), allow_pickle=False) as z:
+            arrays = dict(z.items())
+        return {name: arrays[name] for name in names} | arrays
+    except (*UNREADABLE, OSError, KeyError, zipfile.BadZipFile) as e:
+        raise BundleError(f"{file} cannot be read: {e}; export the bundle again") from e
+
+
+def packed(**arrays: NDArray[Any]) -> bytes:
+    """The bytes of an .npz; equal arrays give equal bytes."""
+    file = io.BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def changes(samples: NDArray[Any]) -> NDArray[np.uint8]:
+    """The changes from frame to frame of sweeps [G, T, R, C] or [G, T, R, C, A], as whole numbers of the same bits: of all
+    changes first the lowest byte, then the next one, [bytes, G, T, R, C] or [bytes, G, T, R, C, A].
+
+    These pack better than the numbers, and not a bit of them is lost.
+    """
+    bits = np.ascontiguousarray(samples).view(f"<u{samples.itemsize}")
+    steps = np.diff(bits, axis=1, prepend=np.zeros_like(bits[:, :1]))
+    planes: NDArray[np.uint8] = np.moveaxis(steps.view(np.uint8).reshape(*bits.shape, samples.itemsize), -1, 0)
+    return planes
+
+
+def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
+    """Sweeps from the bytes of their changes [bytes, G, T, R, C] or [bytes, G, T, R, C, A]: the inverse of `changes`. Raises
+    BundleError naming `file`."""
+    size = f.numpy_type.itemsize
+    if planes.dtype != np.uint8 or planes.shape[:1] + planes.shape[2:] != (size, f.window, *f.shape):
+        raise BundleError(f"{file} holds changes {planes.dtype} {planes.shape}, which do not fit the format {f}")
+    steps = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(f"<u{size}")[..., 0]
+    return np.cumsum(steps, axis=1, dtype=steps.dtype).view(f.numpy_type)
+
+
+def check_classes(arrays: Mapping[str, NDArray[Any]], n: int) -> None:
+    """Raises BundleError if an array of means.npz has another type or shape than `n` labels have, or a number out of
+    range."""
+    rank = arrays["means"].shape[-1] if arrays["means"].ndim else 0
+    rows = {"means": (n, rank), "bias": (n,), "sweeps": (n,), "spread": (n,), "shapes": (n, 0, 0), "moved_turn": (rank, rank),
+            "moved_means": (n, rank), "moved_shapes": (n, 0, 0)}  # fmt: skip
+    kinds = {"sweeps": "int64", "shapes": "float16", "moved_shapes": "float16"}
+    for name, wanted in rows.items():
+        if name not in arrays:
+            continue
+        values, kind, shape = arrays[name], kinds.get(name, "float32"), arrays[name].shape
+        if name.endswith("shapes") and len(shape) == 3 and shape[1] <= rank:
+            wanted = (n, shape[1], shape[1])
+        if values.dtype != kind or shape != wanted or (not name.endswith("shapes") and 0 in shape):
+            raise BundleError(
+                f"{MEANS} holds {name} {values.dtype} {shape} for {n} labels; {kind} {list(wanted)} is wanted, a row a label"
+            )
+        if not np.isfinite(values).all():
+            raise BundleError(f"{MEANS} holds {name} that are not finite; export the bundle again")
+    if not (arrays["spread"] > 0).all():
+        raise BundleError(
+            f"{MEANS} holds spread {arrays['spread'].tolist()}, which must be above 0; export the bundle again"
+        )

@@ -1,0 +1,157 @@
+"""The box's key for enrolments: made at the install, private, for nothing else; what is said where it is missing or damaged."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from appliance.core.errors import BundleError, ConfigError
+from appliance.deployment import enrolment_key, signature
+from appliance.deployment.enrolment_key import KEY, NAMESPACE, SIGNER, EnrolmentKey
+from tests.factories import deliveries, install_scripts
+
+pytestmark = deliveries.NEEDED
+DATA = b"any enrolment"
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> EnrolmentKey:
+    """A key as an install makes it."""
+    return install_scripts.enrolment_key(tmp_path / "enrolment")
+
+
+def test_an_install_makes_a_private_key_once(key: EnrolmentKey):
+    """Nobody else may read it, it signs, the signer believes it; another install changes nothing."""
+    assert (key.folder / KEY).stat().st_mode & 0o777 == 0o400
+    assert (key.folder / SIGNER).stat().st_mode & 0o777 == 0o644
+    assert key.folder.stat().st_mode & 0o777 == 0o750
+    assert sorted(os.listdir(key.folder)) == [KEY, SIGNER]
+    before = {name: (key.folder / name).read_bytes() for name in (KEY, SIGNER)}
+    key.check()
+    install_scripts.enrolment_key(key.folder)
+    assert {name: (key.folder / name).read_bytes() for name in (KEY, SIGNER)} == before
+    key.verify(DATA, key.sign(DATA))
+
+
+def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
+    """Another box's signature, one of other data, one for another use, a cut one: none passes."""
+    other = install_scripts.enrolment_key(tmp_path / "other")
+    assert (other.folder / KEY).read_bytes() != (key.folder / KEY).read_bytes()
+    good = key.sign(DATA)
+    bundles = signature.sign(DATA, key.folder / KEY)
+    for data, signed in (
+        (DATA, other.sign(DATA)),
+        (DATA + b"!", good),
+        (DATA, bundles),
+        (DATA, good[:80]),
+        (DATA, b""),
+    ):
+        with pytest.raises(BundleError, match=r"not enrolled on this box, or altered since .*palpate enrol"):
+            key.verify(data, signed)
+    key.verify(DATA, good)
+
+
+def test_the_key_signs_no_bundle(key: EnrolmentKey, tmp_path: Path):
+    """Even an administrator who puts its line among the signers of bundles makes none of its signatures one of a bundle."""
+    signers = tmp_path / "allowed_signers"
+    signers.write_text((key.folder / SIGNER).read_text())
+    for signed in (key.sign(DATA), signature.sign(DATA, key.folder / KEY)):
+        with pytest.raises(BundleError, match="namespace"):
+            signature.verify(DATA, signed, signers)
+
+
+def lost(key: EnrolmentKey) -> None:
+    """The private key is gone."""
+    (key.folder / KEY).unlink()
+
+
+def open_to_all(key: EnrolmentKey) -> None:
+    """Others may read it."""
+    (key.folder / KEY).chmod(0o444)
+
+
+def cut(key: EnrolmentKey) -> None:
+    """Half of it is left."""
+    path = key.folder / KEY
+    half = path.read_bytes()[: path.stat().st_size // 2]
+    path.chmod(0o600)
+    path.write_bytes(half)
+    path.chmod(0o400)
+
+
+def empty(key: EnrolmentKey) -> None:
+    """Nothing of it is left."""
+    (key.folder / KEY).chmod(0o600)
+    (key.folder / KEY).write_bytes(b"")
+    (key.folder / KEY).chmod(0o400)
+
+
+def of_another(key: EnrolmentKey) -> None:
+    """The key of another box is there."""
+    other = install_scripts.enrolment_key(key.folder.parent / "another")
+    shutil.copy2(other.folder / KEY, key.folder / "new")
+    (key.folder / "new").replace(key.folder / KEY)
+
+
+def unsigned(key: EnrolmentKey) -> None:
+    """The signer is gone."""
+    (key.folder / SIGNER).unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lost, "key: No such file or directory, so nothing can be enrolled"),
+        (open_to_all, r"may be read by others \(mode 444\)"),
+        (cut, "key is damaged; take it and signer away, run make install again"),
+        (empty, "key is damaged"),
+        (of_another, "is not the key of .*enrolled again"),
+        (unsigned, "cannot be checked: .*signer cannot be read.*make install makes it again from key"),
+    ],
+)
+def test_a_key_that_cannot_be_used_is_told_with_what_to_do(
+    key: EnrolmentKey, spoil: Callable[[EnrolmentKey], None], why: str
+):
+    """Missing, open to others, damaged, another box's, without a signer: before the robot sweeps, in one line."""
+    spoil(key)
+    with pytest.raises(ConfigError, match=why) as e:
+        key.check()
+    assert "\n" not in str(e.value)
+
+
+def test_what_was_enrolled_is_believed_without_the_private_key(key: EnrolmentKey):
+    """Where the key is lost the box goes on with what it has; the next install makes no other one, which would end that."""
+    signed = key.sign(DATA)
+    lost(key)
+    install_scripts.enrolment_key(key.folder)
+    assert os.listdir(key.folder) == [SIGNER]
+    key.verify(DATA, signed)
+
+
+def test_a_lost_signer_is_made_again_from_the_key(key: EnrolmentKey):
+    """As `make install` does; what was signed before is believed again."""
+    signed, before = key.sign(DATA), (key.folder / SIGNER).read_bytes()
+    unsigned(key)
+    install_scripts.enrolment_key(key.folder)
+    assert (key.folder / SIGNER).read_bytes() == before
+    key.verify(DATA, signed)
+    unsigned(key)
+    cut(key)
+    with pytest.raises(subprocess.CalledProcessError) as e:
+        install_scripts.enrolment_key(key.folder)
+    assert b"key is damaged; take it away" in e.value.stderr
+
+
+def test_a_box_without_ssh_keygen_says_so(key: EnrolmentKey, monkeypatch: pytest.MonkeyPatch):
+    """It is neither a damaged key nor a wrong signature."""
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(ConfigError, match="ssh-keygen is missing"):
+        key.sign(DATA)
+    with pytest.raises(ConfigError, match="ssh-keygen is missing"):
+        key.verify(DATA, b"")
+    assert NAMESPACE == enrolment_key.NAMESPACE != signature.NAMESPACE
