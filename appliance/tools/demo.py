@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import select
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import IO, Any
 
 from numpy.typing import NDArray
@@ -50,11 +50,13 @@ class Demo:
     """Steps a box until enough answers have come to the robot's end of its serial line, and shows what happens.
 
     played: the acts of the simulated robot, which hold the true materials. far_end: non-blocking file descriptor of the
-    robot's end. raw: print the sentences alone.
+    robot's end. labels: that the bundle knows. raw: print the sentences alone.
     """
 
-    def __init__(self, played: Sequence[Act], far_end: int, clock: Clock, out: IO[str], *, raw: bool) -> None:
-        self.score = AnswerScore()
+    def __init__(
+        self, played: Sequence[Act], far_end: int, clock: Clock, out: IO[str], labels: Collection[str], *, raw: bool
+    ) -> None:
+        self.score = AnswerScore(frozenset(labels))
         self._played, self._clock, self._out = played, clock, out
         self._far_end, self._raw = far_end, raw
         self._live = not raw and out.isatty()
@@ -65,13 +67,13 @@ class Demo:
     def run(self, box: Box, sweeps: int, stopped: Callable[[], bool]) -> None:
         """Step `box` until `sweeps` answers were read or `stopped()`."""
         sent = 0
-        while self.score.total.total() < sweeps and not stopped():
+        while self.score.answers < sweeps and not stopped():
             sent += len(box.step())
             self._read(sent, sweeps)
             if self._live and self._clock.now_ns() >= self._next_ns and (frame := box.newest_frame()) is not None:
                 self._next_ns = self._clock.now_ns() + FRAME_NS
                 self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""])
-        if not self._raw and self.score.total:
+        if not self._raw and self.score.answers:
             lost = f"  frames lost     {box.counters.lost_frames} of {box.counters.frames + box.counters.lost_frames}"
             touch = [f"  touch time      {self.score.touch(box.format.rate_hz)}"] if self.score.early else []
             self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}", *touch)
@@ -79,11 +81,11 @@ class Demo:
     def _read(self, sent: int, wanted: int) -> None:
         """Read what has come to the robot's end; wait for answers that were sent and have not come; stop at
         `wanted`."""
-        while select.select([self._far_end], [], [], ARRIVAL_S if self.score.total.total() < sent else 0)[0]:
+        while select.select([self._far_end], [], [], ARRIVAL_S if self.score.answers < sent else 0)[0]:
             *lines, self._rest = (self._rest + os.read(self._far_end, 65536)).split(b"\r\n")
             for line in lines:
                 self._show(line.decode("ascii"))
-                if self.score.total.total() == wanted:
+                if self.score.answers == wanted:
                     return
 
     def _show(self, line: str) -> None:
@@ -93,7 +95,8 @@ class Demo:
         if answer is None:
             return
         act = self._played[answer.sweep - 1]
-        mark = "right" if self.score.add(act, answer) else "wrong"
+        right = self.score.add(act, answer)
+        mark = ("right" if right else "wrong") if act.label in self.score.labels else "not in the bundle"
         if not self._raw:
             named = answer.label or answer.status
             used = f"  after {answer.share:.0%} of the window" if answer.share < 1 else ""

@@ -16,11 +16,13 @@ from appliance.sim.rig import Act
 class AnswerScore:
     """Counts of the answers so far.
 
-    right, total: by material. objects: whether the last answer for each object was right, where NEW OBJECT was
+    labels: that the bundle knows. right, total: by material; a material that the bundle does not know is `unknown` at best.
+    objects: whether the last answer for each object was right, where NEW OBJECT was
     signalled. early: answers that did not need the whole window. slide_frames: frames from START to STOP, of all
     sweeps.
     """
 
+    labels: frozenset[str]
     right: Counter[str] = field(default_factory=Counter)
     total: Counter[str] = field(default_factory=Counter)
     objects: list[bool] = field(default_factory=list)
@@ -29,23 +31,33 @@ class AnswerScore:
     slide_frames: int = 0
 
     def add(self, act: Act, answer: Answer) -> bool:
-        """Count an answer; True where it names the material of `act`."""
-        right = answer.label == act.label and answer.status == Status.OK
+        """Count an answer; True where it names the material of `act`, or says of one that the bundle does not know that it is
+        unknown."""
+        known = act.label in self.labels
+        right = answer.label == act.label and answer.status == Status.OK if known else answer.status == Status.UNKNOWN
         self.total[act.label] += 1
         self.right[act.label] += right
         self.latency_ms.append(answer.latency_ms)
         self.early += answer.share < 1
         self.slide_frames += act.stop - act.start
+        if not known:
+            return right
         if act.new_object:
             self.objects.append(right)
         elif self.objects:
             self.objects[-1] = right
         return right
 
+    @property
+    def answers(self) -> int:
+        """How many there are."""
+        return self.total.total()
+
     def table(self) -> list[str]:
-        """Lines with right answers and their number: by material, of all sweeps, of all objects."""
-        rows = [(name, self.right[name], self.total[name]) for name in sorted(self.total)]
-        sums = [("all sweeps", self.right.total(), self.total.total())]
+        """Lines with right answers and their number: by material, of all sweeps, of all objects, all of materials that the bundle
+        knows; then how many sweeps of other materials were called unknown."""
+        rows = [(name, self.right[name], self.total[name]) for name in sorted(self.total.keys() & self.labels)]
+        sums = [("all sweeps", sum(right for _, right, _ in rows), sum(n for *_, n in rows))] if rows else []
         if self.objects:
             sums.append(("all objects", sum(self.objects), len(self.objects)))
         lines = [f"  {name:<16}{right:>5} / {n}" for name, right, n in rows]
@@ -53,11 +65,14 @@ class AnswerScore:
             low, high = wilson(right, n)
             percent = f"{100 * right / n:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
             lines.append(f"  {name:<16}{right:>5} / {n:<5} {percent}")
+        if others := sorted(self.total.keys() - self.labels):
+            right, n = (sum(counts[name] for name in others) for counts in (self.right, self.total))
+            lines.append(f"  not in the bundle: {right} of {n} sweeps called unknown ({', '.join(others)})")
         return ["  material        right / all", *lines]
 
     def touch(self, rate_hz: float) -> str:
         """Mean touch time, from the start edge to the stop edge, and how many answers came before it."""
-        n = self.total.total()
+        n = self.answers
         return f"{self.slide_frames / n / rate_hz:.2f} s mean, {self.early} of {n} answered early"
 
     def latency(self) -> str:

@@ -498,7 +498,7 @@ def test_the_demo_shows_what_it_saves(rigged: Callable[..., Rigged]):
     for slides, early in (((slid(60), slid(10)), 1), ((slid(10), slid(10)), 0)):
         simulated = simulated_slides(*slides)
         box, out = rigged(simulated, SETS, toy()), io.StringIO()
-        show = demo.Demo(simulated.robot.played, box.far_end, simulated.clock, out, raw=False)
+        show = demo.Demo(simulated.robot.played, box.far_end, simulated.clock, out, toy().manifest.labels, raw=False)
         show.run(box.box, 2, lambda: False)
         assert out.getvalue().count("after 20% of the window") == early
         want = [(a.stop - a.start) / 100 for a in simulated.robot.played]

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
 from appliance.cli.main import main
 from appliance.sim import script
 from appliance.tools import demo
+from tests.factories import deliveries
 from tests.factories.simulated_box import numbered
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
@@ -64,7 +68,42 @@ def test_demo_of_a_set_ends_with_the_set(tmp_path: Path, default_bundle: Bundle,
     assert main(["demo", "--virtual", *which]) == 0
     out = capsys.readouterr().out
     assert out.count(" -> ") == 3
-    assert "all sweeps" in out
+    assert "not in the bundle: " in out
+
+
+def test_materials_that_the_bundle_never_learnt_are_counted_apart(
+    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
+):
+    """A bundle of two of the simulated materials: the others are no wrong answers, and `unknown` is what they should be."""
+    files = bundle.files(bundle.DEFAULT)
+    names = [f"x{i}" for i in range(len(default_bundle.manifest.labels))]
+    names[:2] = default_bundle.manifest.labels[:2]
+    text = replace(default_bundle.manifest, labels=tuple(names)).json()
+    folder = deliveries.put(tmp_path / "few", files | {bundle.MANIFEST: text})
+    assert main(["demo", "--virtual", "--sweeps", "12", "--set", f"classifier.bundle={folder}"]) == 0
+    out = capsys.readouterr().out
+    table = out[out.index("right / all") :].splitlines()
+    assert sorted(line.split()[0] for line in table[1:3]) == sorted(name.split()[0] for name in names[:2])
+    assert table[3].split()[:5] == ["all", "sweeps", "4", "/", "4"]
+    others = ", ".join(sorted(set(default_bundle.manifest.labels[2:])))
+    assert f"not in the bundle: 0 of 8 sweeps called unknown ({others})" in out
+    assert out.count("  not in the bundle  ") == 8
+
+
+def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
+    tmp_path: Path, default_bundle: Bundle, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """On an installed box what was deployed is for user palpate alone: said, with what to do, and the demo plays."""
+
+    def refused(path: object) -> str:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(os, "readlink", refused)
+    assert main(["demo", *VIRTUAL, "--set", f"store.folder={tmp_path}"]) == 0
+    output = capsys.readouterr()
+    assert f"{tmp_path}/current: Permission denied, so the packaged bundle plays" in output.err
+    assert "sudo -u palpate" in output.err
+    assert output.out.count(f",{default_bundle.id},") == 3
 
 
 @pytest.mark.parametrize("text", ["0", "-3", "many", "1.5"])

@@ -26,7 +26,7 @@ def act(label: str, *, new_object: bool = False) -> Act:
 
 def test_only_ok_with_the_right_label_counts():
     """Another label, and the right one that is unsure, are wrong; percentages have their intervals."""
-    score = AnswerScore()
+    score = AnswerScore(frozenset({"wood", "paper"}))
     answers = [answer(1, "wood"), answer(2, "wood"), answer(3, "wood", Status.UNSURE), answer(4, "wood", share=0.5)]
     right = [score.add(act(name), one) for name, one in zip(("wood", "paper", "wood", "wood"), answers, strict=True)]
     assert right == [True, False, False, True]
@@ -41,11 +41,30 @@ def test_only_ok_with_the_right_label_counts():
 
 def test_an_object_counts_by_its_last_answer():
     """Two sweeps of the first object, one of the second."""
-    score = AnswerScore()
+    score = AnswerScore(frozenset({"wood", "paper"}))
     for new, label in ((True, "paper"), (False, "wood"), (True, "paper")):
         score.add(act("wood", new_object=new), answer(1, label))
     assert score.objects == [True, False]
     assert score.table()[-1].startswith("  all objects         1 / 2     50.0 % [")
+
+
+def test_a_material_that_the_bundle_does_not_know_is_unknown_at_best():
+    """It is counted apart, and no object is wrong for it."""
+    score = AnswerScore(frozenset({"wood"}))
+    right = [
+        score.add(act("cork", new_object=True), answer(1, "wood")),
+        score.add(act("cork"), answer(2, "", Status.UNKNOWN)),
+        score.add(act("felt"), answer(3, "", Status.UNSURE)),
+        score.add(act("wood"), answer(4, "wood")),
+    ]
+    assert right == [False, True, False, True]
+    assert score.answers == 4
+    assert score.objects == []
+    assert score.table()[1:] == [
+        "  wood                1 / 1",
+        "  all sweeps          1 / 1     100.0 % [20.7, 100.0]",
+        "  not in the bundle: 1 of 3 sweeps called unknown (cork, felt)",
+    ]
 
 
 def test_another_sentence_is_no_answer():
