@@ -29,6 +29,16 @@ def test_an_image_is_named_by_what_goes_in(monkeypatch: pytest.MonkeyPatch):
     assert image._box_name() != box
 
 
+def test_the_guest_s_wheels_are_those_of_its_python(monkeypatch: pytest.MonkeyPatch):
+    """Whatever Python builds the virtual box: of packages that differ between 3.11 and 3.12 the guest gets those for 3.11."""
+    lock = image.guest_lock()
+    assert "numpy==2.4" in lock
+    assert "numpy==2.5" not in lock
+    assert ";" not in lock
+    monkeypatch.setattr(image, "GUEST_PYTHON", "3.13")
+    assert "numpy==2.5" in image.guest_lock()
+
+
 def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
     """A step that fails names its command and output; no folder is left that looks like an image."""
 

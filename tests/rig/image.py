@@ -18,6 +18,7 @@ from pathlib import Path
 
 from tests.factories import emulated_machines
 from tests.factories.emulated_machines import ROOT, Missing, run, whole
+from tests.factories.install_scripts import run_here
 
 HERE = Path(__file__).parent
 GUEST = HERE / "guest"
@@ -135,8 +136,10 @@ def _make_ground(part: Path) -> None:
     subprocess.run([*apt, "apt-get", "-qq", "download", package, "busybox-static"], cwd=part, check=True)
     for deb in part.glob("*.deb"):
         run("dpkg-deb", "-x", deb, part / ("kernel" if "linux-image" in deb.name else "busybox"))
+    lock = part / emulated_machines.LOCK.name
+    lock.write_text(guest_lock())
     run(*emulated_machines.PIP, "download", *emulated_machines.ARM_WHEELS, "--python-version", GUEST_PYTHON,
-        "--require-hashes", "-r", emulated_machines.LOCK, "-d", part / "wheels")  # fmt: skip
+        "--require-hashes", "-r", lock, "-d", part / "wheels")  # fmt: skip
     version = package.removeprefix("linux-image-")
     _make_root(part, version)
     _make_ramdisk(part, version)
@@ -148,9 +151,14 @@ def _make_ground(part: Path) -> None:
             shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
 
 
+def guest_lock() -> str:
+    """The locked dependencies as they are for the guest's Python and processor: pip would choose by this machine's."""
+    return run_here(f"from release import LOCK, locked; print(locked(LOCK.read_text(), '{GUEST_PYTHON}.2', 'aarch64'))")
+
+
 def _make_root(part: Path, version: str) -> None:
     """Debian with the box's virtual environment, the agent and the modules of its kernel."""
-    shutil.copy(emulated_machines.LOCK, part / "wheels")
+    shutil.copy(part / emulated_machines.LOCK.name, part / "wheels")
     (part / "wheels").chmod(0o755)
     pip = "/opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --find-links /wheels"
     hooks = (
