@@ -32,7 +32,7 @@ LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
 UNSURE = 0.5
 """Least probability for status ok where a bundle names none."""
 MOST_BYTES = 64 << 20
-"""Largest file. The largest of our models, the paper's network in int8, has 16 MB; the service is limited to 128 MB."""
+"""Largest file. The largest of our models, the paper's network in int8, has 16 MB; what a model may need in memory is checked by onnx_check."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
 

@@ -35,6 +35,9 @@ FAILURES = 3
 """The candidate is no longer asked after it failed on so many sweeps in a row."""
 SLOW_NS = 100_000_000
 """A candidate that computes for longer has failed on the sweep: frames wait for it."""
+MOST_MEMORY = 180 << 20
+"""Bytes that the candidate's model and the current one may need together, by the account of onnx_check: the service may have
+256 MB (systemd/palpate.service), and needs 60 without a model."""
 STARTS = 3
 """After so many starts in a row that did not last PERIOD_NS, the candidate is not loaded any more."""
 PERIOD_NS = 60_000_000_000
@@ -131,6 +134,12 @@ class Shadow(Observer):
             raise BundleError(
                 f"candidate {candidate.id} wants {candidate.format}, the bundle in service {current.format}: one skin "
                 "cannot serve both; commit to it without a shadow"
+            )
+        if candidate.memory + current.memory > MOST_MEMORY:
+            raise BundleError(
+                f"candidate {candidate.id} may need {candidate.memory >> 20} MB and the bundle in service "
+                f"{current.memory >> 20}, which is more than the {MOST_MEMORY >> 20} that there are for both; commit to it "
+                "without a shadow"
             )
         self._clock, self._failures_in_row, self._tare = clock, 0, current.manifest.tare
         self._log = TroubleLog(f"shadow: {folder} cannot be written", "make room there; classifying goes on")

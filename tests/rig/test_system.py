@@ -264,7 +264,7 @@ def test_memory_limit(box: Cell, note: Callable[..., None]):
     limit = "systemctl set-property --runtime palpate MemoryMax="
     box.machine.run(limit + "4M", timeout_s=120)
     until_logged(box, "oom-kill")
-    box.machine.run(limit + "128M", timeout_s=120, check=True)
+    box.machine.run(limit + "256M", timeout_s=120, check=True)
     until_logged(box, "skin: streaming", streamed)
     box.until_ready()
     sound(box)

@@ -33,7 +33,7 @@ MOST_TENSOR = 64 << 20
 """Bytes of one tensor. The largest of our own are the weights of the paper's CNN in int8, 63 MB once they are floats."""
 MOST_MEMORY = 160 << 20
 """Bytes of all of a model by the account of `_Cost`. Our own largest: the paper's CNN in int8 151 MB, MiniRocket 93 MB.
-onnxruntime never took more than this account, and 9 MB for itself; so the box stays below 256 MB whatever it is given."""
+onnxruntime never took more than this account, and 9 MB for itself; so the service stays below its MemoryMax of 256 MB."""
 COPIES = 3
 """Of a constant in memory: in the parsed file, as a tensor, and laid out for the processor."""
 MOST_WORK = 2_000_000_000
@@ -71,9 +71,9 @@ class _Cost:
 
 def check(
     model: bytes, manifest: Manifest, features: int | None = None, enrolled: int = 0, rank: int | None = None
-) -> None:
-    """Raises BundleError where `model` is not an ONNX file that the box may run as the model of a bundle like this. No
-    other place looks at inputs and outputs.
+) -> int:
+    """Bytes of memory that `model` needs at most, by the account of MOST_MEMORY. Raises BundleError where it is not an ONNX
+    file that the box may run as the model of a bundle like this. No other place looks at inputs and outputs.
 
     features: numbers of the input, where it is not raw counts. enrolled: how many of the labels the model does not know.
     rank: numbers of the embedding. None stands for any number above 0.
@@ -84,12 +84,13 @@ def check(
         _versions(read)
         need(read.graph is not None, "it has no graph")
         _takes(read.graph, manifest, features)
-        known = _followed(read.graph, len(model))
+        known, cost = _followed(read.graph, len(model))
         for declared in (*read.graph.value_info, *read.graph.output):
             _agree(declared, known)
         _gives([declared.name for declared in read.graph.output], known, manifest, enrolled, rank)
     except BundleError as e:
         raise BundleError(f"the model must not be opened: {str(e)[:MOST_LETTERS]}; export the bundle again") from e
+    return cost.bytes + cost.workspace
 
 
 def _bytes(value: Value) -> int:
@@ -118,8 +119,8 @@ def _takes(graph: Message, manifest: Manifest, features: int | None) -> None:
     need(fits, f"it takes {kind} {list(shape)}, the manifest has {want} {list(form)}")
 
 
-def _followed(graph: Message, size: int) -> dict[str, Value]:
-    """All values of the graph by name: the input, the constants, what each node gives. size: bytes of the file."""
+def _followed(graph: Message, size: int) -> tuple[dict[str, Value], _Cost]:
+    """All values of the graph by name: the input, the constants, what each node gives; and its cost. size: bytes of the file."""
     for what, have, most in ("nodes", graph.node, MOST_NODES), ("constants", graph.initializer, MOST_CONSTANTS):
         need(len(have) <= most, f"it has {len(have)} {what} (limit {most})")
     (declared,) = graph.input
@@ -133,7 +134,7 @@ def _followed(graph: Message, size: int) -> dict[str, Value]:
             _follow(node, known, cost)
         except BundleError as e:
             raise BundleError(f"node {number} {node.name[:80]!r} ({node.op_type[:80]!r}): {e}") from e
-    return known
+    return known, cost
 
 
 def _fits(shape: Shape, form: Form) -> bool:
