@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,7 +31,7 @@ def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
             arrays = dict(z.items())
         return {name: arrays[name] for name in names} | arrays
-    except (*UNREADABLE, OSError, KeyError, zipfile.BadZipFile) as e:
+    except (*UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
         raise BundleError(f"{file} cannot be read: {e}; export the bundle again") from e
 
 

@@ -1,4 +1,5 @@
-"""The campaign of fuzzed models: our own, changed at random, through the box's check, onnxruntime and a run.
+"""The campaign of fuzzed models: our own, changed at random, through the box's check, onnxruntime and a run; and of fuzzed
+enrolments, beside the default bundle, through their check and the classifier.
 
 `python -m tests.campaigns.hostile_fuzz --count 10000 --seed 1 --out FILE.json` (make it `nice`; a stopped one goes
 on where it was). Each model is opened in a child that may take 256 MB more than it had and ten seconds; what matters is
@@ -23,11 +24,16 @@ from typing import Any
 
 import numpy as np
 
-from appliance.bundle.bundle import Manifest, Thresholds
+from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle, Manifest, Thresholds
 from appliance.bundle.onnx_check import check
 from appliance.core import storage
+from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError
+from appliance.core.types import Frames, Status, Sweep
+from appliance.inference.classifier import Classifier
 from appliance.inference.session import session
+from tests.factories import mutated_enrolments
 from tests.factories.grown_models import FORM, grown
 from tests.factories.mutated_models import Own, mutated, own_models
 from train.metrics.score import provenance
@@ -39,6 +45,10 @@ BATCH = 50
 """Models that a child takes one after another: a fork for each costs more than the model."""
 GROWN = 0.25
 """Share of models that grow by the check's own rules instead of being one of ours that was changed: they reach farther."""
+ENROLLED = 0.1
+"""Share of enrolments."""
+ENROLLING = Own("enrolment", b"", bundle.load(bundle.DEFAULT).manifest)
+"""Stands for the default bundle with an enrolment; the bytes are those of the enrolment."""
 GROWING = Own("grown", b"", Manifest("grown", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255), {}))
 SORRY = ("refused", "onnxruntime refused", "run refused", "ran")
 """What may become of a model; anything else is a find."""
@@ -52,14 +62,16 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
     outcome, why, checked_s = "refused", "", 0.0
     try:
         try:
-            check.check(model, own.manifest)
+            taken = checked(model, own)
         finally:
             checked_s = time.process_time() - begin_cpu
         outcome = "onnxruntime refused"
-        opened = session(model)
+        opened = Classifier(taken, SystemClock()) if taken else session(model)
         outcome = "run refused"
         run(opened, rng)
         outcome = "ran"
+    except FloatingPointError as e:
+        outcome, why = "no number", str(e)
     except MemoryError:
         outcome = "no memory"
     except Exception as e:  # onnxruntime's own classes share no base but this
@@ -73,14 +85,37 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
     return {"outcome": outcome, "why": why[:200], "check_ms": 1e3 * checked_s, "mb": more, "s": took}
 
 
+def checked(model: bytes, own: Own) -> Bundle | None:
+    """What the box does with it first; the bundle of an enrolment. Raises BundleError where it is refused."""
+    if own is ENROLLING:
+        return bundle.from_files(mutated_enrolments.packaged() | {bundle.ENROLMENT: model}, "a campaign")
+    check.check(model, own.manifest)
+    return None
+
+
 def run(opened: Any, rng: Random) -> None:
-    """Three sweeps: at rest, at the end of the scale, of noise."""
+    """Three sweeps: at rest, at the end of the scale, of noise. Raises FloatingPointError where a classifier names a material
+    without a probability."""
+    if isinstance(opened, Classifier):
+        classify(opened, rng)
+        return
     (takes,) = opened.get_inputs()
     kind = np.dtype({"tensor(float)": "float32"}.get(takes.type, takes.type[7:-1]))
     top = 1e6 if kind.kind == "f" else np.iinfo(kind).max
     noise = np.random.default_rng(rng.getrandbits(32)).uniform(0, top, takes.shape)
     for window in (np.zeros(takes.shape), np.full(takes.shape, top), noise):
         opened.run(None, {takes.name: window.astype(kind)})
+
+
+def classify(classifier: Classifier, rng: Random) -> None:
+    """The same by a classifier, with the golden sweeps, which have contact and get as far as the class means."""
+    f = classifier.format
+    noise = np.random.default_rng(rng.getrandbits(32)).integers(0, 255, (f.window, *f.shape)).astype(f.numpy_type)
+    number = np.arange(f.window)
+    for window in (np.zeros_like(noise), np.full_like(noise, 255), noise, *classifier.bundle.golden):
+        verdict = classifier(Sweep(1, 0, 0, Status.OK, Frames(number, number, window)))
+        if verdict.label and not 0 <= verdict.probability <= 1:
+            raise FloatingPointError(f"{verdict.label!r} with probability {verdict.probability}")
 
 
 def memory(name: str) -> int:
@@ -99,6 +134,8 @@ class Fuzz:
     def model(self, number: int) -> tuple[bytes, Own, Random]:
         """The model of this number."""
         rng = Random(f"{self.seed}/{number}")
+        if rng.random() < ENROLLED:
+            return mutated_enrolments.mutated(rng), ENROLLING, rng
         if rng.random() < GROWN:
             return grown(rng), GROWING, rng
         own = rng.choice(self.owns)

@@ -124,8 +124,15 @@ def test_an_enrolment_that_is_not_as_it_must_be_is_refused(made: dict[str, bytes
 
 def test_a_file_that_is_no_npz_is_refused(made: dict[str, bytes]):
     """Cut, empty, something else, or a zip that unpacks without end."""
-    for data in (b"", b"PK", made[bundle.ENROLMENT][:200], b"\0" * 1000):
+    whole = made[bundle.ENROLMENT]
+    for data in (b"", b"PK", whole[:200], b"\0" * 1000):
         check_refused(made | {bundle.ENROLMENT: data}, "enrolment.npz cannot be read")
+    name, extra = (int.from_bytes(whole[at : at + 2], "little") for at in (26, 28))
+    packed, central = 30 + name + extra, whole.index(b"PK\1\2")
+    for at, value in ((packed, 0xFF), (central + 8, 1), (central + 10, 99)):  # no deflate, encrypted, method 99
+        check_refused(
+            made | {bundle.ENROLMENT: whole[:at] + bytes([value]) + whole[at + 1 :]}, "enrolment.npz cannot be read"
+        )
     bomb = io.BytesIO()
     np.savez_compressed(bomb, **content(made) | {"zeros": np.zeros(70 << 20, np.uint8)})
     check_refused(made | {bundle.ENROLMENT: bomb.getvalue()}, "unpacks to .* bytes")

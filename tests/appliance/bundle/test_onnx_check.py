@@ -249,6 +249,18 @@ def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
 
 
 @pytest.mark.slow
+def test_fuzzed_enrolments_are_refused_or_answer(owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
+    """A hundred of the campaign's enrolments alone: none names a material without a probability, and some get that far."""
+    monkeypatch.setattr(hostile_fuzz, "ENROLLED", 1.0)
+    record = hostile_fuzz.fresh(4)
+    for told in hostile_fuzz.Fuzz(owns, 4).results(0, 100):
+        hostile_fuzz.note(record, told)
+    assert record["finds"] == []
+    assert record["outcomes"]["refused"] >= 50
+    assert record["outcomes"]["ran"] >= 5
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["dies", "hangs", "swells"])
 def test_the_campaign_would_tell(how: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
     """A child that dies, hangs or takes too much memory is told, with its number, and the next model is tried."""

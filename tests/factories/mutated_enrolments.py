@@ -1,0 +1,76 @@
+"""Enrolments that mean harm: those of the default bundle, changed at random, as whoever has a box's key might sign them. In: a
+generator. Out: the bytes of enrolment.npz.
+
+Two kinds of change: of bytes, which mostly break the file, and of arrays, which leave a file that can be read.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from functools import cache
+from random import Random
+
+import numpy as np
+
+from appliance.bundle import bundle
+from appliance.bundle.enrolled import ARRAYS
+from tests.factories import deliveries
+from tests.factories.mutated_models import FLOATS, NUMBERS, flip
+
+LABELS = ("cork", "felt", "silk")
+
+
+@cache
+def packaged() -> dict[str, bytes]:
+    """The files of the bundle that they add to."""
+    return bundle.files(bundle.DEFAULT)
+
+
+@cache
+def own(labels: int) -> bytes:
+    """A right one with so many labels."""
+    files = packaged()
+    for label in LABELS[:labels]:
+        files = deliveries.enrolled(files, None, label)
+    return files[bundle.ENROLMENT]
+
+
+def mutated(rng: Random) -> bytes:
+    """One with one to four changes."""
+    data = own(rng.randint(1, 3))
+    if rng.random() < 0.2:
+        return flip(data, rng, data)
+    with np.load(io.BytesIO(data)) as z:
+        arrays = dict(z.items())
+    for _ in range(rng.randint(1, 4)):
+        name = rng.choice(ARRAYS)
+        arrays[name] = _changed(arrays.get(name, np.zeros(1)), rng)
+        if rng.random() < 0.05:
+            del arrays[name]
+    file = io.BytesIO()
+    (np.savez_compressed if rng.random() < 0.5 else np.savez)(file, **arrays)
+    return file.getvalue()
+
+
+def _changed(values: np.ndarray, rng: Random) -> np.ndarray:
+    """Another number in it, other sizes, another type, or a label that is not one."""
+    if values.dtype.kind == "U":
+        text = rng.choice(("", "wood", "a,b", "x" * 25, "\0", "cork", "é", "$PPLP"))
+        return np.array(text) if not values.ndim or rng.random() < 0.2 else np.array([text] * len(values))
+    how = rng.random()
+    if how < 0.5 and values.size:
+        changed = values.copy()
+        at = rng.sample(range(values.size), min(values.size, rng.choice((1, 1, 5, 10**6))))
+        limits = np.iinfo(values.dtype) if values.dtype.kind in "iu" else None
+        number = rng.choice(NUMBERS if limits else FLOATS)
+        changed.ravel()[at] = min(max(number, limits.min), limits.max) if limits else number
+        return changed
+    if how < 0.75:
+        shape = tuple(rng.choice((0, 1, n, n + 1)) for n in values.shape)
+        return np.resize(values, shape) if values.size else np.zeros(shape, values.dtype)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numbers that the other type does not have
+        return values.astype(
+            rng.choice(("float64", "float32", "float16", "int64", "int8", "uint8", "complex64", "bool"))
+        )
