@@ -21,6 +21,7 @@ from appliance.io.robot_link import StdoutPort
 from appliance.runtime import assembly
 from appliance.sim import devices, script, skin
 from appliance.sim.rig import VirtualClock
+from tests.factories.page_reader import PageReader
 from tests.factories.paths import NO_SITE
 from tests.rig import soak, soak_judge, soak_page
 from tests.rig.soak_boxes import Gone, Reckoned, Script, ThisMachine, process
@@ -464,11 +465,16 @@ def test_the_page_needs_nothing_else_and_tells_all(result):
     assert not re.search(
         r"<script(?! type=\"application/json\")|<link|<img|@import|url\((?!#)|href=\"(?!#|\.\./)", html
     )
-    for text in ("this machine", "virtual box", "third box; it was not there", "answer 7 came again", "not reached",
+    for text in ("this machine", "virtual box", "third box; it was not there", "answer 7 came again", "missed",
                  "growth of memory", "too short to judge", "abc"):  # fmt: skip
         assert text in html, text
     assert svg.replace(SCHEMES, "") in html
     assert len(svg) < 60_000
+    text = PageReader(html).text
+    assert re.search(r"This machine: \d of 7 targets reached\.", text)
+    assert re.search(
+        r"The virtual box: \d of 7 targets reached; missed: sentences out of order, broken or missing, 1", text
+    )
 
 
 def test_a_day_of_sweeps_stays_a_small_picture(result):
@@ -497,6 +503,10 @@ def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
               "started": "now", "runs": [soak.asdict(clean)]}  # fmt: skip
     soak.write(tmp_path / "this-machine.json", record)
     assert soak.draw(tmp_path, tmp_path / "page")
+    first = (tmp_path / "page" / "index.html").read_text()
+    (tmp_path / "page" / "index.html").unlink()
+    assert soak.draw(tmp_path / "no records", tmp_path / "page")
+    assert (tmp_path / "page" / "index.html").read_text() == first
     record["runs"][0]["due"] += 1
     soak.write(tmp_path / "this-machine.json", record)
     assert not soak.draw(tmp_path, tmp_path / "page")

@@ -230,9 +230,12 @@ def soak(
 
 
 def draw(work: Path, out: Path) -> bool:
-    """Put the records together, judge and draw them; False where a target was not reached."""
+    """Put the records together, judge and draw them; False where a target was not reached.
+
+    Where `work` holds no record, those of the page in `out` are judged and drawn again.
+    """
     paths = [work / f"{name.replace(' ', '-')}.json" for name in BOXES]
-    records = [json.loads(path.read_text()) for path in paths if path.exists()]
+    records = [json.loads(path.read_text()) for path in paths if path.exists()] or _drawn(out)
     boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}
     results = {
         "columns": {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE},
@@ -255,6 +258,12 @@ def draw(work: Path, out: Path) -> bool:
     return reached and bool(records)
 
 
+def _drawn(out: Path) -> list[dict[str, Any]]:
+    """The records of the page in `out`; none where there is no page."""
+    path = out / "results.json"
+    return list(json.loads(path.read_text())["boxes"].values()) if path.exists() else []
+
+
 def main() -> int:
     """Run what the arguments say; its exit code."""
     parser = argparse.ArgumentParser(
@@ -267,7 +276,7 @@ def main() -> int:
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "soak", help="where records are kept")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "soak" / "page", help="where the page goes")
     parser.add_argument("--box", choices=BOXES, help="record this one alone, and draw nothing")
-    parser.add_argument("--draw", action="store_true", help="only draw what is there")
+    parser.add_argument("--draw", action="store_true", help="only draw what is there, or the page of --out again")
     args = parser.parse_args()
     hours = args.minutes / 60 if args.minutes else args.hours
     if args.box:

@@ -28,15 +28,21 @@ from tests.rig.soak_judge import (
     targets,
 )
 from train.reports import formatting, html, provenance
-from train.reports.plot_style import ACCENT, BLACK, FAINT, SMALL, WIDTH, add_axes, set_ticks, to_svg
+from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, SMALL, WIDTH, add_axes, set_ticks, to_svg
 
 Json = Mapping[str, Any]
 LOOKS = {"color": ACCENT, "linewidth": 1.8}, {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))}
 """Of the boxes; where both do the same, one shows through the other."""
 DOTS = 1500
 """Dots of a chart; of more sweeps the slowest of each few is drawn."""
-ORIGIN = ("what", "machine", "versions", "commit", "seed", "format", "started", "runs")
-MARKS = {True: "reached", False: "not reached", None: "too short to judge"}
+ORIGIN = {
+    "what": "what runs", "machine": "machine", "versions": "versions", "bundle": "bundle", "commit": "commit", "seed": "seed",
+    "format": "skin", "started": "started (UTC)", "runs": "runs",
+}  # fmt: skip
+"""What was run: names in the records and on the page."""
+
+
+ENDS = {"time": "to its end", "interrupted": "interrupted", "gone": "the box was gone", "": "not ended"}
 
 
 def render(records: Json) -> tuple[str, str]:
@@ -52,6 +58,7 @@ def render(records: Json) -> tuple[str, str]:
         names=list(boxes),
         hours=[f"{_hours(box['sums']['hours'])} on {_the(name)}" for name, box in boxes.items()],
         left_out=[(_the(name), why) for name, why in records["left_out"].items()],
+        verdicts=[f"{_the(name)}: {_verdict(box)}" for name, box in boxes.items()],
         targets=_targets(boxes),
         lines=[f"{_the(name)} {'dashed' if i else 'in blue'}" for i, name in enumerate(boxes)],
         sums=_sums([box["sums"] for box in boxes.values()]),
@@ -64,19 +71,31 @@ def render(records: Json) -> tuple[str, str]:
             for run in box["runs"]
             for at_s, what in run["faults"]
         ],
-        origin=[[name, *(_about(box, name) for box in boxes.values())] for name in ORIGIN],
-    )
+        origin=[[text, *(_about(box, name) for box in boxes.values())] for name, text in ORIGIN.items()],
+    )  # fmt: skip
     return page, svg
 
 
-def _targets(boxes: Json) -> list[list[str]]:
-    """What was asked and what came out, a line for each target."""
-    rows = []
-    for each in zip(*(targets(box["sums"]) for box in boxes.values()), strict=True):
-        marks = [met for *_, met in each]
-        reached = MARKS[False if False in marks else None if None in marks else True]
-        rows.append([each[0][0], each[0][1], *(came for _, _, came, _ in each), reached])
-    return rows
+def _targets(boxes: Json) -> list[Json]:
+    """What was asked and what came out on each box, a line for each target."""
+    each = zip(*(targets(box["sums"]) for box in boxes.values()), strict=True)
+    return [
+        {
+            "what": row[0][0],
+            "target": row[0][1],
+            "here": [came for _, _, came, _ in row],
+            "met": [met for *_, met in row],
+        }
+        for row in each
+    ]
+
+
+def _verdict(box: Json) -> str:
+    """How many targets a box has reached, and which it has missed."""
+    met = {f"{what}, {came}": reached for what, _, came, reached in targets(box["sums"])}
+    missed = [text for text, reached in met.items() if reached is False]
+    count = f"{sum(map(bool, met.values()))} of {len(met)} targets reached"
+    return f"{count}; missed: {'; '.join(missed)}" if missed else count
 
 
 def _sums(sums: Sequence[Json]) -> list[list[str]]:
@@ -91,27 +110,27 @@ def _sums(sums: Sequence[Json]) -> list[list[str]]:
         ("other than the network by itself", lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}"),
         ("frames received", lambda s: f"{s['received']:,}"),
         ("frames lost, reported by the box", lambda s: f"{s['lost']:,}"),
-        ("not accounted for", lambda s: f"{s['unaccounted']:,}"),
-        ("bytes of no packet", lambda s: f"{s['garbage']:,}"),
-        ("enumerations", lambda s: f"{s['enumerations']}"),
+        ("frames not accounted for", lambda s: f"{s['unaccounted']:,}"),
+        ("bytes that belonged to no packet", lambda s: f"{s['garbage']:,}"),
+        ("times that the skin was found on the bus", lambda s: f"{s['enumerations']}"),
         ("sentences dropped", lambda s: f"{s['dropped']}"),
         ("longest silence, s", lambda s: f"{s['silence_s']:.1f}"),
         ("latency, ms: median, 99 %, worst", lambda s: " / ".join(f"{v:.1f}" for v in s["latency_ms"].values())),
-        ("RSS, MiB: start, half-way, end", lambda s: _mib(s["rss_kib"])),
-        ("PSS, MiB: start, half-way, end", lambda s: _mib(s["pss_kib"])),
-        ("slope of the second half, KiB an hour", lambda s: _slope(s["memory"])),
+        ("resident memory, MiB: start, half-way, end", lambda s: _mib(s["rss_kib"])),
+        ("the same, shared pages divided by their users, MiB: start, half-way, end", lambda s: _mib(s["pss_kib"])),
+        ("growth of resident memory in the second half, KiB an hour", lambda s: _slope(s["memory"])),
         ("the same, KiB for 1,000 sweeps", _each),
-        ("share of a core", lambda s: formatting.percent(s["cpu"])),
+        ("share of a core used", lambda s: formatting.percent(s["cpu"])),
     ]
     return [[what, *(of(s) for s in sums)] for what, of in lines]
 
 
 def charts(records: Json) -> str:
     """Four small charts, memory and latency above loss and verdicts."""
-    figure = Figure((WIDTH, 4.4))
+    figure = Figure((WIDTH, 5.0))
     boxes = list(records["boxes"].items())
     hours = max([box["sums"]["hours"] for _, box in boxes] or [0]) or 1
-    by, unit = (1, "min") if hours < 4 else (60, "h")
+    by, unit = (1, "minutes") if hours < 4 else (60, "hours")
     for i, (title, draw) in enumerate(
         (
             ("memory, MiB", _memory),
@@ -121,16 +140,18 @@ def charts(records: Json) -> str:
         )
     ):
         row, column = divmod(i, 2)
-        left, top = 0.075 + 0.5 * column, 0.91 - 0.48 * row
-        axes = add_axes(figure, left, left + 0.41, top, top - 0.34)
-        axes.set_title(title, color=BLACK, size=SMALL + 0.5, loc="left", pad=5)
+        left, top = 0.1 + 0.5 * column, 0.9 - 0.47 * row
+        axes = add_axes(figure, left, left + 0.385, top, top - 0.3)
         axes.set_xlim(0, 60 * hours / by * 1.01)
         for (_, box), look in zip(boxes, LOOKS, strict=False):
             draw(axes, box, look, 60 * by)
-        _scales(axes, unit if row else "")
+        _scales(axes)
+        axes.set_xlabel(f"{unit} since the start", color=GREY, size=SMALL)
+        axes.set_ylabel(title, color=BLACK, size=SMALL + 0.5, rotation=0, ha="left", va="bottom")
+        axes.yaxis.set_label_coords(0, 1.03)
     for i, ((name, _), look) in enumerate(zip(boxes, LOOKS, strict=False)):
         mark = "╍" if "linestyle" in look else "—"
-        figure.text(0.075 + 0.25 * i, 0.985, f"{mark} {name}", color=look["color"], size=SMALL + 0.5, va="center")
+        figure.text(0.1 + 0.25 * i, 0.97, f"{mark} {name}", color=look["color"], size=SMALL + 0.5, va="center")
     with matplotlib.rc_context({"path.simplify": False}):  # it would leave out strokes without length
         return to_svg(figure, "memory, latency, loss and wrong verdicts of a soak over time")
 
@@ -187,18 +208,13 @@ def _wrong(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
     axes.set_ylim(-0.04 * most, max(1.1 * most, axes.get_ylim()[1] if axes.lines[1:] else 0))
 
 
-def _scales(axes: Axes, unit: str) -> None:
-    """Few round ticks; the last of the horizontal ones names its unit."""
+def _scales(axes: Axes) -> None:
+    """Few round ticks."""
     for axis, ends in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
         along = MaxNLocator(4, integer=True, steps=[1, 1.5, 2, 3, 6, 10]) if axis is axes.xaxis else MaxNLocator(4)
         there = [10.0**k for k in range(-3, 7)] if axis.get_scale() == "log" else along.tick_values(*ends)
         ticks = [tick for tick in there if ends[0] <= tick <= ends[1]]
-        if max(ticks, default=0) >= 10_000:
-            set_ticks(axis, ticks, "k", 1e-3)
-        else:
-            set_ticks(axis, ticks, unit if axis is axes.xaxis else "")
-    for label in axes.get_xticklabels()[-1:]:
-        label.set_horizontalalignment("right")  # the unit stays inside of the picture
+        set_ticks(axis, ticks)
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
 
 
@@ -230,5 +246,5 @@ def _about(box: Json, name: str) -> str:
     if name == "versions":
         return ", ".join(f"{k} {v}" for k, v in box[name].items())
     if name == "runs":
-        return "; ".join(f"{run['length_s'] / 60:.1f} min, {run['ended'] or 'not ended'}" for run in box[name])
-    return str(box[name])
+        return "; ".join(f"{run['length_s'] / 60:.1f} min, {ENDS[run['ended']]}" for run in box[name])
+    return str(box.get(name, "not noted"))

@@ -152,6 +152,7 @@ def run_fit(args: argparse.Namespace) -> None:
     if args.rest and rest:
         command = f"palpate-train score BUNDLE --set {shlex.quote(str(args.rest))}"
         print(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; after export: {command}")
+    print(options.report_line(args.out, str(args.rest or "")))
 
 
 def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
@@ -213,8 +214,7 @@ def run_export(args: argparse.Namespace) -> None:
     what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"
     command = shlex.join(["palpate-train", "score", str(args.out), "--set", rest or "SET"])
     print(f"what it names of {what}: {command}")
-    page = shlex.join(["palpate-train", "report", str(args.out), "--set", rest or "SET", "--out", "report.html"])
-    print(f"a page about it, with what breaks it: {page}")
+    print(options.report_line(args.out, rest or ""))
 
 
 def run_pack(args: argparse.Namespace) -> None:

@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> None:
     put(page / "index.html", selection_report.page(result).encode(), parents=True)
     print(selection_report.text(result))
     print(f"bundle: {args.out}; why: {page / 'index.html'}")
+    print(options.report_line(args.out))
 
 
 def _packed(args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset, result: Json, change: Change) -> Json:

@@ -40,7 +40,8 @@ def register(add: Add) -> None:
     calibrate = add(
         "calibrate", run_calibrate, "compare the simulator with the twenty accuracies that the paper prints"
     )
-    calibrate.add_argument("--seeds", default="201-208", metavar="FIRST-LAST", help="of the simulated worlds (201-208)")
+    calibrate.add_argument("--seeds", type=numbers.span("--seeds", "201-208"), default=range(201, 209), metavar="FIRST-LAST",
+                           help="of the simulated worlds (201-208)")  # fmt: skip
     calibrate.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
     calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     options.add_jobs(calibrate)
@@ -59,6 +60,10 @@ def register(add: Add) -> None:
     follow.add_argument("--steps", type=numbers.whole("--steps", 1), metavar="N", help="iterations (those of the size)")
     follow.add_argument("--out", type=Path, required=True, metavar="FILE",
                        help="where the curve goes; an interrupted training goes on from there")  # fmt: skip
+    _add_alignment(add)
+
+
+def _add_alignment(add: Add) -> None:
     alignment = add(
         "alignment",
         run_alignment,
@@ -69,6 +74,9 @@ def register(add: Add) -> None:
     alignment.add_argument("--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places")
     alignment.add_argument("--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead")
     alignment.add_argument("--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go")
+    alignment.add_argument(
+        "--draw", action="store_true", help="measure nothing: picture and tables of place.json in --out again"
+    )
 
 
 def _add_evaluate(add: Add) -> None:
@@ -224,11 +232,7 @@ def run_certainty(args: argparse.Namespace) -> None:
 
 def run_calibrate(args: argparse.Namespace) -> None:
     """Print the table; write the figures as JSON where a file is named."""
-    first, _, last = args.seeds.partition("-")
-    if not first.isdigit() or not (last or first).isdigit() or int(last or first) < int(first):
-        raise FormatError(f"--seeds {args.seeds} cannot be read; write FIRST-LAST, e.g. 201-208")
-    seeds = range(int(first), int(last or first) + 1)
-    result = sim_calibration.measure(seeds, args.ablate, options.Log(), jobs=args.jobs) | score.provenance()
+    result = sim_calibration.measure(args.seeds, args.ablate, options.Log(), jobs=args.jobs) | score.provenance()
     if args.json:
         put(args.json, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     print(sim_calibration.table(result))
@@ -245,17 +249,34 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
 
 
 def run_alignment(args: argparse.Namespace) -> None:
-    """Measure, write the figures and the plot, the table into the page where one lies there, and print a summary."""
-    box = Classifier(bundle.load(args.bundle), SystemClock())
-    displacements = len(contact_positions.DIRECTIONS) * (2 * len(contact_positions.OFF_MM) + 1)
-    progress = Progress(displacements, options.Log())
-    result = contact_positions.measure(box, args.unseen, args.seen, args.hard, progress.begin)
-    args.out.mkdir(parents=True, exist_ok=True)
-    put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
+    """Measure, write the figures and the plot, the tables into the page where one lies there, and print a summary."""
+    if args.draw:
+        result = _positions(args.out / "place.json")
+    else:
+        box = Classifier(bundle.load(args.bundle), SystemClock())
+        displacements = len(contact_positions.DIRECTIONS) * (2 * len(contact_positions.OFF_MM) + 1)
+        progress = Progress(displacements, options.Log())
+        result = contact_positions.measure(box, args.unseen, args.seen, args.hard, progress.begin)
+        put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     about = provenance.of(result)
     put(args.out / "place.svg", (provenance.in_svg(contact_plot.draw(result), about) + "\n").encode(), parents=True)
     page = args.out / "README.md"
     if page.exists():
-        text = marked_text.insert(page.read_text(encoding="utf-8"), "alignment", contact_table.table(result), str(page))
+        text = page.read_text(encoding="utf-8")
+        for name, content in (("in short", contact_table.headline(result)), ("alignment", contact_table.table(result))):
+            text = marked_text.insert(text, name, content, str(page))
         put(page, provenance.in_markdown(text, about).encode())
     print("\n".join(contact_positions.lines(result)))
+
+
+def _positions(path: Path) -> dict[str, Any]:
+    """What an earlier run of `alignment` measured. Raises FormatError where the file has another content."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_bytes())
+        if {"bundle", "moved", "T-HARD", "other positions"} <= found.keys():
+            return found
+    except OSError as e:
+        raise FormatError(f"{path} cannot be read: {e.strerror}; leave --draw away to measure") from e
+    except (ValueError, AttributeError):
+        pass
+    raise FormatError(f"{path} is not what palpate-train alignment wrote; leave --draw away to measure")

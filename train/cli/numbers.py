@@ -41,3 +41,15 @@ def number(name: str, fits: Callable[[float], bool], allowed: str) -> Callable[[
 def above_zero(name: str) -> Callable[[str], float]:
     """Reads the option `name`, a number above 0."""
     return number(name, lambda x: x > 0, "above 0")
+
+
+def span(name: str, example: str) -> Callable[[str], range]:
+    """Reads the option `name`, a whole number or FIRST-LAST; raises FormatError for anything else, with an `example`."""
+
+    def read(text: str) -> range:
+        first, _, last = text.partition("-")
+        if not (first.isdecimal() and (last or first).isdecimal() and int(last or first) >= int(first)):
+            raise FormatError(f"{name} {text} cannot be read; write FIRST-LAST, e.g. {example}")
+        return range(int(first), int(last or first) + 1)
+
+    return read

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import shlex
 import sys
 import tempfile
 import time
@@ -91,6 +92,12 @@ def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
     labels.check_known(pairs, (name for sweeps in loaded for name in sweeps.materials))
     return sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded]).select(args.only)
+
+
+def report_line(what: Path, sweeps: str = "") -> str:
+    """How to get a page about a fit or a bundle. sweeps: the set to judge it on, where one is known."""
+    words = ["palpate-train", "report", str(what), "--set", sweeps or "SET", "--out", "report.html"]
+    return f"a page about it, with what breaks it: {shlex.join(words)}"
 
 
 def names(args: argparse.Namespace) -> tuple[str, ...]:

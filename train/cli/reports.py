@@ -7,26 +7,33 @@ import json
 import os
 import shlex
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from appliance.core.errors import FormatError
+from appliance.core.provenance import commit
 from appliance.core.storage import put
 from train.cli import options
 from train.cli.options import Add
 from train.data import sets
 from train.evaluation.evaluate import Where
+from train.export import quantized_bundle
 from train.metrics import score
+from train.models.compact.fitted import Fit
 from train.models.methods import Effort
 from train.reports import (
     bundle_experiment,
     bundle_report,
+    bundle_trainings,
     chart_report,
     development_experiment,
     development_report,
     development_times,
     docs_pages,
     document_figures,
+    marked_text,
+    matrix_table,
     overview_plot,
     paper_experiment,
     plots,
@@ -68,6 +75,8 @@ def register(add: Add) -> None:
     matrix.add_argument("results", type=Path, nargs="+", metavar="FILE", help="of evaluate --json; several are joined")
     matrix.add_argument("--out", type=Path, required=True, metavar="FILE.svg")
     matrix.add_argument("--recordings", action="store_true", help="count recordings instead of windows")
+    matrix.add_argument("--page", type=Path, metavar="FILE.md",
+                        help="write a table, ours beside the best of the others, between its <!-- matrix --> markers")  # fmt: skip
     overview = add("overview", run_overview, "draw the README's picture: a simulated sweep and what the box answers")
     overview.add_argument(
         "--out", type=Path, default=Path("docs/overview.svg"), metavar="FILE.svg", help="(docs/overview.svg)"
@@ -89,10 +98,15 @@ def _add_report(add: Add) -> None:
     report = add(
         "report", run_report, "write a page about a bundle: what it answers to a set, what breaks it, what it costs"
     )
-    report.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    report.add_argument("bundle", type=Path, metavar="BUNDLE|FIT", help="its folder, or what palpate-train fit wrote")
     options.add_set(report)
     report.add_argument("--out", type=Path, required=True, metavar="FILE.html")
     report.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    report.add_argument("--train", action="append", default=[], metavar="SET",
+                        help="what it was fitted to, for a learning curve, and to leave each material out (those of a FIT)")  # fmt: skip
+    report.add_argument("--quick", action="store_true", help="train nothing: no learning curve, no material left out")
+    options.add_effort(report)
+    options.add_where(report)
 
 
 def _add_development(add: Add) -> argparse.ArgumentParser:
@@ -144,12 +158,23 @@ def run_reports(args: argparse.Namespace) -> None:
 
 
 def run_report(args: argparse.Namespace) -> None:
-    """Measure, write the page and print its path."""
+    """Measure, train, write the page and print its path."""
     for option in ("out", "json"):
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}")
-    sweeps = options.load(args)
-    figures = bundle_experiment.run(args.bundle, sweeps, options.Log())
+    sweeps, log = options.load(args), options.Log()
+    train = sets.join([sets.load(spec, 1) for spec in args.train]) if args.train else None
+    with tempfile.TemporaryDirectory() as folder:
+        bundle, own = args.bundle, None
+        if not bundle.is_dir():
+            fit, bundle = Fit.load(args.bundle), Path(folder) / "bundle"
+            own = bundle_trainings.whole(fit)
+            quantized_bundle.export(fit, bundle, args.bundle.stem, "1", commit())
+        figures = bundle_experiment.run(bundle, sweeps, log)
+    train = train or own
+    if train and not args.quick:
+        where, effort = options.where(args), options.effort(args)
+        figures |= bundle_trainings.run(figures["made"], train, sweeps, where, log, effort)
     figures["command"] = shlex.join(["palpate-train", *sys.argv[1:]])
     put(args.out, bundle_report.page(figures, sweeps).encode(), parents=True)
     if args.json:
@@ -158,7 +183,7 @@ def run_report(args: argparse.Namespace) -> None:
 
 
 def run_matrix(args: argparse.Namespace) -> None:
-    """Write the plot and print its path."""
+    """Write the plot, and the table into a page; print their paths."""
     results: list[dict[str, Any]] = []
     for path in args.results:
         try:
@@ -168,6 +193,10 @@ def run_matrix(args: argparse.Namespace) -> None:
     picture = plots.matrix(results, count="recording" if args.recordings else "window")
     put(args.out, provenance.in_svg(picture, provenance.of(results)).encode(), parents=True)
     print(args.out)
+    if args.page:
+        page = args.page.read_text(encoding="utf-8")
+        put(args.page, marked_text.insert(page, "matrix", matrix_table.headline(results), str(args.page)).encode())
+        print(args.page)
 
 
 def run_chart(args: argparse.Namespace) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.cli import options
+from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import pull, summary
-from train.reports import sweep_plot
+from train.reports import sweep_pages, sweep_plot
 
 
 def register(add: Add) -> None:
@@ -22,10 +22,12 @@ def register(add: Add) -> None:
     )
     describe.add_argument("sets", nargs="+", metavar="SET", help=options.SET)
     describe.set_defaults(run=run_describe)
-    view = commands.add_parser("view", help="draw one sweep: its taxels over time, and their spectrum")
-    view.add_argument("sweep", metavar="SWEEP", help="an .npy that the box recorded, or a SET with --number")
-    view.add_argument("--number", type=int, metavar="N", help="which sweep of the set, from 0 on")
-    view.add_argument("--out", type=Path, required=True, metavar="FILE.svg")
+    view = commands.add_parser("view", help="draw sweeps: taxels over time, spectrum, spectrogram")
+    view.add_argument("sweep", metavar="SWEEP", help=f"an .npy that the box recorded, or a SET: {options.SET}")
+    view.add_argument("--number", type=numbers.span("--number", "0-49"), metavar="N[-LAST]",
+                      help="which sweep of the set, from 0 on; of a page the first and the last")  # fmt: skip
+    view.add_argument("--out", type=Path, required=True, metavar="FILE",
+                      help="FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set")  # fmt: skip
     view.set_defaults(run=run_view)
     pull_command = add("pull", run_pull, "fetch what a box has recorded and is not here yet")
     pull_command.set_defaults(resumes=True)
@@ -53,10 +55,22 @@ def run_describe(args: argparse.Namespace) -> None:
 
 
 def run_view(args: argparse.Namespace) -> None:
-    """Write the plot and print its path."""
-    if args.out.suffix.lower() != ".svg":
-        raise FormatError(f"--out {args.out}: an SVG is written; name a file that ends in .svg")
-    put(args.out, sweep_plot.draw(sweep_plot.load(args.sweep, args.number)).encode(), parents=True)
+    """Write the picture or the page and print its path."""
+    kind, span = args.out.suffix.lower(), args.number
+    if kind not in (".svg", ".html"):
+        raise FormatError(f"--out {args.out}: one sweep is an .svg, a page of many an .html; name a file that ends so")
+    options.writable_file(args.out)
+    if kind == ".svg":
+        if span is not None and len(span) != 1:
+            raise FormatError(f"--number {span.start}-{span.stop - 1}: an .svg shows one sweep; name an .html for more")
+        made = sweep_plot.draw(sweep_plot.load(args.sweep, None if span is None else span.start))
+    else:
+        found = sweep_plot.source(args.sweep)
+        shown = sweep_pages.chosen(found, span)
+        made = sweep_pages.page(found, shown, options.Log())
+        if span is None and len(shown) < found.count:
+            print(f"{len(shown)} of {found.count} sweeps, from all over the set; --number FIRST-LAST shows others")
+    put(args.out, made.encode(), parents=True)
     print(args.out)
 
 

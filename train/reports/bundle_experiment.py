@@ -44,12 +44,30 @@ def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
     known = sweeps.take(np.isin(np.array(sweeps.materials)[sweeps.labels], m.labels))
     return found.json() | {
         "format": str(m.format), "labels": list(m.labels), "made": dict(m.made), "figures": dict(m.figures),
-        "fitted_to_this": m.made.get("set") == sweeps.source,
+        "fitted_to_this": m.made.get("set") == sweeps.source, "tells_unknown": m.known is not None,
+        "groups": {name: len(np.unique(values)) for name, values in sweeps.groups.items()},
+        "named": named(known, found), "foreign_named": foreign_named(found),
         "materials": [material(name, found) for name in found.answered],
         "calibration": calibration(classifier, known),
         "cost": {"ms": cost.ms_p50, "ms_p99": cost.ms_p99, "kb": cost.bundle_kb, "mib": cost.rss_mib},
         "corruptions": corruptions(classifier, EvaluationSweeps.of(known, seed=seed), log, seed),
     }  # fmt: skip
+
+
+def named(known: Dataset, found: bundle_score.BundleScore) -> Json:
+    """Of the sweeps whose material the bundle has: how many are named rightly, wrongly and not at all, and how many of these
+    are called unknown."""
+    answers = sum(found.answered.values(), Counter())
+    right, unknown = int(found.right.sum()), answers[f"({Status.UNKNOWN})"]
+    silent = sum(n for answer, n in answers.items() if answer.startswith("("))
+    n = len(known)
+    return {"n": n, "right": right, "wrong": n - right - silent, "not_named": silent, "unknown": _share(unknown, n)}
+
+
+def foreign_named(found: bundle_score.BundleScore) -> list[float]:
+    """Of the sweeps of other materials the share that gets a label of the bundle, with its interval; empty without any."""
+    answers = sum(found.foreign.values(), Counter())
+    return _share(sum(n for answer, n in answers.items() if not answer.startswith("(")), answers.total())
 
 
 def material(name: str, found: bundle_score.BundleScore) -> Json:

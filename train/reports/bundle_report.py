@@ -1,35 +1,19 @@
 """The report on one bundle, a page to hand to a colleague. In: the figures of bundle_experiment, the sweeps. Out: HTML.
 
-Nothing is computed here but shares of counts, and the spectrograms of the sweeps that are shown.
+Nothing is computed here but shares of counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.signal import spectrogram
 
 from train.data.sets import Dataset
 from train.reports import formatting, html, plots, provenance, sweep_plot
-from train.reports.plot_style import (
-    ACCENT,
-    BLACK,
-    FAINT,
-    GREY,
-    SMALL,
-    WHITE,
-    WIDTH,
-    add_axes,
-    set_ticks,
-    single_axes,
-    to_svg,
-    write,
-)
+from train.reports.plot_style import ACCENT, FAINT, GREY, SMALL, set_ticks, single_axes, to_svg
 
 Array = NDArray[Any]
 Json = Mapping[str, Any]
@@ -37,11 +21,6 @@ MOST_IN_MATRIX = 12
 """Labels up to which the confusion matrix can be read on a phone; with more there is the table alone."""
 MOST_SHOWN = 6
 """Materials of which a sweep is shown."""
-LEAST_FRAMES = 64
-"""Of a window, for a spectrogram."""
-RANGE_DB = 50
-"""Of power that a spectrogram shows, below the largest."""
-SHADES = LinearSegmentedColormap.from_list("power", [WHITE, ACCENT, BLACK])
 MATERIALS = [
     "material",
     "sweeps",
@@ -52,29 +31,69 @@ MATERIALS = [
     "refused",
     "taken for",
 ]
-CORRUPTIONS = ["what goes wrong", "five points are lost at", "at the largest tried", "rightly", "wrongly", "not named"]
+CORRUPTIONS = ["what goes wrong", "five points are lost at", "at the largest tried: rightly / wrongly / not named"]
+LEFT_OUT = ["left out of training", "gets a known name", "known sweeps kept", "AUROC", "sweeps, known / unknown"]
 
 
 def page(figures: Json, sweeps: Dataset) -> str:
     """The page (HTML)."""
-    matrix = figures["labels"] if len(figures["labels"]) <= MOST_IN_MATRIX else []
     pictures = {"calibration": html.picture(calibration(figures["calibration"]))}
-    if matrix:
+    if len(figures["labels"]) <= MOST_IN_MATRIX:
         pictures["confusion"] = html.picture(confusion(figures))
-    shown = _examples(sweeps)
-    if sweeps.format.window >= LEAST_FRAMES:
-        pictures["spectrograms"] = html.picture(spectrograms(sweeps, shown))
+    if len(figures.get("curve", ())) > 1:
+        pictures["curve"] = html.picture(curve(figures["curve"]))
     return html.render(
-        "bundle.html.j2", header=provenance.of(figures), f=figures, pictures=pictures, range_db=RANGE_DB,
+        "bundle.html.j2", header=provenance.of(figures), f=figures, pictures=pictures, short=list(_in_short(figures)),
         right=[figures["named_rightly"]["right"] / figures["named_rightly"]["total"], *figures["named_rightly"]["interval"]],
         statuses=sorted(figures["statuses"].items(), key=lambda item: -item[1]),
         material_head=MATERIALS, materials=[_material(row) for row in figures["materials"]],
         corruption_head=CORRUPTIONS, corruptions=[_corruption(row) for row in figures["corruptions"]],
-        foreign=[[name, sum(given.values()), given.get("(unknown)", 0)] for name, given in figures["not_in_the_bundle"].items()],
+        foreign=[[name, sum(given.values()), given.get("(unknown)", 0), sum(n for answer, n in given.items() if answer[0] != "(")]
+                 for name, given in figures["not_in_the_bundle"].items()],
+        left_out_head=LEFT_OUT, left_out=_left_out(figures.get("left_out")),
         held_out=[[name, formatting.estimate([of[k] for k in ("accuracy", "low", "high")]), of["n"]]
                   for name, of in figures["figures"].items() if "accuracy" in of],
-        signals=[html.picture(sweep_plot.draw(sweep_plot.of_set(sweeps, i), plain=False)) for i in shown],
+        signals=[html.picture(sweep_plot.draw(sweep_plot.of_set(sweeps, i), plain=False)) for i in _examples(sweeps)],
     )  # fmt: skip
+
+
+def _in_short(figures: Json) -> Iterator[list[str]]:
+    """What was reached and what was missed, a line each."""
+    named, n = figures["named"], figures["named"]["n"]
+    for what in ("right", "wrong", "not_named"):
+        text = {
+            "right": "named rightly",
+            "wrong": "named wrongly",
+            "not_named": "not named (unsure, unknown or refused)",
+        }[what]
+        yield [text, f"{formatting.percent(named[what] / n)}, {named[what]} of {n}"]
+    worst = min((row for row in figures["materials"] if row["recall"]), key=lambda row: row["recall"][0])
+    yield [f"the material that is named rightly least often: {worst['name']}", formatting.estimate(worst["recall"])]
+    if share := figures["foreign_named"]:
+        yield ["sweeps of materials that it does not have, yet it names them", formatting.estimate(share)]
+    elif found := figures.get("left_out"):
+        yield [
+            "sweeps of a material left out of training, yet named (mean)",
+            formatting.percent(found["mean"]["false_known"]),
+        ]
+    if breaks := [row for row in figures["corruptions"] if row["falls"] is not None]:
+        first = breaks[0]
+        yield ["what breaks it first", f"{first['name']}: five points lost at {first['falls']:.2g} {first['unit']}"]
+    yield ["mean error of its probabilities", formatting.percent(figures["calibration"]["error"])]
+    cost = figures["cost"]
+    yield ["time of a sweep, memory, disk", f"{cost['ms']:.2f} ms, {cost['mib']:.0f} MiB, {cost['kb']:.0f} kB"]
+
+
+def _left_out(found: Json | None) -> list[list[str]]:
+    """A line for each material that was left out of training, and their mean."""
+    if not found:
+        return []
+    rows = [
+        [name, formatting.percent(m["false_known"]), formatting.percent(m["kept"]),
+         formatting.estimate([m[k] for k in ("auroc", "low", "high")]), f"{m['known']} / {m['unknown']}"]
+        for name, m in found["materials"].items()
+    ]  # fmt: skip
+    return [*rows, ["mean", *(formatting.percent(found["mean"][k]) for k in ("false_known", "kept", "auroc")), ""]]
 
 
 def _material(row: Json) -> list[str]:
@@ -87,8 +106,8 @@ def _corruption(row: Json) -> list[str]:
     """One thing that goes wrong, and what becomes of the sweeps at its largest severity."""
     most, right, wrong = row["severities"][-1], row["right"][-1], row["wrong"][-1]
     falls = "–" if row["falls"] is None else f"{row['falls']:.2g} {row['unit']}"
-    shares = [formatting.percent(n / row["total"], 0) for n in (right, wrong, row["total"] - right - wrong)]
-    return [f"{row['name']}: {row['about']}", falls, f"{most:g} {row['unit']}", *shares]
+    shares = " / ".join(f"{100 * n / row['total']:.0f}" for n in (right, wrong, row["total"] - right - wrong))
+    return [f"{row['name']}: {row['about']}", falls, f"{most:g} {row['unit']}: {shares} %"]
 
 
 def _examples(sweeps: Dataset) -> list[int]:
@@ -118,29 +137,24 @@ def calibration(found: Json) -> str:
     for axis in (axes.xaxis, axes.yaxis):
         set_ticks(axis, [0, 0.25, 0.5, 0.75, 1], percent=True)
     axes.set_xlabel("predicted probability", color=GREY, size=SMALL)
-    axes.set_ylabel("share right", color=GREY, size=SMALL)
+    axes.set_ylabel("named rightly", color=GREY, size=SMALL)
     return to_svg(figure, "share right against the predicted probability")
 
 
-def spectrograms(sweeps: Dataset, shown: list[int]) -> str:
-    """Power over time and frequency, the mean of all taxels, of each sweep that is shown; all on one scale in decibels."""
-    frames, rate = sweeps.format.window, sweeps.rate_hz
-    powers = []
-    for i in shown:
-        taxels = sweeps.samples[i].reshape(frames, -1).astype(np.float64)
-        hz, s, power = spectrogram(taxels, rate, nperseg=min(frames // 4, 128), axis=0, detrend="constant")
-        powers.append(10 * np.log10(power.mean(axis=1) + 1e-9))
-    top = max(p.max() for p in powers)
-    figure = Figure((WIDTH, 0.95 * len(shown) + 0.45))
-    high = figure.get_figheight()
-    for row, (i, power) in enumerate(zip(shown, powers, strict=True)):
-        axes = add_axes(figure, 0.3, 0.97, 1 - (0.1 + 0.95 * row) / high, 1 - (0.87 + 0.95 * row) / high)
-        ends = (s[0], s[-1], hz[0], hz[-1])
-        axes.imshow(power, origin="lower", aspect="auto", cmap=SHADES, vmin=top - RANGE_DB, vmax=top, extent=ends)
-        name = sweeps.materials[sweeps.labels[i]].replace(" ", "\n")
-        write(axes, -0.14, 0.5, name, ha="right", xycoords="axes fraction", parse_math=False)
-        set_ticks(axes.yaxis, [0, np.floor(hz[-1])])
-        times = np.linspace(0, frames / sweeps.rate_hz, 5)
-        set_ticks(axes.xaxis, times[(times >= s[0]) & (times <= s[-1])], bare=row < len(shown) - 1)
-    axes.set_xlabel("seconds to the right, Hz upwards", color=GREY, size=SMALL)
-    return to_svg(figure, "power over time and frequency, a sweep of each material")
+def curve(points: Sequence[Json]) -> str:
+    """Share right over the sweeps of each material that were trained on."""
+    figure, axes = single_axes(2.6, left=0.14, right=0.97, top=0.15, bottom=0.5)
+    each, share = [p["each"] for p in points], [p["share"] for p in points]
+    axes.fill_between(
+        each, [p["low"] for p in points], [p["high"] for p in points], color=ACCENT, alpha=0.13, linewidth=0
+    )
+    axes.plot(each, share, color=ACCENT, linewidth=2, marker="o", markersize=4)
+    axes.set_xscale("log")
+    axes.set_xlim(each[0] / 1.1, each[-1] * 1.1)
+    axes.set_ylim(0, 1.02)
+    axes.grid(color=FAINT, linewidth=0.6)
+    set_ticks(axes.yaxis, [0, 0.25, 0.5, 0.75, 1], percent=True)
+    set_ticks(axes.xaxis, each)
+    axes.set_xlabel("training sweeps of each material", color=GREY, size=SMALL)
+    axes.set_ylabel("named rightly", color=GREY, size=SMALL)
+    return to_svg(figure, "share named rightly over the number of training sweeps")

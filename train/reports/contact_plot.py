@@ -1,4 +1,4 @@
-"""How often a skin that has moved is flagged. In: what contact_positions measured. Out: a picture, SVG text."""
+"""How often a skin that has moved is marked. In: what contact_positions measured. Out: a picture, SVG text."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ DIRECTIONS = {"rows": "along the finger, towards row 4", "columns": "across, tow
 
 
 def draw(results: Json) -> str:
-    """Share named rightly and share flagged over how far the skin was moved, along the finger and across: SVG."""
+    """Share named rightly and share marked over how far the skin was moved, along the finger and across: SVG."""
     figure = Figure((WIDTH, HEIGHT))
     for number, (direction, points) in enumerate(results["moved"].items()):
         top = 1 - (0.5 + 2.15 * number) / HEIGHT
-        axes = add_axes(figure, 0.1, 0.97, top, top - 1.45 / HEIGHT)
+        axes = add_axes(figure, 0.14, 0.97, top, top - 1.45 / HEIGHT)
         mm = [point["mm"] for point in points]
         for name, colour, text, up in (
-            ("accuracy", ACCENT, "named rightly", 0.85), ("moved", BLACK, "flagged\nas moved", 0.58),
+            ("accuracy", ACCENT, "named rightly", 0.85), ("moved", BLACK, "marked\nas moved", 0.58),
         ):  # fmt: skip
             mean, low, high = np.array([point[name] for point in points]).T
             axes.fill_between(mm, low, high, color=colour, alpha=0.13, linewidth=0)
@@ -34,10 +34,10 @@ def draw(results: Json) -> str:
         set_ticks(axes.yaxis, (0, 0.5, 1), percent=True)
         set_ticks(axes.xaxis, range(-6, 7, 2))
         write(axes, mm[0], 1.17, f"skin moved {DIRECTIONS[direction]}", ha="left")
-        if number:
-            write(axes, 0, -0.28, "mm from an attachment like those of training", GREY, SMALL)
+        axes.set_ylabel("of the sweeps", color=GREY, size=SMALL)
+        axes.set_xlabel("mm from where it sat in training" if number else "mm", color=GREY, size=SMALL)
     n, attachments = (results["moved"]["rows"][0][name] for name in ("n", "attachments"))
     return to_svg(
         figure,
-        f"Share of {n} simulated sweeps ({attachments} attachments) that are named rightly, and flagged as moved",
+        f"Share of {n} simulated sweeps ({attachments} attachments) that are named rightly, and marked as moved",
     )

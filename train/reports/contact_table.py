@@ -1,11 +1,11 @@
-"""What the box answers where the skin has moved. In: what contact_positions measured. Out: a table in Markdown.
+"""What the box answers where the skin has moved. In: what contact_positions measured. Out: tables in Markdown.
 
 What it names by label alone stands beside what it answers, since the two are far apart where a skin has moved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from train.reports.formatting import estimate, percent
@@ -25,6 +25,51 @@ SHOWN = {"rows": ((0.0, "not at all"), (1.0, "1 mm towards row 4"), (2.0, "2 mm"
                   (4.0, "4 mm, one row"), (5.0, "5 mm"), (-2.5, "2.5 mm towards row 1"), (-4.0, "4 mm")),
          "columns": ((-2.5, "2.5 mm towards column 1"), (-4.0, "4 mm"), (2.5, "2.5 mm towards column 4"), (4.0, "4 mm"))}  # fmt: skip
 """Displacements in mm that have a line."""
+
+
+WAYS = {"rows, forwards": "towards row 4", "rows, backwards": "towards row 1", "columns, forwards": "towards column 4",
+        "columns, backwards": "towards column 1"}  # fmt: skip
+ROW_MM = 4.0
+"""From taxel to taxel of the simulated skin."""
+
+
+def headline(result: Json) -> str:
+    """What was reached and what was missed, a line each."""
+    every = [point for points in result["moved"].values() for point in points]
+    (still,) = (point for point in result["moved"]["rows"] if point["mm"] == 0)
+    off = [point for point in every if abs(point["mm"]) == ROW_MM]
+    worst = max(every, key=lambda point: point["wrong_unflagged"])
+    kept = [f"{round(of['moved'][0] * of['n'])} of {of['n']} {where}" for where, of in
+            (("at trained positions", result["trained positions, other sweeps"]), ("at others", result["other positions"]))]  # fmt: skip
+    rows = (
+        ("question", "answer"),
+        ("---", "---"),
+        ("how many sweeps are named rightly where the skin sits as in training?", estimate(still["accuracy"])),
+        ("how many of these are marked by mistake?", ", ".join(kept)),
+        ("where five points of accuracy are lost, how many sweeps are marked?", "; ".join(_losses(result))),
+        ("how many sweeps are named wrongly a row of taxels off, marked or not?",
+         f"{_span(point['wrong_share'][0] * 100 for point in off)} %, by the direction"),
+        ("how many are wrong and not marked, at the worst distance?", f"{worst['wrong_unflagged']} of {worst['n']}, at {abs(worst['mm']):g} mm"),
+        (f"what distance is shown where the skin is {ROW_MM:g} mm off?", f"{_span(point['told_mm'] for point in off)} mm: too little"),
+    )  # fmt: skip
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _losses(result: Json) -> Iterator[str]:
+    """For each direction where five points are lost, and what share is marked there."""
+    for key, way in WAYS.items():
+        lost = result[key]["lost_at_mm"]
+        yield (
+            f"{way} nothing is lost up to 6 mm"
+            if lost is None
+            else f"{way}, {lost:g} mm: {estimate(result[key]['moved'], 0)}"
+        )
+
+
+def _span(values: Iterable[float]) -> str:
+    """The least and the largest of some figures."""
+    least, *_, largest = sorted(values)
+    return f"{least:.1f} to {largest:.1f}"
 
 
 def table(result: Json) -> str:

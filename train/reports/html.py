@@ -36,10 +36,13 @@ PERCENT: dict[str, Callable[..., str]] = {
     "interval": formatting.interval,
     "estimate": formatting.estimate,
 }
+UNBROKEN = "\N{NO-BREAK SPACE}%"
+"""What keeps number and sign in one line of a page."""
 FILTERS: dict[str, Callable[..., str]] = {
     "points": formatting.points,
     "seconds": formatting.seconds,
     "sentence": lambda text: text[:1].upper() + text[1:],
+    "unbroken": lambda text: type(text)(text.replace(" %", UNBROKEN)) if isinstance(text, str) else text,
     "one_line": lambda text: type(text)(" ".join(text.split())),  # what is escaped stays so, and is not escaped twice
 }
 """Of all templates; those of PERCENT keep number and sign in one line of a page."""
@@ -115,6 +118,6 @@ def _environment(folder: Path, escape: bool) -> Environment:
 
 def _unbroken(show: Callable[..., str]) -> Callable[..., str]:
     def shown(*values: Any, **options: Any) -> str:
-        return show(*values, **options).replace(" %", "\N{NO-BREAK SPACE}%")
+        return show(*values, **options).replace(" %", UNBROKEN)
 
     return shown

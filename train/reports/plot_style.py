@@ -131,6 +131,13 @@ def set_ticks(
     _place_ticks(axis, ticks, NullFormatter() if bare else TickFormatter(factor, unit))
 
 
+def round_ticks(low: float, high: float, most: int) -> list[float]:
+    """Round values from `low` to `high`, at most `most` and one more."""
+    step = 10.0 ** np.floor(np.log10(max(high - low, 1e-6)))
+    step *= next(k for k in (0.1, 0.2, 0.5, 1, 2, 5) if (high - low) / (k * step) <= most or k == 5)
+    return list(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step)
+
+
 def set_categories(axis: Axis, at: Iterable[float], names: Sequence[str]) -> None:
     """Ticks that stand for things with names, not for values."""
     _place_ticks(axis, at, FixedFormatter(names))

@@ -16,6 +16,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from train.reports.formatting import exact_percent, interval, percent
+from train.reports.method_names import plain_name
 from train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -40,6 +41,8 @@ Estimate = tuple[float, float, float]
 Grid = Mapping[tuple[str, str], Estimate]
 """By row and column."""
 STRONGEST = 0.6  # of the accent colour behind a number: text stays readable on it, in light and in dark
+MEANS = {True: "less each taxel’s mean over the window", False: "as recorded, means and all"}
+"""Titles of the panels of `matrix`."""
 PRINTED: dict[str, Any] = {
     "marker": "D", "markersize": 5.5, "markerfacecolor": WHITE, "markeredgecolor": BLACK, "linestyle": "none",
 }  # fmt: skip
@@ -205,13 +208,19 @@ def matrix(results: Sequence[Mapping[str, Any]], about: str = "methods by protoc
     panels: dict[str, dict[tuple[str, str], list[Estimate]]] = {}
     for result in sorted(results, key=lambda r: (not r["means_removed"], _ease(r["protocol"]), -len(r["materials"]))):
         ends = result["interval" if count == "window" else "recording_interval"]
-        kind, _, name = result["protocol"].partition(":")
-        column = f"{kind}\n{name.split('=')[0]}\n{len(result['materials'])} classes"
-        panel = panels.setdefault("means removed" if result["means_removed"] else "means kept", {})
+        column = f"{_left_out(result['protocol'])}\n{len(result['materials'])} classes"
+        panel = panels.setdefault(MEANS[result["means_removed"]], {})
         share = result[count]["right"] / result[count]["total"]
-        panel.setdefault((result["method"], column), []).append((share, *ends))
+        panel.setdefault((plain_name(result["method"]), column), []).append((share, *ends))
     means = {title: {at: _mean(seeds) for at, seeds in cells.items()} for title, cells in panels.items()}
     return grid(means, about)
+
+
+def _left_out(protocol: str) -> str:
+    """What a protocol leaves out, in two lines."""
+    kind, _, name = protocol.partition(":")
+    name = {"rep": "repetition"}.get(name, name.split("=")[0])
+    return {"leave": f"{name}\nleft out", "split": f"split by\n{name}", "random": "random\nparts"}[kind]
 
 
 def _mean(seeds: Sequence[Estimate]) -> Estimate:

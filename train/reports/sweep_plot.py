@@ -1,11 +1,12 @@
 """The picture of one sweep. In: a recording or a sweep of a set. Out: SVG text, twice as wide as a phone.
 
-Each taxel over time where it lies on the skin, all on one scale of raw counts; below, the spectrum of all. A skin of more
-than MOST rows or columns is one image, a line for each taxel, row after row. Several axes of a taxel share its plot.
+Each taxel over time where it lies on the skin, all on one scale of raw counts; below, spectrum and spectrogram of all. A skin
+of more than MOST rows or columns is one image, a line for each taxel, row after row. Several axes of a taxel share its plot.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -13,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
-from scipy.signal import welch
+from scipy.signal import spectrogram, welch
 
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
@@ -29,17 +30,17 @@ from train.reports.plot_style import (
     GREY,
     MEDIUM,
     SMALL,
-    WHITE,
     WIDTH,
     add_axes,
+    round_ticks,
     set_categories,
     set_ticks,
     to_svg,
     write,
 )
 
-WIDE, SKIN, SPECTRUM, HIGH = 2 * WIDTH, (0.95, 4.55), (5.45, 7.05), 7.45
-"""Inches: the picture's width, from where to where the skin and the spectrum are, and the height of all."""
+WIDE, SKIN, SPECTRUM, SPECTROGRAM, HIGH = 2 * WIDTH, (0.95, 4.55), (5.6, 7.2), (8.1, 9.7), 10.25
+"""Inches: the picture's width, from where to where skin, spectrum and spectrogram are, and the height of all."""
 LEFT, RIGHT = 0.08, 0.985
 """Ends of what is drawn, as shares of the width."""
 NUMBER = 0.14
@@ -56,9 +57,12 @@ VERDICT = ("status", "label", "probability", "detail")
 """What is shown of a verdict."""
 LEAST = 8
 """Frames that a spectrum needs."""
+LEAST_PIECES, PIECE, RANGE_DB = 64, 128, 40
+"""Of a spectrogram: the frames that it needs, those of a piece at most, and the power that is shown below the largest."""
 LONGEST = 256
 """Frames of a segment of the spectrum, or those of one second where they are more (Welch 1967)."""
-SHADES = LinearSegmentedColormap.from_list("shades", [WHITE, ACCENT, BLACK])
+SHADES = LinearSegmentedColormap.from_list("shades", [to_rgba(ACCENT, 0.0), to_rgba(ACCENT)])
+"""From nothing to the accent, so that an image lies on a light page as on a dark one."""
 
 
 @dataclass(frozen=True)
@@ -85,18 +89,39 @@ class ShownSweep:
         axes.set_xlim(self.time_s[0], self.time_s[-1] + 1e-9)  # one frame alone has no width
 
 
-def load(what: str, number: int | None = None) -> ShownSweep:
-    """The recording `what` (.npy), or a set's sweep of this number. Raises FormatError where there is no such sweep."""
+@dataclass(frozen=True)
+class SweepSource:
+    """Sweeps that can be shown one by one. name: as it was given; get: the sweep of a number, from 0 to `count` - 1."""
+
+    name: str
+    count: int
+    get: Callable[[int], ShownSweep]
+
+
+def source(what: str) -> SweepSource:
+    """The sweeps of a recording (.npy), a folder of recordings or a set. Raises FormatError where there are none."""
     path = Path(what)
     if path.suffix == ".npy":
+        one = _recorded(readers.RecordedSweep.load(path))
+        return SweepSource(what, 1, lambda number: one)
+    if path.is_dir():
+        found = readers.ok(readers.recorded(path))
+        return SweepSource(what, len(found), lambda number: _recorded(found[number]))
+    labelled = sets.load(what, 1)
+    return SweepSource(what, len(labelled), lambda number: of_set(labelled, number))
+
+
+def load(what: str, number: int | None = None) -> ShownSweep:
+    """The recording `what` (.npy), or a set's sweep of this number. Raises FormatError where there is no such sweep."""
+    found = source(what)
+    if Path(what).suffix == ".npy":
         if number is not None:
             raise FormatError(f"{what} is one sweep; leave --number away")
-        return _recorded(readers.RecordedSweep.load(path))
-    found = readers.ok(readers.recorded(path)) if path.is_dir() else sets.load(what, 1)
-    if number is None or not 0 <= number < len(found):
+        number = 0
+    if number is None or not 0 <= number < found.count:
         wanted = "" if number is None else f" and none of number {number}"
-        raise FormatError(f"{what} holds {len(found)} sweeps{wanted}; choose one with --number, from 0 on")
-    return _recorded(found[number]) if isinstance(found, list) else of_set(found, number)
+        raise FormatError(f"{what} holds {found.count} sweeps{wanted}; choose one with --number, from 0 on")
+    return found.get(number)
 
 
 def _recorded(one: RecordedSweep) -> ShownSweep:
@@ -171,20 +196,34 @@ def draw(sweep: ShownSweep, plain: bool = True) -> str:
     else:
         shades = _skin(figure, sweep, taxels)
     missing = "; grey bars: frames are missing" if len(sweep.gaps) else ""
-    _caption(page, SKIN[1] + 0.35, f"raw counts over {sweep.since}{shades}{missing}")
-    longest = max(np.split(taxels, sweep.gaps + 1), key=len)
+    _caption(page, SKIN[1] + 0.52, f"raw counts over {sweep.since}{shades}{missing}")
+    first, longest = max(_runs(sweep, taxels), key=lambda run: len(run[1]))
     moving = longest[:, np.ptp(longest, axis=0) > 0]  # the others have no place on a logarithmic axis
-    if len(moving) < LEAST or not moving.size:
-        text = f"no spectrum: less than {LEAST} frames, or nothing moves"
-    else:
+    still = taxels.shape[1] - moving.shape[1]
+    text = f"no spectrum: less than {LEAST} frames, or nothing moves"
+    if len(moving) >= LEAST and moving.size:
         _spectrum(add_axes(figure, LEFT, RIGHT, *_ends(SPECTRUM)), moving, sweep.format)
-        text = "raw counts per √Hz over Hz: the taxels' mean power; light: their range"
-        if sweep.format.numpy_type.kind != "f":
-            text += "; dots: the noise of rounding to whole counts"
-        if still := taxels.shape[1] - moving.shape[1]:
-            text += f"; without {still} that stand still"
+        text = _about_spectrum(sweep.format, still)
     _caption(page, SPECTRUM[0] - 0.13, text)
+    text = f"no spectrogram: less than {LEAST_PIECES} frames, or nothing moves"
+    if len(moving) >= LEAST_PIECES and moving.size:
+        _spectrogram(add_axes(figure, LEFT, RIGHT, *_ends(SPECTROGRAM)), sweep, moving, sweep.time_s[first])
+        text = f"Hz over {sweep.since}: the taxels' mean power; the stronger the colour the more, over {RANGE_DB} dB"
+    _caption(page, SPECTROGRAM[0] - 0.13, text)
     return to_svg(figure, f"one sweep: {_printable(sweep.title)}", plain=plain)
+
+
+def _runs(sweep: ShownSweep, taxels: Array) -> list[tuple[int, Array]]:
+    """The parts [n, taxels] between which frames are missing, each with the number of its first frame."""
+    starts = [0, *(int(frame) + 1 for frame in sweep.gaps)]
+    return list(zip(starts, np.split(taxels, sweep.gaps + 1), strict=True))
+
+
+def _about_spectrum(form: SweepFormat, still: int) -> str:
+    """What the caption says of a spectrum; still: taxels that are not in it."""
+    rounding = "" if form.numpy_type.kind == "f" else "; dots: the noise of rounding to whole counts"
+    left_out = f"; without {still} that stand still" if still else ""
+    return f"raw counts per √Hz over Hz: the taxels' mean power; light: their range{rounding}{left_out}"
 
 
 def _ends(inches: tuple[float, float]) -> tuple[float, float]:
@@ -220,7 +259,7 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
     low, up = shown.min(), shown.max()
     head = NUMBER * rows / (0.88 * (SKIN[1] - SKIN[0]))  # share of a plot that is free for its taxel's number
     margins = max(up - low, 1) * np.array([0.08, 1.08 * head / (1 - head)])
-    times, counts = _ticks(sweep.time_s[0], sweep.time_s[-1], 4), _ticks(low, up, 3)
+    times, counts = round_ticks(sweep.time_s[0], sweep.time_s[-1], 4), round_ticks(low, up, 3)
     for row, column in np.ndindex(rows, columns):
         left, above = LEFT + column * wide, top - row * high
         axes = add_axes(figure, left, left + 0.94 * wide, above, above - 0.88 * high)
@@ -233,8 +272,11 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
             axes.plot(*line, color=ACCENT, linewidth=0.7, alpha=None if normal else 0.4)
         axes.grid(color=FAINT, linewidth=0.6)
         write(axes, 1, 1 - head / 2, f"{row + 1},{column + 1}", GREY, SMALL - 1, ha="right", xycoords="axes fraction")
-        for axis, ticks, outer in ((axes.xaxis, times, row == rows - 1), (axes.yaxis, counts, column == 0)):
+        lowest, leftmost = row == rows - 1, column == 0
+        for axis, ticks, outer in ((axes.xaxis, times, lowest), (axes.yaxis, counts, leftmost)):
             set_ticks(axis, ticks, bare=not outer)
+        axes.set_xlabel("s" if lowest else "", color=GREY, size=SMALL, labelpad=1)
+        axes.set_ylabel("counts" if leftmost else "", color=GREY, size=SMALL)
     return f"; {sweep.format.axes} axes, the normal one dark" if sweep.format.axes > 1 else ""
 
 
@@ -250,7 +292,8 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
     axes.pcolormesh(ends_s, lines / (columns * sweep.format.axes), means.T, cmap=SHADES, rasterized=True)
     sweep.span(axes)
     axes.set_ylim(rows, 0)
-    set_ticks(axes.xaxis, _ticks(ends_s[0], ends_s[-1], 8))
+    set_ticks(axes.xaxis, round_ticks(ends_s[0], ends_s[-1], 8))
+    axes.set_xlabel("s", color=GREY, size=SMALL, labelpad=1)
     first = np.arange(0, rows, -(-rows // 10))
     set_categories(axes.yaxis, first + 0.5, [f"row {row + 1}" for row in first])
     return f", from light, {means.min():.4g}, to dark, {means.max():.4g}; in each row its {columns} taxels{each}"
@@ -271,6 +314,26 @@ def _spectrum(axes: Axes, taxels: Array, form: SweepFormat) -> None:
         steps = (1, 2, 5) if last / first < 2000 else (1,)
         ticks = [step * 10.0**k for k in range(-9, 9) for step in steps if first <= step * 10.0**k <= last]
         set_ticks(axis, ticks)
+    axes.set_xlabel("Hz", color=GREY, size=SMALL, labelpad=1)
+    axes.set_ylabel("counts per √Hz", color=GREY, size=SMALL)
+
+
+def _spectrogram(axes: Axes, sweep: ShownSweep, taxels: Array, start_s: float) -> None:
+    """Mean power of all taxels [T, n] in decibels over time and frequency, on the time axis of the signals."""
+    rate = sweep.format.rate_hz
+    piece = min(len(taxels) // 4, PIECE)
+    hz, s, power = spectrogram(taxels, rate, nperseg=piece, noverlap=3 * piece // 4, axis=0, detrend="constant")
+    db = 10 * np.log10(np.maximum(power.mean(axis=1), 1e-12))  # [frequencies, pieces]
+    half_s, half_hz = (s[1] - s[0]) / 2, (hz[1] - hz[0]) / 2
+    ends = (start_s + s[0] - half_s, start_s + s[-1] + half_s, hz[0] - half_hz, hz[-1] + half_hz)
+    axes.imshow(db, origin="lower", aspect="auto", cmap=SHADES, vmin=db.max() - RANGE_DB, vmax=db.max(), extent=ends,
+                interpolation="none")  # fmt: skip
+    axes.set_xlim(sweep.time_s[0], sweep.time_s[-1])
+    axes.set_ylim(0, hz[-1])
+    set_ticks(axes.xaxis, round_ticks(sweep.time_s[0], sweep.time_s[-1], 8))
+    set_ticks(axes.yaxis, round_ticks(0, hz[-1], 4))
+    axes.set_xlabel("s", color=GREY, size=SMALL, labelpad=1)
+    axes.set_ylabel("Hz", color=GREY, size=SMALL)
 
 
 def _thinned(time_s: Array, counts: Array) -> tuple[Array, Array]:
@@ -286,13 +349,6 @@ def _thinned(time_s: Array, counts: Array) -> tuple[Array, Array]:
 def _edges(n: int, most: int) -> Array:
     """Ends [k + 1] of the k parts, at most `most`, into which n things are divided."""
     return np.linspace(0, n, min(most, n) + 1).astype(int)
-
-
-def _ticks(low: float, high: float, most: int) -> list[float]:
-    """Round values from `low` to `high`, at most `most` and one more."""
-    step = 10.0 ** np.floor(np.log10(max(high - low, 1e-6)))
-    step *= next(k for k in (0.1, 0.2, 0.5, 1, 2, 5) if (high - low) / (k * step) <= most or k == 5)
-    return list(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step)
 
 
 def _printable(text: str) -> str:

@@ -229,8 +229,35 @@ def test_any_terminal_shows_it():
     drawn = re.findall(r"(?m)^.*[_~]{4}.*$|^.*={4}.*$", MANUAL)
     assert len(drawn) >= 30
     assert max(map(len, drawn)) <= 80
-    listed = re.findall(r"(?m)^\d+\. (.+)$", MANUAL.partition("\n## ")[0])
+    listed = re.findall(r"(?m)^\d+\. \[(.+)\]", MANUAL.partition("\n## ")[0])
     assert listed == [*SECTIONS]
+
+
+def place(title: str) -> str:
+    """The place in a page that GitHub gives a heading: lower case, without punctuation, a hyphen for each space."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
+
+
+def test_the_contents_lead_to_their_sections():
+    """Each line of the contents, and each link to a place of the manual in another document, names a heading that is there."""
+    places = {place(title) for title in re.findall(r"(?m)^#+ (.+)$", MANUAL)}
+    linked = re.findall(r"\]\(#([^)]+)\)", MANUAL)
+    assert len(linked) >= len(SECTIONS)
+    for page in (ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("*/*.md")):
+        linked += re.findall(r"\]\([^)#]*manual\.md#([^)]+)\)", page.read_text())
+    assert [name for name in linked if name not in places] == []
+
+
+def test_each_drawing_is_seen_once():
+    """Where the manual is rendered it shows the pictures, and the same as text only where it is read as text: in comments,
+    which end where they should."""
+    comments = re.findall(r"(?s)<!-- as text:\n\n(.*?)-->", MANUAL)
+    rendered = re.sub(r"(?s)<!--.*?-->", "", MANUAL)
+    assert len(comments) == len(PICTURES)
+    for text in comments:
+        assert all(line.startswith("    ") or not line for line in text.splitlines())
+    assert not re.findall(r"(?m)^    .*[_~]{4}.*$", rendered)
+    assert "-->" not in rendered.replace(SECTIONS["What it is"], ""), "a comment ended inside its drawing"
 
 
 def verdict(sweep: int, what: Status, label: str = "", probability: float = 0.0, **more: Any) -> Verdict:

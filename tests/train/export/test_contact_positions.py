@@ -1,8 +1,11 @@
-"""Contact positions of a training set, and how a skin that was moved is flagged."""
+"""Contact positions of a training set, and how a skin that was moved is marked."""
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +17,8 @@ from appliance.inference.classifier import Classifier
 from appliance.signal.contact import ContactPositions, centre
 from appliance.sim import skin
 from tests.factories.contacts import MIDDLE, TARE, counts, patch
+from tests.factories.paths import ROOT
+from train.cli.main import main
 from train.data import sets
 from train.data.sets import Dataset
 from train.export import contact_positions
@@ -105,7 +110,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     text = "\n".join(contact_positions.lines(figures))
     assert "rows +8.0 mm" in text
     assert "network alone" in text
-    assert "flagged" in contact_plot.draw(figures)
+    assert "marked" in contact_plot.draw(figures)
     table = contact_table.table(figures)
     assert [line.split(" | ")[0] for line in table.splitlines()[4:]] == [
         "| T-HARD, a row ahead and all else anew",
@@ -120,3 +125,45 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
             "",
             print,
         )
+
+
+def committed() -> dict:
+    """What the page in docs/alignment was made of."""
+    return json.loads((ROOT / "docs" / "alignment" / "place.json").read_text())
+
+
+def test_the_headline_says_what_was_missed():
+    """In place, false marks, marks where accuracy is lost, wrong answers a row off, the worst distance: from the figures."""
+    figures = committed()
+    figures["moved"]["rows"][3]["wrong_unflagged"] = 77
+    figures["other positions"]["moved"] = [5 / 432, 0.0, 0.1]
+    figures["rows, forwards"] = {"lost_at_mm": 2.5, "moved": [0.5, 0.4, 0.6], "moved_before": [0.0, 0.0, 0.1]}
+    figures["columns, forwards"] = {"lost_at_mm": None, "moved": [1.0, 0.9, 1.0], "moved_before": [1.0, 0.9, 1.0]}
+    for direction, wrong, told in (("rows", 0.5, 3.25), ("columns", 0.25, 0.75)):
+        for point in figures["moved"][direction]:
+            if abs(point["mm"]) == 4:
+                point["wrong_share"], point["told_mm"] = [wrong, 0.0, 1.0], told
+    text = contact_table.headline(figures)
+    for part in ("5 of 432 at others", "towards row 4, 2.5 mm: 50 % [40, 60]", "towards column 4 nothing is lost up to 6 mm",
+                 "25.0 to 50.0 %", f"77 of 432, at {abs(figures['moved']['rows'][3]['mm']):g} mm", "0.8 to 3.2 mm: too little"):  # fmt: skip
+        assert part in text, part
+
+
+def test_the_page_is_drawn_again_without_measuring(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Tables between their markers, the picture; what is missing or another file is named, with what to do."""
+    folder = ROOT / "docs" / "alignment"
+    page = (folder / "README.md").read_text()
+    cleared = re.sub(r"(?s)(<!-- (in short|alignment) -->).*?(?=<!-- /)", r"\1\n", page)
+    (tmp_path / "README.md").write_text(cleared)
+    (tmp_path / "place.json").write_bytes((folder / "place.json").read_bytes())
+    assert main(["alignment", "--draw", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "README.md").read_text() == page
+    assert (tmp_path / "place.svg").read_text() == (folder / "place.svg").read_text()
+    capsys.readouterr()
+    assert main(["alignment", "--draw", "--out", str(tmp_path / "none")]) == FormatError.exit_code
+    assert "place.json cannot be read: No such file or directory; leave --draw away" in capsys.readouterr().err
+    (tmp_path / "place.json").write_text("[1]")
+    assert main(["alignment", "--draw", "--out", str(tmp_path)]) == FormatError.exit_code
+    assert (
+        "place.json is not what palpate-train alignment wrote; leave --draw away to measure" in capsys.readouterr().err
+    )

@@ -97,18 +97,54 @@ def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Da
         "set": "mine.npz", "recordings": {"right": 3, "total": 4},
     }  # fmt: skip
     plain = PageReader(bundle_report.page(many, sweeps)).text
-    assert "felt 8 7" in plain
+    assert "felt 8 7 1" in plain
     assert "materials by the labels that they get" not in plain
     assert "Sweeps of one recording fused: 3 of 4 right" in plain
     assert "simulated" not in plain.split("How it was made")[0]
 
 
-def test_windows_too_short_for_a_spectrogram_have_none(figures: dict, sweeps: Dataset):
+def test_windows_too_short_for_a_spectrogram_say_so(figures: dict, sweeps: Dataset):
     """A skin of 28 Hz has 56 frames; its signals are shown all the same."""
     short = replace(sweeps, samples=sweeps.samples[:, :40])
     text = bundle_report.page(figures, short)
-    assert "Power of a sweep" not in text
+    assert text.count("no spectrogram: less than 64 frames") == len(np.unique(sweeps.labels))
     assert text.count("raw counts over") == len(np.unique(sweeps.labels))
+
+
+def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
+    """Right, wrong and not named add up to all sweeps; the worst material, the first thing to break it, errors, cost."""
+    named = figures["named"]
+    assert named["right"] + named["wrong"] + named["not_named"] == named["n"] == len(sweeps)
+    missed = figures | {
+        "named": {"n": 20, "right": 15, "wrong": 3, "not_named": 2, "unknown": [0.1, 0.0, 0.3]},
+        "materials": [row | {"recall": [0.25, 0.1, 0.5] if row["name"] == "wood" else [1.0, 0.9, 1.0]} for row in figures["materials"]],
+        "foreign_named": [0.75, 0.5, 0.9],
+    }  # fmt: skip
+    text = PageReader(bundle_report.page(missed, sweeps)).text
+    for line in ("named rightly 75.0 %, 15 of 20", "named wrongly 15.0 %, 3 of 20", "refused) 10.0 %, 2 of 20",
+                 "least often: wood 25.0 % [10.0, 50.0]", "yet it names them 75.0 % [50.0, 90.0]",
+                 "Of the sweeps of its own materials it calls 10.0 % [0.0, 30.0] unknown"):  # fmt: skip
+        assert line in text, line
+
+
+def test_what_the_bundle_calls_a_foreign_material_is_counted(sweeps: Dataset, default_bundle: Bundle):
+    """Six sweeps of felt, four of which get a label: two thirds; wrong and silent answers to its own are told apart."""
+    found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
+    answered = {"wood": Counter({"wood": 5, "metal": 3, "(unsure)": 1, "(unknown)": 2})}
+    mixed = replace(found, answered=answered, right=np.arange(11) < 5,
+                    foreign={"felt": Counter({"metal": 3, "wood": 1, "(unknown)": 2})})  # fmt: skip
+    assert bundle_experiment.foreign_named(mixed)[0] == pytest.approx(4 / 6)
+    assert bundle_experiment.foreign_named(found) == []
+    named = bundle_experiment.named(sweeps.take(np.arange(11)), mixed)
+    assert [named[k] for k in ("n", "right", "wrong", "not_named")] == [11, 5, 3, 3]
+    assert named["unknown"][0] == pytest.approx(2 / 11)
+
+
+def test_a_bundle_without_novelty_says_so(figures: dict, sweeps: Dataset):
+    """It never answers unknown; the page does not claim otherwise."""
+    text = PageReader(bundle_report.page(figures | {"tells_unknown": False}, sweeps)).text
+    assert "This bundle holds no measure of novelty: it never answers unknown" in text
+    assert "Of the sweeps of its own materials" not in text
 
 
 @pytest.mark.slow
@@ -121,5 +157,7 @@ def test_the_command_writes_page_and_figures(
     assert main([*named, "--out", "/proc/none/report.html"]) != 0
     assert "cannot be written" in capsys.readouterr().err
     assert main([*named, "--out", str(tmp_path / "report.html"), "--json", str(tmp_path / "f.json")]) == 0
-    assert "<h2>What breaks it first</h2>" in (tmp_path / "report.html").read_text()
+    text = (tmp_path / "report.html").read_text()
+    assert "<h2>What it will be bad at</h2>" in text
+    assert "name the sweeps that it was fitted to with <code>--train</code>" in text
     assert json.loads((tmp_path / "f.json").read_text())["bundle"]["name"] == "default"

@@ -74,7 +74,8 @@ def certainty_facts(figures: Any) -> Facts:
     for p in (p for held in figures["sequence"].values() for p in held["points"] if p["wanted"]):
         yield f"{p['sweeps']:.2f} {three(p['accuracy'], p['low'], p['high'])} {number(p['decided'])} %"
     for name, m in figures["unknown"]["materials"].items():
-        yield f"{name} {three(m['auroc'], m['low'], m['high'])} {number(m['false_known_at_95'])} %"
+        shares = f"{number(m['false_known'])} % {number(m['kept'])} % {three(m['auroc'], m['low'], m['high'])}"
+        yield f"{name} {shares} {number(m['false_known_at_95'])} % {m['known']} / {m['unknown']}"
     for name, value in figures["unknown"]["scores"].items():
         yield f"{name} {number(value)} %"
     for p in figures["enrolment"]["points"]:
@@ -82,7 +83,7 @@ def certainty_facts(figures: Any) -> Facts:
     for tenth, a in enumerate(figures["early"]["always"], 1):
         yield f"{tenth} of 10 {three(a['accuracy'], a['low'], a['high'])}"
     before = figures["calibration"]["before"]
-    yield f"{three(before['error'], before['low'], before['high'])} before"
+    yield f"{three(before['error'], before['low'], before['high'])} as the classifier gives them"
     yield f"{number(figures['early']['share'])} % of the window"
     yield from (str(figures[name]) for name in ("set", "test", "digest", "commit", "machine", "format"))
 

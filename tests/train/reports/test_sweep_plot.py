@@ -101,7 +101,7 @@ def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
             ", position 3, session mon" if svg is small else ""
         )
         assert all(link.startswith(("#", "data:image/png;base64,")) for link in re.findall(r'href="([^"]*)"', svg))
-        assert ("data:image/png;base64," in svg) == (svg is not small)  # one image, not a shape for each of its pixels
+        assert svg.count("data:image/png;base64,") == 1  # spectrogram or skin: one image, not a shape for each pixel
         assert "<style" not in svg
         fills = {re.search("fill: ([^;]*)", text.get("style"))[1] for text in root.iter(f"{SVG}text")}
         assert fills <= set(plot_style.ROLES.values())
@@ -205,6 +205,7 @@ def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(sweep_plot, "_spectrum", lambda axes, taxels, form: heard.append(len(taxels)))
     assert "grey bars: frames are missing" in words(sweep_plot.draw(seen))
     assert heard == [300]
+    assert "no spectrogram" not in words(whole)
     assert "grey bars" not in words(whole)
 
 
@@ -263,7 +264,27 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path, what: str, number: int | 
         sweep_plot.load(str(tmp_path / what), number)
 
 
-def test_only_an_svg_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_picture_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A name that promises another kind of picture is refused, before anything is read."""
     assert main(["sets", "view", "none.npy", "--out", str(tmp_path / "v.png")]) == FormatError.exit_code
-    assert "v.png: an SVG is written; name a file that ends in .svg" in capsys.readouterr().err
+    assert "v.png: one sweep is an .svg, a page of many an .html; name a file that ends so" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_spectrogram_shows_when_a_tone_sounds(monkeypatch: pytest.MonkeyPatch):
+    """A tone of 25 Hz in the second half alone: its band is weak before and strong after; time lies as in the signals."""
+    rate = 100.0
+    t = np.arange(400) / rate
+    tone = np.where(t >= 2, 40 * np.sin(2 * np.pi * 25 * t), 0)
+    noise = np.random.default_rng(0).normal(0, 1, (400, 2, 2))
+    counts = (100 + tone[:, None, None] + noise).astype(np.float32)
+    form = SweepFormat(2, 2, rate, 400, "float32")
+    shown = sweep_plot.ShownSweep(counts, t, form, "", (), "seconds", None, np.empty(0, int))
+    seen = []
+    monkeypatch.setattr(sweep_plot.Axes, "imshow", lambda axes, db, **more: seen.append((db, more["extent"])))
+    sweep_plot.draw(shown)
+    ((db, (start, end, low, high)),) = seen
+    band = round((25 - low) / (high - low) * len(db) - 0.5)
+    columns = start + (np.arange(db.shape[1]) + 0.5) / db.shape[1] * (end - start)
+    assert db[band, columns > 2.7].min() > db[band, columns < 1.3].max() + 20
+    assert 0 <= start < end <= 4

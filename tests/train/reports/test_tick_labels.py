@@ -20,7 +20,6 @@ from tests.factories import choice_data, development_data, stress_data
 from tests.factories.chart_data import DOTS
 from tests.factories.paths import ROOT
 from tests.rig import soak_page
-from train.data import sets
 from train.reports import (
     bundle_report,
     contact_plot,
@@ -71,7 +70,9 @@ PICTURES: dict[str, Callable[[], Any]] = {
     "bundle": lambda: bundle_report.calibration(
         {"n": 9, "bins": [{"said": 0.6, "right": 0.5, "n": 4}, {"said": 0.9, "right": 1.0, "n": 5}]}
     ),
-    "spectrograms": lambda: bundle_report.spectrograms(sets.load("sim:T-REAL:1001:1", 1), [0, 5]),
+    "curve of a bundle": lambda: bundle_report.curve(
+        [{"each": n, "share": 0.5, "low": 0.4, "high": 0.6} for n in (5, 10, 37.5)]
+    ),
     "confusion of a bundle": lambda: bundle_report.confusion(
         {"labels": ["a", "b"], "answers": {"a": {"a": 3, "b": 1}}}
     ),

@@ -445,7 +445,9 @@ def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, mon
     (tmp_path / "scene.toml").write_text('sets = ["skin.npz"]\nvaries = ["place"]\naccuracy = 0.99\nreduce = []\n')
     scene_file, out, cache = (str(tmp_path / name) for name in ("scene.toml", "b", "c"))
     assert main(["choose", "--scene", scene_file, "--out", out, "--jobs", "1", "--cache", cache]) == 0
-    assert "Not reached: 99 % is wanted" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Not reached: 99 % is wanted" in printed
+    assert printed.splitlines()[-1].endswith(f"palpate-train report {out} --set SET --out report.html")
     assert 'class="stop">Not reached' in (tmp_path / "b-why" / "index.html").read_text()
     assert bundle.load(tmp_path / "b").manifest.name == "scene"
 

@@ -1,0 +1,116 @@
+"""The page to leaf through a set: which sweeps it shows, how large it is, and how it is turned in a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.core.errors import FormatError
+from tests.factories.browser import BrowsedPage, launched
+from tests.factories.page_reader import PageReader
+from tests.factories.recordings import record
+from tests.factories.sweep_sets import easy
+from train.cli.main import main
+from train.reports import sweep_pages, sweep_plot
+from train.reports.sweep_plot import SweepSource
+
+
+def source(count: int) -> SweepSource:
+    """A set of so many sweeps, all the same."""
+    one = sweep_plot.of_set(easy(4), 0)
+    return SweepSource("mine.npz", count, lambda number: one)
+
+
+def test_of_a_large_set_sweeps_from_all_over_it_are_shown(monkeypatch: pytest.MonkeyPatch):
+    """First and last among them, in order, none twice; as many as are allowed, and as fit by their size."""
+    assert sweep_pages.chosen(source(7), None) == list(range(7))
+    shown = sweep_pages.chosen(source(1000), None)
+    assert (len(shown), shown[0], shown[-1]) == (sweep_pages.MOST, 0, 999)
+    assert shown == sorted(set(shown))
+    monkeypatch.setattr(sweep_pages, "MOST_BYTES", 3 * len(sweep_plot.draw(source(1).get(0), plain=False)))
+    assert sweep_pages.chosen(source(1000), None) == [0, 500, 999]
+
+
+@pytest.mark.parametrize(
+    ("count", "numbers", "message"),
+    [
+        (0, None, "mine.npz holds no sweep that could be shown"),
+        (12, range(5, 13), "--number 5-12: mine.npz holds sweeps 0 to 11; name some of them"),
+        (12, range(3), "--number 0-2 are 3 sweeps; a page holds 1 of this skin: name fewer"),
+    ],
+)
+def test_what_a_page_cannot_show_is_refused(
+    count: int, numbers: range | None, message: str, monkeypatch: pytest.MonkeyPatch
+):
+    """No sweeps, numbers that are not there, more than a page holds: each says what there is."""
+    monkeypatch.setattr(sweep_pages, "MOST_BYTES", 1)
+    with pytest.raises(FormatError, match=message):
+        sweep_pages.chosen(source(count), numbers)
+
+
+def test_the_command_writes_a_page_of_what_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Sweeps of a set and of a folder; an .svg is of one sweep, and other kinds of file are not written."""
+    easy(4).save(tmp_path / "s.npz")
+    out = tmp_path / "v.html"
+    assert main(["sets", "view", str(tmp_path / "s.npz"), "--number", "10-11", "--out", str(out)]) == 0
+    reader = PageReader(out.read_text())
+    assert "2 of 12 sweeps of " in reader.text
+    assert "11: high, recording 11" in reader.text
+    assert (reader.open, reader.wrong) == ([], [])
+    assert all(link.startswith(("#", "data:")) for link in reader.links)
+    for name, material in (("0", "a"), ("1", "b")):
+        record(tmp_path / "box" / f"{name}.npy", material)
+    assert main(["sets", "view", str(tmp_path / "box"), "--out", str(out)]) == 0
+    assert "2 of 2 sweeps of " in PageReader(out.read_text()).text
+    capsys.readouterr()
+    assert main(["sets", "view", str(tmp_path / "s.npz"), "--number", "0-1", "--out", str(tmp_path / "v.svg")]) != 0
+    assert "--number 0-1: an .svg shows one sweep; name an .html for more" in capsys.readouterr().err
+    assert main(["sets", "view", str(tmp_path / "s.npz"), "--number", "9-1", "--out", str(out)]) != 0
+    assert "--number 9-1 cannot be read; write FIRST-LAST, e.g. 0-49" in capsys.readouterr().err
+
+
+def test_a_page_of_some_sweeps_says_how_many_there_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """In the terminal and on the page, with what shows the others."""
+    monkeypatch.setattr(sweep_pages, "MOST", 3)
+    easy(4).save(tmp_path / "s.npz")
+    assert main(["sets", "view", str(tmp_path / "s.npz"), "--out", str(tmp_path / "v.html")]) == 0
+    assert "3 of 12 sweeps, from all over the set; --number FIRST-LAST shows others" in capsys.readouterr().out
+    assert "3 of 12 sweeps of " in (tmp_path / "v.html").read_text()
+
+
+@pytest.fixture
+def leafed(tmp_path: Path) -> Iterator[tuple[BrowsedPage, Any]]:
+    """A page of four sweeps in a browser."""
+    text = sweep_pages.page(source(4), range(4), lambda line: None)
+    (tmp_path / "v.html").write_text(text)
+    with launched() as browser:
+        context = browser.new_context(viewport={"width": 390, "height": 800})
+        yield BrowsedPage(context, (tmp_path / "v.html").as_uri()), context
+
+
+@pytest.mark.slow
+def test_arrow_keys_turn_the_page(leafed: tuple[BrowsedPage, Any]):
+    """One sweep is seen at a time; arrows, Home and End turn, not beyond the ends; the address names the sweep."""
+    page = leafed[0].page
+
+    def seen() -> list[str]:
+        return page.eval_on_selector_all("figure", "all => all.filter((f) => f.checkVisibility()).map((f) => f.id)")
+
+    assert seen() == ["sweep-0"]
+    for key, wanted in (("ArrowLeft", 0), ("ArrowRight", 1), ("ArrowRight", 2), ("End", 3), ("ArrowRight", 3),
+                        ("ArrowLeft", 2), ("Home", 0)):  # fmt: skip
+        page.keyboard.press(key)
+        assert seen() == [f"sweep-{wanted}"]
+        assert page.evaluate("location.hash") == f"#sweep-{wanted}"
+    page.click("#on")
+    assert seen() == ["sweep-1"]
+    page.select_option("#which", index=3)
+    assert seen() == ["sweep-3"]
+    assert page.is_disabled("#on")
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    assert leafed[0].errors == []

@@ -1,0 +1,47 @@
+"""What was reached and what was missed in a matrix of methods by protocols. In: the list that evaluate writes. Out: Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from train.models.methods import SHIPPED
+from train.reports import comparison
+from train.reports.development_chart import PROTOCOLS
+from train.reports.formatting import estimate
+from train.reports.method_names import plain_name
+
+Json = Mapping[str, Any]
+HEAD = ("test", "means", "{ours}", "best of the others", "difference, points", "verdict")
+
+
+def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:
+    """A line for each test: `ours`, the best of the others (chosen after the fact), their difference, a verdict.
+
+    Sweeps without means come first. Each figure is the mean over seeds, with its 95 % interval.
+    """
+    tests: dict[tuple[bool, int, str], dict[str, list[list[float]]]] = {}
+    for result in results:
+        test = (bool(result["means_removed"]), len(result["materials"]), result["protocol"])
+        share = result["window"]["right"] / result["window"]["total"]
+        tests.setdefault(test, {}).setdefault(result["method"], []).append([share, *result["interval"]])
+    rows = [[cell.format(ours=plain_name(ours)) for cell in HEAD], ["---"] * len(HEAD)]
+    for removed, classes, protocol in sorted(tests, key=lambda test: (not test[0], -test[1])):
+        found = {name: dict(zip(("mean", "low", "high"), np.mean(seeds, axis=0).tolist(), strict=True))
+                 for name, seeds in tests[removed, classes, protocol].items()}  # fmt: skip
+        if ours in found:
+            line = comparison.line("", found[ours], {name: one for name, one in found.items() if name != ours})
+            what = f"{classes} classes: {PROTOCOLS.get(protocol, (protocol,))[0]}"
+            rows.append([what, "removed" if removed else "kept", *_cells(line)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _cells(line: Json) -> list[str]:
+    """Ours, the best of the others with its name, difference, verdict."""
+    own = estimate(comparison.estimate(line["ours"]))
+    if not line["best"]:
+        return [own, "–", "–", line["verdict"]]
+    other = f"{plain_name(line['best'])}: {estimate(comparison.estimate(line['leader']))}"
+    return [own, other, comparison.shown(line["gap"]), line["verdict"]]
