@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from appliance.core.errors import FormatError
+from train.data.progress import Progress
 from train.reports import html, sweep_plot
 from train.reports.sweep_plot import SweepSource
 
@@ -40,9 +41,9 @@ def chosen(found: SweepSource, numbers: range | None) -> list[int]:
 
 def page(found: SweepSource, numbers: Sequence[int], log: Callable[[str], None]) -> str:
     """The page (HTML) of the sweeps `numbers`. log: receives the progress."""
-    shown = []
-    for done, number in enumerate(numbers, 1):
+    shown, progress = [], Progress(len(numbers), log)
+    for number in numbers:
         sweep = found.get(number)
         shown.append((number, sweep.title, html.picture(sweep_plot.draw(sweep, plain=False))))
-        log(f"{done} of {len(numbers)} sweeps drawn")
+        progress(f"sweep {number} drawn")
     return html.render("sweeps.html.j2", name=found.name, count=found.count, sweeps=shown)

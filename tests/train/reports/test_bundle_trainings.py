@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
+from tests.factories import rendered
 from tests.factories.page_reader import PageReader
 from tests.factories.sweep_sets import easy, tones
 from train.cli.main import main
@@ -111,6 +113,19 @@ def test_the_page_shows_the_curve_and_materials_left_out():
     assert "low 25.0 % 95.0 % 90.0 % [80.0, 100.0] 9 / 4" in text
     assert "yet named (mean) 25.0 %" in text
     assert "Not measured" not in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", rendered.SCHEMES)
+@pytest.mark.parametrize("width", rendered.WIDTHS)
+def test_the_page_can_be_read_everywhere(browser: Any, tmp_path: Path, width: int, scheme: str):
+    """At three widths, by day and by night, with a curve, materials left out, matrix and sweeps."""
+    points = [
+        {"each": 5, "share": 0.5, "low": 0.4, "high": 0.6, "n": 90},
+        {"each": 16.0, "share": 0.75, "low": 0.7, "high": 0.8, "n": 90},
+    ]
+    (tmp_path / "r.html").write_text(bundle_report.page(figures(points), easy(2)))
+    assert rendered.faults(browser, rendered.address(tmp_path / "r.html"), width, scheme) == {}
 
 
 @pytest.mark.slow

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from appliance.core.errors import FormatError
-from tests.factories.browser import BrowsedPage, launched
+from tests.factories import rendered
+from tests.factories.browser import BrowsedPage
 from tests.factories.page_reader import PageReader
 from tests.factories.recordings import record
 from tests.factories.sweep_sets import easy
@@ -84,19 +84,17 @@ def test_a_page_of_some_sweeps_says_how_many_there_are(
 
 
 @pytest.fixture
-def leafed(tmp_path: Path) -> Iterator[tuple[BrowsedPage, Any]]:
-    """A page of four sweeps in a browser."""
-    text = sweep_pages.page(source(4), range(4), lambda line: None)
-    (tmp_path / "v.html").write_text(text)
-    with launched() as browser:
-        context = browser.new_context(viewport={"width": 390, "height": 800})
-        yield BrowsedPage(context, (tmp_path / "v.html").as_uri()), context
+def address(tmp_path: Path) -> str:
+    """Of a page of four sweeps."""
+    (tmp_path / "v.html").write_text(sweep_pages.page(source(4), range(4), lambda line: None))
+    return rendered.address(tmp_path / "v.html")
 
 
 @pytest.mark.slow
-def test_arrow_keys_turn_the_page(leafed: tuple[BrowsedPage, Any]):
+def test_arrow_keys_turn_the_page(browser: Any, address: str):
     """One sweep is seen at a time; arrows, Home and End turn, not beyond the ends; the address names the sweep."""
-    page = leafed[0].page
+    seen_page = BrowsedPage(browser.new_context(), address)
+    page = seen_page.page
 
     def seen() -> list[str]:
         return page.eval_on_selector_all("figure", "all => all.filter((f) => f.checkVisibility()).map((f) => f.id)")
@@ -112,5 +110,12 @@ def test_arrow_keys_turn_the_page(leafed: tuple[BrowsedPage, Any]):
     page.select_option("#which", index=3)
     assert seen() == ["sweep-3"]
     assert page.is_disabled("#on")
-    assert page.evaluate("document.documentElement.scrollWidth") == 390
-    assert leafed[0].errors == []
+    assert seen_page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", rendered.SCHEMES)
+@pytest.mark.parametrize("width", rendered.WIDTHS)
+def test_the_page_can_be_read_everywhere(browser: Any, address: str, width: int, scheme: str):
+    """At three widths, by day and by night."""
+    assert rendered.faults(browser, address, width, scheme) == {}
