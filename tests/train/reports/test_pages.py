@@ -71,6 +71,11 @@ def paper_facts(summary: Any) -> Facts:
 
 def certainty_facts(figures: Any) -> Facts:
     """Targets, calibration, sequences, materials, enrolment, early exit, origin."""
+    let_through = figures["unknown"]["mean"]["false_known"]
+    if let_through > 0.1:
+        yield f"Missed: sweeps of unknown materials that get a known name, {number(let_through)} % (wanted ≤ 10 %)"
+    worst, its = max(figures["unknown"]["materials"].items(), key=lambda item: item[1]["false_known"])
+    yield f"the one most often taken for a known one: {worst}, {number(its['false_known'])} %."
     for p in (p for held in figures["sequence"].values() for p in held["points"] if p["wanted"]):
         yield f"{p['sweeps']:.2f} {three(p['accuracy'], p['low'], p['high'])} {number(p['decided'])} %"
     for name, m in figures["unknown"]["materials"].items():
