@@ -41,7 +41,7 @@ Estimate = tuple[float, float, float]
 Grid = Mapping[tuple[str, str], Estimate]
 """By row and column."""
 STRONGEST = 0.6  # of the accent colour behind a number: text stays readable on it, in light and in dark
-MEANS = {True: "less each taxel’s mean over the window", False: "as recorded, means and all"}
+MEANS = {True: "without each taxel’s mean over the window", False: "as recorded, means and all"}
 """Titles of the panels of `matrix`."""
 PRINTED: dict[str, Any] = {
     "marker": "D", "markersize": 5.5, "markerfacecolor": WHITE, "markeredgecolor": BLACK, "linestyle": "none",
@@ -242,7 +242,7 @@ def grid(panels: Mapping[str, Grid], about: str) -> str:
     inch = 1 / figure.get_figheight()
     for p, (title, panel) in enumerate(panels.items()):
         top = 1 - inch * ((above + below) * p + above)
-        axes = add_axes(figure, 0.265, 0.995, top, top - inch * below)
+        axes = add_axes(figure, 0.31, 0.995, top, top - inch * below)
         figure.text(0.01, top + inch * (above - 0.22), title, color=BLACK, size=MEDIUM, weight="bold")
         _table(axes, panel, names)
     return to_svg(figure, about)

@@ -128,7 +128,7 @@ def test_matrix_puts_hard_protocols_and_good_methods_first():
     results += [result("bad", p, 95, means_removed=False) for p in order]
     shown = places(plots.matrix(results))
     assert shown["good"][1] < shown["bad"][1]
-    assert shown["less each taxel’s mean over the window"][1] < shown["as recorded, means and all"][1]
+    assert shown["without each taxel’s mean over the window"][1] < shown["as recorded, means and all"][1]
     assert shown["speed"][0] < shown["split by"][0] < shown["random"][0]
 
 
