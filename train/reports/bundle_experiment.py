@@ -118,5 +118,5 @@ def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: 
     first = breaks_first(right)
     others = sorted(right.keys() - set(first), key=lambda name: (right[name]["right"][-1], name))
     return [{"name": name, "wrong": wrong[name]["right"]}
-            | {k: right[name][k] for k in ("about", "unit", "severities", "right", "total", "falls")}
+            | {k: right[name][k] for k in ("title", "about", "unit", "severities", "right", "total", "falls")}
             for name in (*first, *others)]  # fmt: skip

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from train.data.sets import Dataset
 from train.reports import formatting, html, plots, provenance, sweep_plot
 from train.reports.plot_style import ACCENT, FAINT, GREY, SMALL, set_ticks, single_axes, to_svg
+from train.reports.stress_report import level
 
 Array = NDArray[Any]
 Json = Mapping[str, Any]
@@ -78,7 +79,7 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
         ]
     if breaks := [row for row in figures["corruptions"] if row["falls"] is not None]:
         first = breaks[0]
-        yield ["what breaks it first", f"{first['name']}: five points lost at {first['falls']:.2g} {first['unit']}"]
+        yield ["what breaks it first", f"{first['title']}: five points lost at {level(first, first['falls'])}"]
     yield ["mean error of its probabilities", formatting.percent(figures["calibration"]["error"])]
     cost = figures["cost"]
     yield ["time of a sweep, memory, disk", f"{cost['ms']:.2f} ms, {cost['mib']:.0f} MiB, {cost['kb']:.0f} kB"]
@@ -105,9 +106,9 @@ def _material(row: Json) -> list[str]:
 def _corruption(row: Json) -> list[str]:
     """One thing that goes wrong, and what becomes of the sweeps at its largest severity."""
     most, right, wrong = row["severities"][-1], row["right"][-1], row["wrong"][-1]
-    falls = "–" if row["falls"] is None else f"{row['falls']:.2g} {row['unit']}"
+    falls = "–" if row["falls"] is None else level(row, row["falls"])
     shares = " / ".join(f"{100 * n / row['total']:.0f}" for n in (right, wrong, row["total"] - right - wrong))
-    return [f"{row['name']}: {row['about']}", falls, f"{most:g} {row['unit']}: {shares} %"]
+    return [f"{row['title']}: {row['about']}", falls, f"{level(row, most)}: {shares} %"]
 
 
 def _examples(sweeps: Dataset) -> list[int]:
