@@ -9,9 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 Estimate = tuple[float, float, float]
 """A share or a difference of shares, and the lower and upper end of its 95 % interval."""
+
+
+def of(entry: Mapping[str, Any]) -> Estimate:
+    """An entry of results, with `mean`, `low` and `high`."""
+    return entry["mean"], entry["low"], entry["high"]
+
+
+def entry(estimate: Estimate) -> dict[str, float]:
+    """The same as an entry of results."""
+    return dict(zip(("mean", "low", "high"), estimate, strict=True))
 
 
 def difference(one: Estimate, other: Estimate) -> Estimate:

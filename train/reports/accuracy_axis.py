@@ -1,6 +1,6 @@
 """The axis of accuracy that pictures of many methods share. In: a plot. Out: its axis, to 100 %, stretched where the best are.
 
-A place on it is the root of the error, so that 90 and 95 % are as far apart as 63 and 70 %, and 100 % is still there.
+A place on it is the root of the error, so that 90 and 95 % are as far apart as 71 and 80 %, and 100 % is still there.
 """
 
 from __future__ import annotations

@@ -107,8 +107,19 @@ def _who(dots: Sequence[Dot]) -> list[list[str]]:
     for dot in {dot["method"]: dot for dot in dots}.values():
         about = method_names.about(dot["method"])
         lines.setdefault(about or dot["method"], []).append(dot)
-    return [["; ".join(dict.fromkeys(map(label, those))), method_names.about(those[0]["method"]), ", ".join(dot["method"] for dot in those)]
+    return [[_together(those), method_names.about(those[0]["method"]), ", ".join(dot["method"] for dot in those)]
             for those in lines.values()]  # fmt: skip
+
+
+def _together(those: Sequence[Dot]) -> str:
+    """One name for models that are the same but for their size."""
+    names = list(dict.fromkeys(map(label, those)))
+    sizes = sorted(dot["weights"] for dot in those if dot.get("weights"))
+    return (
+        f"{OURS}, {method_names.size(sizes[0])} to {method_names.size(sizes[-1])} weights"
+        if len(names) > 1 and sizes
+        else names[0]
+    )
 
 
 def _table(

@@ -31,7 +31,7 @@ def line(what: str, ours: Json, peers: Mapping[str, Json]) -> dict[str, Any]:
             "short": False,
         }
     best = max(peers, key=lambda name: float(peers[name]["mean"]))
-    gap = differences.difference(estimate(ours), estimate(peers[best]))
+    gap = differences.difference(differences.of(ours), differences.of(peers[best]))
     short = gap[0] < NEAR - ROUNDING
     return {
         "what": what,
@@ -42,11 +42,6 @@ def line(what: str, ours: Json, peers: Mapping[str, Json]) -> dict[str, Any]:
         "verdict": verdict(gap),
         "short": short,
     }
-
-
-def estimate(figures: Json) -> Estimate:
-    """An accuracy with the ends of its interval."""
-    return figures["mean"], figures["low"], figures["high"]
 
 
 def verdict(gap: Estimate) -> str:

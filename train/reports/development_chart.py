@@ -84,7 +84,7 @@ def dots(
             case: {key: figures[key] for key in SHOWN} for case, figures in rows.items() if figures
         }
         if shared and all(case in accuracy for case in shared):
-            accuracy[MEAN] = entry(mean({case: accuracy[case] for case in shared}, sets))
+            accuracy[MEAN] = differences.entry(mean({case: accuracy[case] for case in shared}, sets))
         if accuracy:
             found.append({**dict.fromkeys(COSTS), **one, "family": family(one["method"]), "accuracy": accuracy})
     return found
@@ -95,21 +95,11 @@ def _form(figures: Json | None, form: str | None) -> Json | None:
     return figures["forms"].get(form) if figures and form else figures
 
 
-def estimate(figures: Json) -> Estimate:
-    """An accuracy with the ends of its interval."""
-    return figures["mean"], figures["low"], figures["high"]
-
-
-def entry(figures: Estimate) -> Json:
-    """The same as an entry of results."""
-    return dict(zip(("mean", "low", "high"), figures, strict=True))
-
-
 def mean(entries: Mapping[str, Json], sets: Mapping[str, str]) -> Estimate:
     """Mean of a method's accuracies by case, with its interval. sets: what each case is made of; those of one set err together."""
     groups: dict[str, list[Estimate]] = {}
     for case, figures in entries.items():
-        groups.setdefault(sets[case], []).append(estimate(figures))
+        groups.setdefault(sets[case], []).append(differences.of(figures))
     return differences.mean(groups)
 
 

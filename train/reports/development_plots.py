@@ -37,7 +37,7 @@ FEW = (0, 0.5, 0.8, 0.9, 0.95, 1)
 
 def lines(cases: Sequence[Json], table: Mapping[str, Accuracies], ours: str, peers: Sequence[str]) -> str:
     """A line for each case: every peer a grey dot, the best of them dark and named, ours in the accent colour with its interval."""
-    figure, axes = single_axes(0.36 * len(cases) + 0.85, left=0.56, right=0.95, top=0.42, bottom=0.32)
+    figure, axes = single_axes(0.36 * len(cases) + 1.0, left=0.56, right=0.95, top=0.42, bottom=0.5)
     lows: list[float] = []
     for y, case in enumerate(cases):
         row, chance = table[case["case"]], 1 / case["materials"]
@@ -55,12 +55,13 @@ def lines(cases: Sequence[Json], table: Mapping[str, Accuracies], ours: str, pee
         lows += [row[ours]["low"], chance, *there.values()]
     axes.set_ylim(len(cases) - 0.5, -0.5)
     accuracy_axis.stretch(axes, "x", lows, FEW)
+    axes.set_xlabel("sweeps named rightly", color=GREY, size=SMALL, labelpad=3)
     axes.grid(axis="x", color=FAINT, linewidth=0.6)
     set_ticks(axes.yaxis, [])
-    named = f"● {plain_name(ours)}, 95 % interval"
-    for up, texts in ((22, ((-1.4, named, ACCENT),)), (8, ((-1.4, "● best peer, named", BLACK), (-0.4, "● other peers", GREY), (0.35, "| guessing", GREY)))):  # fmt: skip
-        for x, text, shade in texts:
-            axes.annotate(text, (x, 1), (0, up), "axes fraction", textcoords="offset points", color=shade, size=SMALL)
+    legend = ((22, -1.4, f"● {plain_name(ours)}, 95 % interval", ACCENT), (8, -1.4, "● best peer, named", BLACK),
+              (8, -0.4, "● other peers", GREY), (8, 0.35, "| guessing", GREY))  # fmt: skip
+    for up, x, text, shade in legend:
+        axes.annotate(text, (x, 1), (0, up), "axes fraction", textcoords="offset points", color=shade, size=SMALL)
     return to_svg(figure, f"accuracy of {plain_name(ours)} and its peers on each development set")
 
 
@@ -82,7 +83,10 @@ def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> st
             line = sorted(those[name].items(), key=lambda item: at[item[0]])
             axes.plot([at[n] for n, _ in line], [entry["mean"] for _, entry in line], clip_on=False, **look)
         chance = 1 / cases[case]["materials"]
-        axes.set_title(plain_case(cases[case]), color=BLACK, size=MEDIUM, loc="left", pad=20, x=-0.11)
+        axes.set_ylabel(
+            f"Named rightly: {plain_case(cases[case])}", color=BLACK, size=MEDIUM, rotation=0, ha="left", va="bottom"
+        )
+        axes.yaxis.set_label_coords(-0.11, 1.19)
         for x, text, shade in ((-0.11, f"━ {plain_name(ours)}", ACCENT), (0.3, f"╍ {plain_name(peer)}" if peer else "", BLACK),
                                (0.72, "thin: other peers", GREY)):  # fmt: skip
             axes.annotate(text, (x, 1), (0, 9), "axes fraction", textcoords="offset points", color=shade, size=SMALL)

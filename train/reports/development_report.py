@@ -14,6 +14,7 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
+from train.metrics import differences
 from train.reports import (
     chart_page,
     comparison,
@@ -72,35 +73,56 @@ def render(figures: Json, quick: bool = False) -> tuple[dict[str, str], dict[str
     of = {case["case"]: case for case in cases}
     means = _means(table, cases, ours, names, peers)
     main = means[REAL]
-    pictures = {"accuracy": development_plots.lines(cases, table, ours, peers)}
-    curves = learning_curves(figures["results"])
-    if curves:
-        pictures["curves"] = development_plots.curves(of, curves, ours)
     times = figures.get("times") or {"entries": [], "left_out": {}}
-    pages = {}
+    pages, pictures = {}, {}
     if dots := development_chart.dots(times["entries"], table, cases, main["shared"]):
         axes = development_chart.axes(cases, main["shared"])
         pictures["front"] = scatter.chart(dots, list(axes)[:1], accuracies=axes)
         pages["chart"] = chart_page.html(_with_origin(dots, figures), pictures["front"], quick, times["left_out"], accuracies=axes,
                                          source="results.json", header=provenance.of(figures))  # fmt: skip
-    lines = [comparison.line(plain_case(one), table[case][ours], _plain_names({name: table[case][name] for name in peers if name in table[case]}))
-             for case, one in of.items()]  # fmt: skip
+    pictures["accuracy"] = development_plots.lines(cases, table, ours, peers)
+    curves = learning_curves(figures["results"])
+    if curves:
+        pictures["curves"] = development_plots.curves(of, curves, ours)
     pages["index"] = html.render(
-        "development.html.j2", header=provenance.of(figures), home=html.HOME, figures=figures, quick=quick, ours=ours, names=names, means=means, main=main, times=times, lines=lines,
-        cases=of, table=table, best_of={case: line["best"] for case, line in zip(of, lines, strict=True)}, plain={case: plain_case(one) for case, one in of.items()}, name_of=method_names.plain_name,
-        about={name: method_names.about(name) for name in names}, shown=comparison.shown,
-        precisions=list(precisions(table, main["shared"], names)),
-        targets=list(targets(lines, of, table, ours, main, times["entries"])),
-        curves=_curve_rows(curves, names), relative=relative_times(times["entries"], names), each=EACH,
+        "development.html.j2", header=provenance.of(figures), home=html.HOME, figures=figures, quick=quick, ours=ours, names=names,
+        means=means, main=main, times=times, cases=of, table=table, curves=_curve_rows(curves, names), each=EACH,
+        relative=relative_times(times["entries"], names), precisions=list(precisions(table, main["shared"], names)),
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
-        sets=[[plain_case(one), about_case(one), one["sweeps"]] for one in cases],
-        files=[[plain_case(one), ", ".join([one["set"], *one["only"]]), one["protocol"], one["digest"]] for one in cases],
         costs=[[method_names.plain_name(one["method"]), *(one[key] for key in ("precision", "runtime", "ms_p50", "ms_p99"))]
                for one in times["entries"]],
         fits=[[method_names.plain_name(name), _fit_s(table, name)] for name in names],
-        missing={name: [plain_case(of[case]) for case in those] for name, those in _missing(table, list(of), names, figures["left_out"]).items()},
+        **_beside_peers(of, table, ours, peers, main, times["entries"]), **_words(of, names, _missing(table, of, names, figures["left_out"])),
     )  # fmt: skip
     return pages, pictures
+
+
+def _beside_peers(
+    of: Mapping[str, Json], table: Mapping[str, Accuracies], ours: str, peers: Sequence[str], main: Json, times: Sequence[Json]
+) -> dict[str, Any]:  # fmt: skip
+    """What the page says of ours beside the best peer of each line, and of what was wanted."""
+    lines = [
+        comparison.line(plain_case(one), table[case][ours], _plain_names({name: table[case][name] for name in peers if name in table[case]}))
+        for case, one in of.items()
+    ]  # fmt: skip
+    best = {case: line["best"] for case, line in zip(of, lines, strict=True)}
+    return {
+        "lines": lines,
+        "best_of": best,
+        "shown": comparison.shown,
+        "targets": list(targets(lines, of, table, ours, main, times)),
+    }
+
+
+def _words(of: Mapping[str, Json], names: Sequence[str], missing: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    """Lines and methods as the page calls them; `missing` are the lines that a method lacks."""
+    plain = {case: plain_case(one) for case, one in of.items()}
+    return {
+        "plain": plain, "name_of": method_names.plain_name, "about": {name: method_names.about(name) for name in names},
+        "missing": {name: [plain[case] for case in those] for name, those in missing.items()},
+        "sets": [[plain[case], about_case(one), one["sweeps"]] for case, one in of.items()],
+        "files": [[plain[case], ", ".join([one["set"], *one["only"]]), one["protocol"], one["digest"]] for case, one in of.items()],
+    }  # fmt: skip
 
 
 def _with_origin(dots: Sequence[Json], figures: Json) -> list[dict[str, Any]]:
@@ -166,7 +188,7 @@ def mean_row(
                       key=lambda those: (len(those) * (lines := min(len(has[name]) for name in those)), lines), default=())  # fmt: skip
     shared = [case for case in sets if all(name in table[case] for name in (ours, *whole))]
     entries = {
-        name: development_chart.entry(development_chart.mean({case: table[case][name] for case in shared}, sets))
+        name: differences.entry(development_chart.mean({case: table[case][name] for case in shared}, sets))
         for name in names if shared and all(name in table[case] for case in shared)
     }  # fmt: skip
     beside = _plain_names({name: entries[name] for name in peers if name in entries})
@@ -225,7 +247,7 @@ def precisions(table: Mapping[str, Accuracies], cases: Sequence[str], names: Ite
 
 
 def _missing(
-    table: Mapping[str, Accuracies], cases: Sequence[str], names: Sequence[str], left_out: Mapping[str, str]
+    table: Mapping[str, Accuracies], cases: Iterable[str], names: Sequence[str], left_out: Mapping[str, str]
 ) -> dict[str, list[str]]:
     """Of each method the cases in which it has no result, and for which no other reason is given."""
     lacks = {

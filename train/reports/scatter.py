@@ -35,15 +35,17 @@ from train.reports.plot_style import (
     to_svg,
 )
 
-HEIGHT, ABOVE, BELOW, FOOT = 3.7, 0.52, 0.5, 0.42
+HEIGHT, ABOVE, BELOW, FOOT = 3.9, 0.7, 0.5, 0.42
 """Inches: of a panel, above and below its plot, and of the legend."""
+HEAD = 33.0
+"""Points from a plot to its title: two lines stand between them."""
 LETTER = 0.56
 """Width of a letter, in sizes of the text: more than the mean of most fonts."""
 MARK = 3.2
 """Half of a mark, points."""
 RING, FARTHER, GUESSED = 13.5, 1.5, 6.0
 """Around what is shipped, points across; how much farther its name is; what is kept free above the floor, where guessing is."""
-PLACES = [(0, 10, "center"), (6, 0, "left"), (-6, 0, "right"), (0, -10, "center"), (-4, 8, "right"), (5, -8, "left"),
+PLACES = [(6, 0, "left"), (0, 10, "center"), (-6, 0, "right"), (0, -10, "center"), (-4, 8, "right"), (5, -8, "left"),
           (5, 8, "left"), (-5, -8, "right"), (0, 20, "center"), (0, -20, "center"), (8, 16, "left"), (8, -16, "left"),
           (-8, 16, "right"), (-8, -16, "right")]  # fmt: skip
 """Where a name may stand, points from its dot, and its alignment; the best first."""
@@ -71,11 +73,10 @@ def chart(
     for x, row, text, shade in (
         (0.01, 1, "■ int8   ● float   → float to int8   ○ not on the box", GREY),
         (0.01, 0, "━ Pareto front: no other is both better and cheaper", BLACK),
-        (0.71, 1, f"■ {OURS}   ◯ shipped{'' if chosen == SHIPPED else ' then'}", ACCENT),
-        (0.71, 0, "┄ guessing", GREY),
+        (0.66, 1, f"■ {OURS}   ◯ shipped{'' if chosen == SHIPPED else ' then'}", ACCENT),
     ):
         figure.text(x, (0.06 + 0.19 * row) / height, text, color=shade, size=SMALL)
-    return to_svg(figure, f"accuracy over {COSTS[cost].short} of {len(set(networks(dots)))} models")
+    return to_svg(figure, f"accuracy over {COSTS[cost].short}, of {len(set(networks(dots)))} models")
 
 
 def _panel(axes: Axes, spots: Sequence[Spot], accuracy: ChartAxis, y: str, cost: ChartAxis, chosen: str) -> None:
@@ -86,6 +87,8 @@ def _panel(axes: Axes, spots: Sequence[Spot], accuracy: ChartAxis, y: str, cost:
     accuracy_axis.stretch(axes, "y", [*lows, *([accuracy.chance] if accuracy.chance else [])])
     if accuracy.chance:
         accuracy_axis.draw_chance(axes, accuracy.chance)
+        axes.annotate(f"guessing: {percent(accuracy.chance)}", (1, accuracy.chance), (0, 3), ("axes fraction", "data"),
+                      textcoords="offset points", color=GREY, size=SMALL, ha="right")  # fmt: skip
     axes.grid(color=FAINT, linewidth=0.6)
     tens = 10.0 ** np.arange(np.floor(np.log10(min(ends))), np.ceil(np.log10(max(ends))) + 1)
     ticks = [float(t) for t in tens if axes.get_xlim()[0] <= t <= axes.get_xlim()[1]]
@@ -93,11 +96,7 @@ def _panel(axes: Axes, spots: Sequence[Spot], accuracy: ChartAxis, y: str, cost:
         axes.xaxis, ticks or [float(f"{min(ends):.1g}")], cost.unit
     )  # a single dot may have no power of ten in reach
     axes.set_xlabel(f"← {cost.short}", color=GREY, size=SMALL, labelpad=4)
-    axes.set_title(
-        f"Named rightly: {accuracy.short}", color=BLACK, size=MEDIUM, weight="bold", loc="left", pad=19, x=-0.1
-    )
-    axes.annotate(_sentence(spots, cost, chosen), (-0.1, 1), (0, 8), "axes fraction", textcoords="offset points", color=ACCENT,
-                  size=SMALL)  # fmt: skip
+    _head(axes, spots, f"Named rightly: {accuracy.short}", cost, chosen)
     best = [spot for spot in spots if spot.best]
     edge = [axes.get_xlim()[1]]
     stairs = np.array([[s.x for s in best] + edge, [s.y for s in best] + [best[-1].y]])
@@ -107,13 +106,18 @@ def _panel(axes: Axes, spots: Sequence[Spot], accuracy: ChartAxis, y: str, cost:
     _labels(axes, spots, axes.transData.transform(stairs.T), chosen)
 
 
-def _sentence(spots: Sequence[Spot], cost: ChartAxis, chosen: str) -> str:
-    """What one reads first: what the box ships, and the most accurate other method."""
-    ours = [spot for spot in spots if chosen in spot.methods]
-    others = sorted((spot for spot in spots if spot.dot["family"] != OURS), key=lambda spot: -spot.y)
-    return "; ".join(
-        f"{label(spot.dot)}: {percent(spot.y)}, {amount(spot.x, cost.unit)}" for spot in (*ours, *others[:1])
-    )
+def _head(axes: Axes, spots: Sequence[Spot], title: str, cost: ChartAxis, chosen: str) -> None:
+    """What is upwards, and what one is to read first: what the box ships, and the most accurate other method."""
+    shipped = next((spot for spot in spots if chosen in spot.methods), None)
+    peer = max((spot for spot in spots if spot.dot["family"] != OURS), key=lambda spot: spot.y, default=None)
+    axes.set_ylabel(title, color=BLACK, size=MEDIUM, weight="bold", rotation=0, ha="left", va="bottom")
+    axes.yaxis.set_label_coords(-0.1, 1 + HEAD / axes.get_window_extent().height)
+    for up, before, spot in ((21, "", shipped), (9, "best peer, ", peer)):
+        if spot:
+            text = f"{before}{label(spot.dot)}: {percent(spot.y)} in {amount(spot.x, cost.unit)}"
+            axes.annotate(
+                text, (-0.1, 1), (0, up), "axes fraction", textcoords="offset points", color=colour(spot), size=SMALL
+            )
 
 
 def colour(spot: Spot) -> str:
@@ -151,6 +155,7 @@ def _labels(axes: Axes, spots: Sequence[Spot], stairs: NDArray[Any], chosen: str
             taken.append((min(x, to_x), min(y, to_y) - 2, max(x, to_x), max(y, to_y) + 2))
     left, bottom, right, top = map(float, axes.get_window_extent().extents)
     frame: Box = (left, bottom + GUESSED, right, top)
+    taken.append((right - 80, bottom, right, bottom + GUESSED + 12))  # where it says what guessing reaches
     for i in _important(spots, chosen):
         _name(axes, spots[i], at[i], taken, i, frame, chosen)
 

@@ -36,6 +36,12 @@ def test_groups_of_a_mean_err_independently():
     assert mixed == pytest.approx((0.8, 0.8 - 0.2 / 3, 0.8 + 0.2 / 3))
 
 
+def test_an_entry_of_results_is_an_estimate():
+    """There and back."""
+    entry = {"mean": 0.8, "low": 0.7, "high": 0.9}
+    assert differences.entry(differences.of(entry | {"n": 3})) == entry
+
+
 def test_of_nothing_there_is_no_mean():
     """An error, no figure."""
     with pytest.raises(ZeroDivisionError):

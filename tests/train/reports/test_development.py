@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ from typing import Any
 import pytest
 
 from appliance.core.errors import FormatError
+from tests.factories import rendered
 from tests.factories.development_data import entry, figures
 from tests.factories.page_reader import PageReader
+from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import tones
 from train.cli.main import main
 from train.evaluation.evaluate import Where
@@ -81,7 +84,8 @@ def test_the_chart_has_an_axis_for_each_line_and_their_mean():
     assert data["dots"][1]["accuracy"]["two"] == {"mean": 0.755, "low": 0.705, "high": 0.805, "n": 100, "seeds": [1, 2]}
     assert "older than" not in pages["chart"]
     assert '<a href="results.json" download>' in pages["chart"]
-    assert "Palpate, as shipped: 90.0 %, 0.1 ms; QUANT: 85.0 %, 22 ms" in pictures["front"]
+    assert "Palpate, as shipped: 90.0 % in 0.1 ms" in pictures["front"]
+    assert "best peer, QUANT: 85.0 % in 22 ms" in pictures["front"]
 
 
 def test_the_mean_of_lines_counts_one_set_once():
@@ -435,3 +439,30 @@ def test_the_quick_form_writes_everything(tmp_path: Path, capsys: pytest.Capture
     assert again["results"] == [r for r in found["results"] if r["method"] != "edge-spectral"]
     assert main([*args, "--kept", "--method", "quant", "--out", str(tmp_path / "c")]) == FormatError.exit_code
     assert "no result of default" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", rendered.SCHEMES)
+@pytest.mark.parametrize("width", rendered.WIDTHS)
+def test_both_pages_can_be_read(browser: Any, tmp_path: Path, width: int, scheme: str):
+    """Nothing cut off, no axis without title, no raw brace, enough contrast; and so for the chart of today's results."""
+    development_report.write(figures(), tmp_path)
+    for name in ("index", "chart"):
+        assert rendered.faults(browser, rendered.address(tmp_path / f"{name}.html"), width, scheme) == {}, name
+    for page in ("development/index.html", "development/chart.html", "chart/index.html"):
+        assert rendered.faults(browser, rendered.address(ROOT / "docs" / page), width, scheme) == {}, page
+
+
+@pytest.mark.slow
+def test_the_pages_show_the_results_beside_them(tmp_path: Path):
+    """Drawn again from results.json and chart.json they say what those in docs/ say, word by word."""
+    for folder, file in (("development", "results.json"), ("chart", "chart.json")):
+        docs, again = ROOT / "docs" / folder, tmp_path / folder
+        again.mkdir()
+        shutil.copy(docs / file, again)
+        if folder == "chart":
+            shutil.copytree(ROOT / "docs" / "alignment", tmp_path / "alignment")
+        assert main([folder, "--draw", "--out", str(again)]) == 0
+        for path in (path for path in again.iterdir() if path.suffix in (".html", ".svg")):
+            shown, there = (PageReader(one.read_text()).text for one in (path, docs / path.name))
+            assert shown == there, f"{path.name}: palpate-train {folder} --draw"

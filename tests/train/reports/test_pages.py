@@ -243,6 +243,9 @@ def test_numbers_are_written_for_people():
     assert formatting.interval((0.81, 0.903), 0) == "81 – 90 %"
     assert [formatting.points(v) for v in (0.023, -0.0041)] == ["2.3", "−0.4"]
     assert [formatting.points(v, sign=True) for v in (0.023, -0.0041)] == ["+2.3", "−0.4"]
+    assert formatting.points(-0.0001) == "0.0"
+    assert [formatting.amount(*v) for v in ((0.4009, "ms"), (104.17, "ms"), (950.0, "KB"), (15918.3, "KB"), (1234567.0,))] == [
+        "0.401 ms", "104 ms", "950 KB", "15.9 MB", "1,230,000"]  # fmt: skip
     assert [formatting.seconds(v) for v in (0.2468, 31.4, 720)] == ["0.25 s", "31 s", "12 min"]
 
 

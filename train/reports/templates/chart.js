@@ -227,8 +227,8 @@ function table() {
     return `<tr data-i="${i}" class="${kinds}"><th scope="row">${dot.runs_on_box ? "" : "○ "}${safe(dot.label)}`
       + `<small>${safe(dot.name)}</small></th>${cells.map((c) => `<td>${c}</td>`).join("")}</tr>`;
   });
-  $("table").innerHTML = `<div class="wide"><table><caption>${rows.length} of ${dots.length} measured forms; bold: on the Pareto front;
-    a dash: not measured</caption><thead><tr>${head}</tr></thead><tbody>${body.join("")}</tbody></table></div>`;
+  $("table").innerHTML = `<p class="quiet">${rows.length} of ${dots.length} measured forms; bold: on the Pareto front; a dash: not measured.</p>
+    <div class="wide"><table><thead><tr>${head}</tr></thead><tbody>${body.join("")}</tbody></table></div>`;
 }
 
 function choose(change) {
