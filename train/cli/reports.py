@@ -191,11 +191,13 @@ def run_matrix(args: argparse.Namespace) -> None:
         except ValueError as e:
             raise FormatError(f"{path.name}: not what evaluate wrote: {e}") from e
     picture = plots.matrix(results, count="recording" if args.recordings else "window")
-    put(args.out, provenance.in_svg(picture, provenance.of(results)).encode(), parents=True)
+    about = provenance.of(results)
+    put(args.out, provenance.in_svg(picture, about).encode(), parents=True)
     print(args.out)
     if args.page:
         page = args.page.read_text(encoding="utf-8")
-        put(args.page, marked_text.insert(page, "matrix", matrix_table.headline(results), str(args.page)).encode())
+        text = marked_text.insert(page, "matrix", matrix_table.headline(results), str(args.page))
+        put(args.page, provenance.in_markdown(text, about).encode())
         print(args.page)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from train.metrics import differences
 from train.models.methods import SHIPPED
 from train.reports import comparison
 from train.reports.development_chart import PROTOCOLS
@@ -40,8 +41,8 @@ def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:
 
 def _cells(line: Json) -> list[str]:
     """Ours, the best of the others with its name, difference, verdict."""
-    own = estimate(comparison.estimate(line["ours"]))
+    own = estimate(differences.of(line["ours"]))
     if not line["best"]:
         return [own, "–", "–", line["verdict"]]
-    other = f"{plain_name(line['best'])}: {estimate(comparison.estimate(line['leader']))}"
+    other = f"{plain_name(line['best'])}: {estimate(differences.of(line['leader']))}"
     return [own, other, comparison.shown(line["gap"]), line["verdict"]]

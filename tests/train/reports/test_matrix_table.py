@@ -64,7 +64,8 @@ def test_the_command_writes_the_table_between_its_markers(tmp_path: Path, capsys
     text = page.read_text()
     assert "| 2 classes: a force it never felt | removed |" in text
     assert "old" not in text
-    assert text.startswith("# Fabrics\n\n<!-- matrix -->\n| test |")
+    assert text.startswith("# Fabrics\n\n<!-- provenance ")
+    assert "<!-- matrix -->\n| test |" in text
     assert text.endswith("<!-- /matrix -->\n\nend\n")
     assert picture.exists()
     page.write_text("# Fabrics\n")
