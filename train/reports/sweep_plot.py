@@ -315,7 +315,7 @@ def _spectrum(axes: Axes, taxels: Array, form: SweepFormat) -> None:
         ticks = [step * 10.0**k for k in range(-9, 9) for step in steps if first <= step * 10.0**k <= last]
         set_ticks(axis, ticks)
     axes.set_xlabel("Hz", color=GREY, size=SMALL, labelpad=1)
-    axes.set_ylabel("counts per √Hz", color=GREY, size=SMALL)
+    axes.set_ylabel("counts/√Hz", color=GREY, size=SMALL)
 
 
 def _spectrogram(axes: Axes, sweep: ShownSweep, taxels: Array, start_s: float) -> None:
