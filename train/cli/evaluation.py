@@ -251,7 +251,12 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
 def run_alignment(args: argparse.Namespace) -> None:
     """Measure, write the figures and the plot, the tables into the page where one lies there, and print a summary."""
     if args.draw:
-        result = _positions(args.out / "place.json")
+        result = options.earlier_run(
+            args.out / "place.json",
+            "alignment",
+            {"bundle", "moved", "T-HARD", "other positions"},
+            "leave --draw away to measure",
+        )
     else:
         box = Classifier(bundle.load(args.bundle), SystemClock())
         displacements = len(contact_positions.DIRECTIONS) * (2 * len(contact_positions.OFF_MM) + 1)
@@ -267,16 +272,3 @@ def run_alignment(args: argparse.Namespace) -> None:
             text = marked_text.insert(text, name, content, str(page))
         put(page, provenance.in_markdown(text, about).encode())
     print("\n".join(contact_positions.lines(result)))
-
-
-def _positions(path: Path) -> dict[str, Any]:
-    """What an earlier run of `alignment` measured. Raises FormatError where the file has another content."""
-    try:
-        found: dict[str, Any] = json.loads(path.read_bytes())
-        if {"bundle", "moved", "T-HARD", "other positions"} <= found.keys():
-            return found
-    except OSError as e:
-        raise FormatError(f"{path} cannot be read: {e.strerror}; leave --draw away to measure") from e
-    except (ValueError, AttributeError):
-        pass
-    raise FormatError(f"{path} is not what palpate-train alignment wrote; leave --draw away to measure")

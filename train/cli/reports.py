@@ -260,15 +260,10 @@ def _developed(args: argparse.Namespace, where: Where, log: options.Log, effort:
 
 def _results(path: Path) -> dict[str, Any]:
     """What an earlier run of `development` wrote. Raises FormatError where the file has another content."""
-    try:
-        found: dict[str, Any] = json.loads(path.read_bytes())
-        if {"methods", "runs", "cases", "results", "left_out"} <= found.keys():
-            return found
-    except OSError as e:
-        raise FormatError(f"{path} cannot be read: {e.strerror}; name the results.json of an earlier run") from e
-    except (ValueError, AttributeError):
-        pass
-    raise FormatError(f"{path} is not what palpate-train development wrote; name its results.json")
+    keys = {"methods", "runs", "cases", "results", "left_out"}
+    return options.earlier_run(
+        path, "development", keys, "name the results.json of an earlier run", "name its results.json"
+    )
 
 
 def run_overview(args: argparse.Namespace) -> None:

@@ -68,7 +68,8 @@ class DocsPage:
 
 PAGES = (
     DocsPage("development", "development/index.html", "development/results.json", ("train", "development"), (REAL,), True, True),
-    DocsPage("alignment", "alignment/README.md", "alignment/place.json", ("train", "alignment", "--out", "docs/alignment")),
+    DocsPage("alignment", "alignment/README.md", "alignment/place.json", ("train", "alignment", "--out", "docs/alignment"),
+             drawn=True),
     DocsPage("certainty", "certainty/index.html", "certainty/results.json",
              ("train", "certainty", "--set", "sim:T-REAL:1-3", "--test", "sim:T-REAL:4-6:20"), folds=True),
     DocsPage("chart", "chart/index.html", "chart/chart.json", ("train", "chart"), (REAL,), True, True),
