@@ -19,7 +19,7 @@ GROUPS = {
     "bundles": ("fit", "export", "pack", "references", "score", "parity"),
     "signing": ("sign",),
     "choose": ("choose",),
-    "reports": ("reports", "figures", "paper", "chart", "development", "matrix", "overview", "report"),
+    "reports": ("reports", "figures", "paper", "chart", "development", "fabrics", "matrix", "overview", "report"),
 }
 """The modules of this package and their commands: only the one that is wanted is imported, since that takes seconds."""
 

@@ -1,4 +1,4 @@
-"""The commands that write pages and plots: reports, figures, paper, chart, development, matrix, overview, report."""
+"""The commands that write pages and plots: reports, figures, paper, chart, development, fabrics, matrix, overview, report."""
 
 from __future__ import annotations
 
@@ -32,17 +32,16 @@ from train.reports import (
     development_times,
     docs_pages,
     document_figures,
-    marked_text,
+    fabrics_report,
     matrix_table,
     overview_plot,
     paper_experiment,
-    plots,
     provenance,
 )
 
 
 def register(add: Add) -> None:
-    """reports, figures, paper, chart, development, matrix, overview, report."""
+    """reports, figures, paper, chart, development, fabrics, matrix, overview, report."""
     _add_reports(add)
     add("figures", run_figures, "write the figures of results into README, manual and pages")
     paper = add("paper", run_paper, "run the paper's experiment on the simulated skin and write a page about it")
@@ -68,7 +67,21 @@ def register(add: Add) -> None:
                      help="results.json of palpate-train certainty, for the touch time of its method")  # fmt: skip
     _add_report(add)
     development = _add_development(add)
-    for command in (paper, chart, development):
+    fabrics = add(
+        "fabrics", run_fabrics, "evaluate methods on real fabrics with a condition left out, and write a page about it"
+    )
+    fabrics.add_argument(
+        "--out", type=Path, default=Path("docs/fabricslide"), metavar="DIR", help="where it goes (docs/fabricslide)"
+    )
+    fabrics.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
+                         help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
+    fabrics.add_argument("--method", default="all", metavar="NAME[,NAME...]",
+                         help="run these; all others stay as results.json in --out has them (all)")  # fmt: skip
+    fabrics.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
+    fabrics.add_argument(
+        "--draw", action="store_true", help="run nothing: draw the page of results.json in --out again"
+    )
+    for command in (paper, chart, development, fabrics):
         options.add_effort(command)
         options.add_where(command)
     matrix = add("matrix", run_matrix, "draw what evaluate wrote: methods by protocols")
@@ -190,15 +203,21 @@ def run_matrix(args: argparse.Namespace) -> None:
             results += json.loads(path.read_bytes())
         except ValueError as e:
             raise FormatError(f"{path.name}: not what evaluate wrote: {e}") from e
-    picture = plots.matrix(results, count="recording" if args.recordings else "window")
-    about = provenance.of(results)
-    put(args.out, provenance.in_svg(picture, about).encode(), parents=True)
+    matrix_table.draw(results, args.out, args.recordings)
     print(args.out)
     if args.page:
-        page = args.page.read_text(encoding="utf-8")
-        text = marked_text.insert(page, "matrix", matrix_table.headline(results), str(args.page))
-        put(args.page, provenance.in_markdown(text, about).encode())
+        matrix_table.insert(results, args.page)
         print(args.page)
+
+
+def run_fabrics(args: argparse.Namespace) -> None:
+    """Evaluate, write the page and print its path; with --draw write it of what lies in --out."""
+    if not args.draw:
+        where, log, effort = options.where(args), options.Log(), options.effort(args)
+        left_out = fabrics_report.run(args.out, args.data, options.names(args), where, log, effort)
+        for name, why in left_out.items():
+            print(f"left out: {name}: {why}")
+    print(fabrics_report.draw(args.out))
 
 
 def run_chart(args: argparse.Namespace) -> None:

@@ -1,21 +1,36 @@
-"""What was reached and what was missed in a matrix of methods by protocols. In: the list that evaluate writes. Out: Markdown."""
+"""What was reached and what was missed in a matrix of methods by protocols. In: the list that evaluate writes. Out: a picture,
+a table in a page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from appliance.core.storage import put
 from train.metrics import differences
 from train.models.methods import SHIPPED
-from train.reports import comparison
+from train.reports import comparison, marked_text, plots, provenance
 from train.reports.development_chart import PROTOCOLS
 from train.reports.formatting import estimate
 from train.reports.method_names import plain_name
 
 Json = Mapping[str, Any]
 HEAD = ("test", "means", "{ours}", "best of the others", "difference, points", "verdict")
+
+
+def draw(results: Sequence[Json], out: Path, recordings: bool = False) -> None:
+    """The picture of all methods, an SVG file: of recordings instead of windows where `recordings`."""
+    picture = plots.matrix(results, count="recording" if recordings else "window")
+    put(out, provenance.in_svg(picture, provenance.of(results)).encode(), parents=True)
+
+
+def insert(results: Sequence[Json], page: Path) -> None:
+    """The headline, between the markers of a page. Raises FormatError where it has none."""
+    text = marked_text.insert(page.read_text(encoding="utf-8"), "matrix", headline(results), str(page))
+    put(page, provenance.in_markdown(text, provenance.of(results)).encode())
 
 
 def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:

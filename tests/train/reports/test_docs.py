@@ -18,8 +18,6 @@ DOCS = ROOT / "docs"
 HTML = sorted(DOCS.rglob("*.html"))
 SVG = sorted(DOCS.rglob("*.svg"))
 MARKDOWN = [*ROOT.glob("*.md"), *sorted(DOCS.rglob("*.md"))]
-JOINED = DOCS / "fabricslide" / "results.json"
-"""Of several runs of evaluate, drawn by `matrix`; `reports` has no command that makes it."""
 METHODS = {"method", "methods", "shipped"}
 """Keys of results that tell of methods, and so of the default."""
 
@@ -42,7 +40,7 @@ def test_every_page_and_every_result_that_tells_of_a_default_is_listed():
     assert [name(path) for path in HTML if path.parent not in folders] == []
     results = [path for path in DOCS.rglob("*.json") if tells_of_a_default(json.loads(path.read_bytes()))]
     assert len(results) >= 5
-    listed = {JOINED, *(DOCS / page.results for page in docs_pages.PAGES)}
+    listed = {DOCS / page.results for page in docs_pages.PAGES}
     assert [name(path) for path in results if path not in listed] == []
 
 
