@@ -171,8 +171,8 @@ def _choose(court: Court, trunk: Trunk, settings: Settings, log: Log) -> Judged:
 def _beside_stages(court: Court, judged: Judged, fixed: Trunk, settings: Settings, log: Log) -> Judged:
     """What was chosen with a discriminant of trained stages, with as few filters as then do.
 
-    For a skin that will be reattached stages and the spectrum are enough where neither held-out sweeps nor their copies
-    show more. Sweeps in place alone would not: they do not show what a view is good for in a condition that nobody recorded.
+    For a skin that will be reattached stages and the spectrum are enough unless held-out sweeps and their copies show that
+    more is better: what corrupts sweeps moves filters more. Sweeps in place alone would not: they do not show what a view is good for in a condition that nobody recorded.
     """
     size, full = sum(STAGES.channels), court.judge(_with_stages(judged.plan))
     if not settings.choose:
@@ -180,7 +180,7 @@ def _beside_stages(court: Court, judged: Judged, fixed: Trunk, settings: Setting
     if settings.reattached:
         log("choosing: stages and the spectrum alone")
         lean = court.judge(_stages_alone(fixed.layout().get("bands", slice(0, 0))))
-        if court.holds(lean, full):
+        if not court.better(full, lean):
             return lean
     numbers = np.append(np.full(size, -1), _filter_numbers(fixed))
     return choice.fewer(court, full, numbers, bank.LEAST_FILTERS, log)

@@ -133,19 +133,19 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("holds", [True, False])
-def test_stages_and_the_spectrum_are_enough_where_copies_show_it(monkeypatch: pytest.MonkeyPatch, holds: bool):
+@pytest.mark.parametrize("better", [True, False])
+def test_stages_and_the_spectrum_are_enough_unless_more_is_better(monkeypatch: pytest.MonkeyPatch, better: bool):
     """For a skin that is put back: each stage then has a discriminant with the spectrum, and the trunk holds no filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
-    monkeypatch.setattr(choice.Court, "holds", lambda *_: holds)
+    monkeypatch.setattr(choice.Court, "better", lambda *_: better)
     fit = recipe.fit(easy(), 1, Settings(steps=20, reattached=True))
     bands = fit.bands
     assert bands
-    assert bool(fit.architecture.pools) != holds
-    assert bool(fit.architecture.distribution) != holds
+    assert bool(fit.architecture.pools) == better
+    assert bool(fit.architecture.distribution) == better
     assert fit.about["validation"]["n"] == len(fit.held)  # copies were judged, and are not counted
-    if holds:
+    if not better:
         sizes = [len(part.columns) for part in fit.plan.parts]
         assert sizes == [channels + bands for channels in recipe.STAGES.channels]
         assert all(part.copies for part in fit.plan.parts)
