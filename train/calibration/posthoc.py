@@ -114,18 +114,37 @@ class Posthoc:
         return assemble_model(joined(trunk, tenths), self.embedding, head, self.steps, known)
 
 
+@dataclass(frozen=True)
+class PosthocInputs:
+    """What everything is fitted to: features [N, D + 1, F] of sweeps with labels [N] from 0 to K - 1, of groups [N].
+
+    judged: bool [N], sweeps that the trunk did not see. Only these find temperatures and rule, each with heads that did
+    not see its group. fixed: so many features, the last ones, were not trained; see novelty.embed. Where there are some,
+    most of a distance is in them, and all sweeps find its limit: of more positions, so that it is less a matter of chance.
+    copied: augmented copies; those that are not held are what the head was fitted to as well, the others judge what a moved
+    skin does. disturbed: bool [N], sweeps that only show how far known materials scatter when something is wrong: the head
+    does not see them, and they judge nothing. plan: of the head that names the material; None for one discriminant that sees
+    everything.
+    """
+
+    tenths: Array
+    labels: Array
+    groups: Array
+    judged: Array
+    fixed: int
+    copied: AugmentedCopies
+    disturbed: Array
+    plan: HeadPlan | None = None
+
+
 def calibrate(fit: Fit) -> Posthoc:
     """Fit everything to the int8 trunk of `fit`. Raises FormatError as `posthoc_inputs` and `fit_posthoc`."""
-    return fit_posthoc(*posthoc_inputs(fit))
+    return fit_posthoc(posthoc_inputs(fit))
 
 
-def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, AugmentedCopies, HeadPlan, Array]:
-    """The arguments of `fit_posthoc`: what the int8 trunk gives for the sweeps that were trained on, held out and disturbed,
-    in this order, and for augmented copies of the first two; those of the training sweeps are the ones that its head was
-    fitted to, those of the others judge what a moved skin does.
-
-    Raises FormatError where none was held out: nothing could judge.
-    """
+def posthoc_inputs(fit: Fit) -> PosthocInputs:
+    """What the int8 trunk of `fit` gives for the sweeps that were trained on, held out and disturbed, in this order, and for
+    augmented copies of the first two. Raises FormatError where none was held out: nothing could judge."""
     train, held, by = fit.train, fit.held, fit.about["held_out_by"]
     if by == "nothing":
         raise FormatError(f"{train.source}: too few groups to hold some out; record more positions")
@@ -143,26 +162,15 @@ def posthoc_inputs(fit: Fit) -> tuple[Array, Array, Array, Array, int, Augmented
     copied_groups = np.append(np.tile(train.group(by), COPIES), np.tile(held.group(by), COPIES))
     is_held = np.repeat([False, True], [len(side) for side in sides])
     copied = AugmentedCopies(np.concatenate(features), np.concatenate(sides), copied_groups, is_held)
-    return tenths, labels, groups, role == 1, fit.bands, copied, fit.plan, role == 2
+    return PosthocInputs(tenths, labels, groups, role == 1, fit.bands, copied, role == 2, fit.plan)
 
 
-def fit_posthoc(
-    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0, copied: AugmentedCopies | None = None,
-    plan: HeadPlan | None = None, disturbed: Array | None = None,
-) -> Posthoc:  # fmt: skip
-    """Fit all of it to features [N, D + 1, F] of sweeps with labels [N] from 0 to K - 1, of groups [N].
-
-    judged: bool [N], sweeps that the trunk did not see. Only these find temperatures and rule, each with heads that did
-    not see its group. fixed: so many features, the last ones, were not trained; see novelty.embed. Where there are some,
-    most of a distance is in them, and all sweeps find its limit: of more positions, so that it is less a matter of chance.
-    plan: of the head that names the material; None for one discriminant that sees everything. disturbed: bool [N], sweeps
-    that only show how far known materials scatter when something is wrong: the head does not see them, and they judge nothing.
-    Raises FormatError as novelty.embed, and where there is only one group or nothing to judge by.
-    """
+def fit_posthoc(given: PosthocInputs) -> Posthoc:
+    """Fit all of it. Raises FormatError as novelty.embed, and where there is only one group or nothing to judge by."""
+    tenths, labels, groups, judged, fixed = given.tenths, given.labels, given.groups, given.judged, given.fixed
     whole, classes, every = tenths[:, -1], int(labels.max()) + 1, np.ones(len(labels), bool)
-    sound = every if disturbed is None else ~disturbed
-    more = copied or AugmentedCopies(whole[:0], labels[:0], groups[:0], every[:0])
-    plan = plan or HeadPlan((HeadPart(tuple(range(whole.shape[1])), copies=True),))
+    sound, more = ~given.disturbed, given.copied
+    plan = given.plan or HeadPlan((HeadPart(tuple(range(whole.shape[1])), copies=True),))
 
     def naming_head(fit: Array) -> tuple[Array, Array]:
         """The head fitted to the groups in `fit`, bool [N]."""

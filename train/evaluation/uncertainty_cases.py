@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.calibration.moved import AugmentedCopies
-from train.calibration.posthoc import Posthoc, fit_posthoc, posthoc_inputs
+from train.calibration.posthoc import Posthoc, PosthocInputs, fit_posthoc, posthoc_inputs
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
 from train.evaluation.evaluate import Where
@@ -89,9 +89,10 @@ class Case:
         """What is fitted on the trunk of this training."""
         copies = AugmentedCopies(self.copied, self.copied_labels, self.copied_groups, self.copied_held)
         plan = HeadPlan.read(json.loads(self.plan)) if self.plan else None
-        return fit_posthoc(
-            self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies, plan, self.disturbed
+        given = PosthocInputs(
+            self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies, self.disturbed, plan
         )
+        return fit_posthoc(given)
 
     def numbered(self) -> Array:
         """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out mean nothing."""
@@ -116,12 +117,13 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).fit  # type: ignore[attr-defined]
-    seen, seen_labels, seen_groups, judged, fixed, copies, plan, disturbed = posthoc_inputs(made)
+    given = posthoc_inputs(made)
+    copies = given.copied
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
-        task.left_out, task.fold, fixed, seen, seen_labels, seen_groups, judged, copies.features, copies.labels, copies.groups,
-        copies.held, run_graph(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test], places[task.test],
-        disturbed, json.dumps(plan.json()),
+        task.left_out, task.fold, given.fixed, given.tenths, given.labels, given.groups, given.judged, copies.features, copies.labels,
+        copies.groups, copies.held, run_graph(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test],
+        places[task.test], given.disturbed, json.dumps(given.plan.json()) if given.plan else "",
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from appliance.core.clock import SystemClock
 from appliance.inference import classifier, enrolment
 from appliance.inference import early_exit as box_early
 from appliance.inference.novelty import Means
+from tests.factories.posthoc_inputs import plain_inputs
 from tests.factories.trunk import FORM, trunk
 from train.calibration import early_exit, posthoc
 from train.evaluation import uncertainty
@@ -106,7 +107,7 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
 def test_temperatures_calibrate_each_step():
     """Cross-fitted over positions, the mean of the highest probability is the accuracy, at every step."""
     x, y, at = tenths(40)
-    done = posthoc.fit_posthoc(x, y, at, np.ones(len(y), bool))
+    done = posthoc.fit_posthoc(plain_inputs(x, y, at, np.ones(len(y), bool)))
     new, labels, _ = tenths(60, seed=9)
     p = done.probabilities(new)
     right = (p.argmax(2) == labels[:, None]).mean(0)
@@ -120,7 +121,7 @@ def test_each_step_has_its_own_temperature():
     x, y, at = tenths(10, places=3, seed=3)
     # the sweeps of a material at one position lie together: the heads are too sure of other positions
     x = x + 3 * np.random.default_rng(4).standard_normal((9, 1, 5))[3 * at + y]
-    done, every = posthoc.fit_posthoc(x, y, at, np.ones(len(y), bool)), np.ones(len(y), bool)
+    done, every = posthoc.fit_posthoc(plain_inputs(x, y, at, np.ones(len(y), bool))), np.ones(len(y), bool)
     logits, numbers = early_exit.cross_fitted_logits(x, y, at, every)
     cooler = early_exit.fit_temperatures(logits, y[numbers], at[numbers])
     assert len(set(cooler)) > 2
@@ -134,10 +135,10 @@ def test_a_material_of_one_place_and_two_materials():
     """A material that only one place has is still learned; of two materials, too: nothing is NaN."""
     x, y, at = tenths(20)
     keep = (y != 2) | (at == 0)
-    done = posthoc.fit_posthoc(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool))
+    done = posthoc.fit_posthoc(plain_inputs(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool)))
     assert np.isfinite(done.probabilities(x)).all()
     assert (done.logits(x[:, -1]).argmax(1) == y).mean() > 0.9
-    two = posthoc.fit_posthoc(x[y < 2], y[y < 2], at[y < 2], at[y < 2] < 4)
+    two = posthoc.fit_posthoc(plain_inputs(x[y < 2], y[y < 2], at[y < 2], at[y < 2] < 4))
     assert np.isfinite(two.probabilities(x[y < 2])).all()
 
 
@@ -151,7 +152,7 @@ def made():
     counts = np.rint(counts + rng.normal(0, 5, counts.shape)).astype(np.int16)
     trunks = trunk(FORM, True)
     x, size = run(trunks, counts), 1
-    done = posthoc.fit_posthoc(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
+    done = posthoc.fit_posthoc(plain_inputs(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size))
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
     model = done.graph(trunk(FORM), trunks)
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: done.means()}
