@@ -21,7 +21,7 @@ def figures(**changes: Any) -> dict[str, Any]:
     ]  # fmt: skip
     cases = [
         {"case": name, "set": f"{name}.npz", "only": ["force<=180"], "protocol": "leave:force", "means_removed": True,
-         "sweeps": 100, "materials": 4, "format": "2x2", "digest": f"digest of {name}", "curve": True, "simulated": name == "two"}
+         "sweeps": 100, "materials": 4, "format": "2x2", "digest": f"digest of {name}", "curve": [5], "simulated": name == "two"}
         for name in ("one", "two")
     ]  # fmt: skip
     names = ["default", "quick <b>", "quant"]

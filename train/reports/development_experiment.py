@@ -27,17 +27,18 @@ OURS = ("default", "default-reattached", "filter-bank", "compact-50k")
 """No peers; the first of them that is there is compared with the peers."""
 PEERS = ("minirocket", "minirocket-augmented", "multirocket-hydra", "quant", "ds-cnn", "lite", "edge-spectral")
 EACH = (5, 10, 20)
-"""Training sweeps of each material along a learning curve, before all of them."""
+"""Points of a learning curve, as far as a set has more sweeps of each material than that."""
 
 
 @dataclass(frozen=True)
 class DevelopmentCase:
-    """One set under one protocol. means_removed: each taxel's mean over the window is taken away. curve: with EACH."""
+    """One set under one protocol. means_removed: each taxel's mean over the window is taken away. curve: training sweeps of
+    each material along its learning curve, before all of them."""
 
     name: str
     part: ChartPart
     means_removed: bool = True
-    curve: bool = False
+    curve: tuple[int, ...] = ()
 
     @property
     def simulated(self) -> bool:
@@ -48,30 +49,34 @@ class DevelopmentCase:
 FOUR = ("material=BeigeCotton,BrownCotton,Canvas,Linen",)
 
 
-def _fabrics(name: str, protocol: str, only: tuple[str, ...], curve: bool = False) -> DevelopmentCase:
+def _fabrics(name: str, protocol: str, only: tuple[str, ...], curve: tuple[int, ...] = ()) -> DevelopmentCase:
     return DevelopmentCase(name, ChartPart((FABRICS,), protocol, only, real=True), curve=curve)
 
 
-def _published(name: str) -> DevelopmentCase:
-    return DevelopmentCase(f"{name}, published split", ChartPart((f"aeon:{name}",), "split:split=0->1"))
+def _published(name: str, curve: tuple[int, ...] = ()) -> DevelopmentCase:
+    return DevelopmentCase(f"{name}, published split", ChartPart((f"aeon:{name}",), "split:split=0->1"), curve=curve)
 
 
 REAL = ChartPart(("sim:T-REAL:1",), "leave:position")
 CASES = (
-    _fabrics("7 fabrics, a force out", "leave:force", SEVEN, curve=True),
+    _fabrics("7 fabrics, a force out", "leave:force", SEVEN, EACH),
     _fabrics("7 fabrics, a speed out", "leave:speed", SEVEN),
     _fabrics("7 fabrics, a repetition out", "leave:rep", SEVEN),
     _fabrics("4 fabrics, a force out", "leave:force", FOUR),
     _fabrics("4 fabrics, a speed out", "leave:speed", FOUR),
     _fabrics("4 fabrics, a direction out", "leave:direction", FOUR),
-    *map(_published, ("ACSF1", "OSULeaf", "BasicMotions", "ArrowHead", "GunPoint")),
-    DevelopmentCase("simulated tubes, a position out", REAL, means_removed=False, curve=True),
+    _published("ACSF1", (5,)),
+    _published("OSULeaf", (5, 10)),
+    _published("BasicMotions", (5,)),
+    _published("ArrowHead", (5, 10)),
+    _published("GunPoint", EACH),
+    DevelopmentCase("simulated tubes, a position out", REAL, means_removed=False, curve=EACH),
 )
 """In the order of the page."""
 QUICK = (
     _published("GunPoint"),
     DevelopmentCase("simulated tubes, a position out",
-         ChartPart(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)), means_removed=False, curve=True),
+         ChartPart(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)), means_removed=False, curve=EACH),
 )  # fmt: skip
 QUICK_METHODS = ("compact-50k", "edge-spectral", "L-gauss")
 QUICK_EFFORT = Effort(share=0.02)
@@ -147,7 +152,7 @@ class Development:
 
 def _points(case: DevelopmentCase) -> list[tuple[int, str]]:
     """Training sweeps of each material (0 for all) and name of what is evaluated of a case: it, and points of its curve."""
-    return [(each, _name(case.name, each)) for each in (0, *(EACH if case.curve else ()))]
+    return [(each, _name(case.name, each)) for each in (0, *case.curve)]
 
 
 def _name(case: str, each: int) -> str:
@@ -193,7 +198,7 @@ def _about(case: DevelopmentCase, sweeps: Dataset) -> Json:
     return {
         "case": case.name, "set": sweeps.source, "only": list(case.part.only), "protocol": case.part.protocol,
         "means_removed": case.means_removed, "simulated": case.simulated, "sweeps": len(sweeps), "materials": len(sweeps.materials),
-        "format": str(sweeps.format), "digest": digest(sweeps), "curve": case.curve,
+        "format": str(sweeps.format), "digest": digest(sweeps), "curve": list(case.curve),
     }  # fmt: skip
 
 

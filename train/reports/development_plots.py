@@ -100,6 +100,7 @@ def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> st
 
 
 def _leader(those: Mapping[str, Mapping[int, Json]], ours: str) -> str:
-    """The peer with a whole curve that is most accurate with all sweeps; "" where none has one."""
-    whole = [name for name, line in those.items() if name != ours and len(line) > len(EACH)]
+    """The peer with the whole curve that is most accurate with all sweeps; "" where there is no peer."""
+    points = max(map(len, those.values()))
+    whole = [name for name, line in those.items() if name != ours and len(line) == points]
     return max(whole, key=lambda name: float(those[name][0]["mean"]), default="")

@@ -137,7 +137,7 @@ def experiment(folder: Path, *names: str, **given: Any) -> Development:
     """Two cases on tones, which lie in `folder` as a file of real sweeps; the first with a learning curve."""
     tones().save(folder / "tones.npz")
     replace(tones(), samples=tones().samples[:, :7]).save(folder / "short.npz")
-    cases = [DevelopmentCase("tones", ChartPart(("tones.npz",), "leave:session", real=True), curve=True),
+    cases = [DevelopmentCase("tones", ChartPart(("tones.npz",), "leave:session", real=True), curve=development_experiment.EACH),
              DevelopmentCase("short", ChartPart(("short.npz",), "split:session=0,1->2", ("material=a,c",), real=True))]  # fmt: skip
     where = Where(jobs=1, cache=folder / "cache")
     settings = {"where": where, "log": lambda line: None, "data": folder} | given
@@ -195,13 +195,13 @@ def test_other_precisions_of_a_method_are_counted_with_it():
 
 
 def test_the_usual_methods_and_cases_exist():
-    """Every peer by its name; every set and protocol can be read; the page ends with simulated sweeps."""
+    """Every peer by its name; every set and protocol can be read, each set with a learning curve; the page ends with simulated sweeps."""
     assert set(development_experiment.PEERS) < set(development_experiment.usual_methods())
     assert set(development_experiment.usual_methods()) <= set(methods.every())
     names = [case.name for case in development_experiment.CASES]
     assert len(set(names)) == len(names) == 12
     assert [case.name for case in development_experiment.CASES if case.simulated] == [names[-1]]
-    assert sum(case.curve for case in development_experiment.CASES) == 2
+    assert [len(case.curve) for case in development_experiment.CASES] == [3, 0, 0, 0, 0, 0, 1, 2, 1, 2, 3, 3]
 
 
 def test_a_run_is_joined_by_what_it_lacks_of_another():
