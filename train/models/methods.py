@@ -28,7 +28,9 @@ Log = Callable[[str], None]
 Cost = list[tuple[int, float]]
 """(iteration, cross entropy of its batch), eq. 11: what the paper's Fig. 9 shows."""
 SHIPPED = "default"
-"""The method of the packaged bundle, and of `fit`."""
+"""The method of `fit`."""
+PACKAGED = "default-reattached"
+"""The method of `fit --reattached`, which made the packaged bundle."""
 MODULES = (
     "train.models.baselines",
     "train.models.prior_work",

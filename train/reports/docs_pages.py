@@ -71,7 +71,7 @@ PAGES = (
     DocsPage("alignment", "alignment/README.md", "alignment/place.json", ("train", "alignment", "--out", "docs/alignment"),
              drawn=True),
     DocsPage("certainty", "certainty/index.html", "certainty/results.json",
-             ("train", "certainty", "--set", "sim:T-REAL:1-3", "--test", "sim:T-REAL:4-6:20"), folds=True),
+             ("train", "certainty", "--method", "default-reattached", "--set", "sim:T-REAL:1-3", "--test", "sim:T-REAL:4-6:20"), folds=True),
     DocsPage("chart", "chart/index.html", "chart/chart.json", ("train", "chart"), (REAL,), True, True),
     DocsPage("fabrics", "fabricslide/README.md", "fabricslide/results.json", ("train", "fabrics"), (REAL,), True, True),
     DocsPage("stress", "stress/index.html", "stress/results.json", ("train", "stress"), folds=True, drawn=True),

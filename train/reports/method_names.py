@@ -10,7 +10,7 @@ TRAINED = "compact"
 """Our trained networks: the command's name of each says a bound of its weights, so people are told the weights."""
 NAMES = {
     SHIPPED: (f"{OURS}, as shipped", "what the box runs: filters, spectra and trained layers, as the training sweeps ask for; int8"),
-    "default-reattached": (f"{OURS}, for a skin put back", "as shipped, with altered copies shown to every head: what `fit --reattached` makes"),
+    "default-reattached": (f"{OURS}, for a skin put back", "the packaged bundle’s recipe, `fit --reattached`: altered copies shown to every head, filters only where they are better; int8"),
     "filter-bank": (f"{OURS}, filters alone", "a part of what is shipped: random filters and a head in closed form, nothing trained"),
     "compact-bands": (f"{OURS}, spectrum alone", "a part of what is shipped: the spectrum that all taxels share"),
     "minirocket": ("MiniRocket", "10,000 features of fixed small filters and ridge regression: the usual quick choice for time series"),

@@ -15,7 +15,7 @@ from typing import Any
 
 from appliance.core.errors import FormatError
 from train.metrics import score
-from train.models.methods import SHIPPED
+from train.models.methods import PACKAGED, SHIPPED
 
 NAME = "provenance"
 SETS, TEMPLATE = ("set", "sets", "test", "train"), "{"
@@ -125,9 +125,9 @@ def _bundle(value: Any) -> list[str]:
 
 
 def _has_default(part: dict[str, Any]) -> bool:
-    """Whether the default recipe is among the methods of a part; True where it names none."""
+    """Whether the default recipe, or that of the packaged bundle, is among the methods of a part; True where it names none."""
     methods = [name for key in ("method", "methods") for name in _list(part.get(key))]
-    return not methods or SHIPPED in methods
+    return not methods or SHIPPED in methods or PACKAGED in methods
 
 
 def _list(value: Any) -> list[Any]:

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from appliance.core.storage import put
 from train.calibration.novelty import KEPT
-from train.models.methods import SHIPPED
+from train.models.methods import PACKAGED, SHIPPED
 from train.reports import formatting, html, provenance
 from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, SMALL, round_ticks, set_ticks, single_axes, to_svg
 
@@ -58,7 +58,7 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         header=provenance.of(figures),
         home=html.HOME,
         figures=figures,
-        shipped=SHIPPED,
+        shipped=(PACKAGED, SHIPPED),
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         tables=_tables(figures),
         targets=targets,

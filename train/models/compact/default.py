@@ -16,12 +16,10 @@ from train.data.sets import Dataset
 from train.models.compact import recipe
 from train.models.compact.fitted import CompactModel
 from train.models.linear_head import expanded_head
-from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
+from train.models.methods import FULL_EFFORT, PACKAGED, Effort, Log, Method, no_log
 from train.onnx_tools.graph_builder import GraphModel, with_head
 
 Array = NDArray[Any]
-REATTACHED = "default-reattached"
-"""The method that does what `palpate-train fit --reattached` does."""
 
 
 def train(sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log) -> CompactModel:
@@ -50,8 +48,8 @@ def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
             effort=f"{settings.steps} iterations of stages",
         ),
         Method(
-            REATTACHED,
-            "as default, but every head sees augmented copies, which look as if the skin had been taken off and put back",
+            PACKAGED,
+            "as default, but all see augmented copies, as of a skin put back, and filters join stages only where that is better",
             "raw",
             partial(train, settings=replace(settings, reattached=True)),
             effort=f"{settings.steps} iterations of stages",
