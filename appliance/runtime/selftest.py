@@ -5,6 +5,7 @@ In: the settings and the devices. Out: one result for each component, with its t
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -24,6 +25,8 @@ from appliance.runtime.assembly import UNSIGNED, gpio
 
 LISTEN_S = 1.0
 """How long frames of the skin are counted."""
+MOST_READING = 0.5
+"""Share of a core that reading a skin may take: the loop has one, and answers, recordings and readers of the feed need the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +38,13 @@ class CheckResult:
     detail: str
 
 
-def check(settings: Config, load: Callable[[], Bundle], devices: Devices) -> Iterator[CheckResult]:
-    """Check one component after another; the check goes on after one that fails. The skin needs no bundle."""
+def check(
+    settings: Config, load: Callable[[], Bundle], devices: Devices, spent_ns: Callable[[], int] = time.thread_time_ns
+) -> Iterator[CheckResult]:
+    """Check one component after another; the check goes on after one that fails. The skin needs no bundle.
+
+    spent_ns: processor time that this thread has taken so far.
+    """
     loaded: list[Bundle] = []
 
     def bundle() -> str:
@@ -57,7 +65,7 @@ def check(settings: Config, load: Callable[[], Bundle], devices: Devices) -> Ite
         yield CheckResult("signatures", True, f"warning: unsigned {UNSIGNED}")
     if loaded:
         yield _try("golden sweeps", golden)
-    yield _try("skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices))
+    yield _try("skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns))
     yield from _triggered(settings, devices)
     if settings.serial.port:
         yield _try("serial port", lambda: _port(settings, devices))
@@ -70,10 +78,13 @@ def _try(component: str, look: Callable[[], str]) -> CheckResult:
         return CheckResult(component, False, str(e))
 
 
-def _skin(settings: Config, wanted: SweepFormat | None, devices: Devices) -> str:
-    """What the skin is and sends. wanted: by the bundle. Raises SensorError, also if the bundle is for another skin."""
+def _skin(settings: Config, wanted: SweepFormat | None, devices: Devices, spent_ns: Callable[[], int]) -> str:
+    """What the skin is, sends and costs. wanted: by the bundle.
+
+    Raises SensorError, also if the bundle is for another skin or this board is too slow for it.
+    """
     fmt = skins.announced(settings, devices, wanted)
-    sends = _listened(settings, fmt, devices)
+    sends = _listened(settings, fmt, devices, spent_ns)
     if wanted and not fits(fmt, wanted):
         raise SensorMismatch(
             f"{sends}; the bundle wants {wanted}: record sweeps of this skin and train one (palpate record needs none), "
@@ -83,12 +94,17 @@ def _skin(settings: Config, wanted: SweepFormat | None, devices: Devices) -> str
     return f"{sends}; warning: {slow}" if slow else sends
 
 
-def _listened(settings: Config, fmt: SweepFormat, devices: Devices) -> str:
+def _listened(settings: Config, fmt: SweepFormat, devices: Devices, spent_ns: Callable[[], int]) -> str:
+    """What comes from the skin, and what reading it takes of a core once it streams: imports and asking it take longer."""
     sensor = skins.sensor(settings, fmt, devices)
-    until_ns = devices.clock.now_ns() + round(LISTEN_S * 1e9)
+    now_ns = devices.clock.now_ns
+    until_ns, streams = now_ns() + round(LISTEN_S * 1e9), (0, 0)
     try:
-        while devices.clock.now_ns() < until_ns:
+        while now_ns() < until_ns:
             sensor.read()
+            if streams == (0, 0) and sensor.counters.frames:
+                streams = now_ns(), spent_ns()
+        share = (spent_ns() - streams[1]) / max(now_ns() - streams[0], 1)
         if sensor.trouble or not sensor.counters.frames:
             raise sensor.trouble or SensorError(f"the skin sent no frame within {LISTEN_S} s; replug it")
         who = sensor.identity
@@ -96,7 +112,15 @@ def _listened(settings: Config, fmt: SweepFormat, devices: Devices) -> str:
         name = f"{who.board} {who.serial}" if who else ""
         form = f"{shown(fmt.shape)} {fmt.dtype} at {fmt.rate_hz:g} Hz"
         lost = f"{counters.lost_frames} lost" if sensor.loss_known else "whether frames were lost cannot be seen"
-        return f"{name.strip()}, {form}, {counters.frames} frames in {LISTEN_S} s, {lost}"
+        sends = (
+            f"{name.strip()}, {form}, {counters.frames} frames in {LISTEN_S} s, {lost}, {100 * share:.1f} % of a core"
+        )
+        if share > MOST_READING:
+            raise SensorError(
+                f"{sends}: {MOST_READING:.0%} at most leave room for answers, recordings and readers; use a faster board, or "
+                "a skin that sends fewer frames a second"
+            )
+        return sends
     finally:
         sensor.close()
 

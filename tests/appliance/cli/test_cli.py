@@ -243,7 +243,8 @@ def test_check_needs_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str
     other = toy_bundle.put(tmp_path / "toy", toy_bundle.files())
     assert main(["check", "--sim", "skin", "--virtual", "--set", f"classifier.bundle={other}"]) == 1
     (fail,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL")]
-    assert "4x4 uint8 at 750 Hz, 750 frames in 1.0 s, 0 lost; the bundle wants 2x2 int16 at 100 Hz" in fail
+    assert "4x4 uint8 at 750 Hz, 750 frames in 1.0 s, 0 lost, " in fail
+    assert " % of a core; the bundle wants 2x2 int16 at 100 Hz" in fail
     assert "palpate record" in fail
 
 
