@@ -16,7 +16,9 @@ from appliance.io import packets
 from appliance.sim import rig, skin
 from tests.factories import emulated_machines
 from tests.rig import image, notes
+from tests.rig.guest_clock import HZ, STILL_S, WRAP, GuestClock
 from tests.rig.lines import HOLD_NS, GuestLines
+from tests.rig.qtest import Qtest
 from tests.rig.usbredir import BULK, CANCEL, HELLO, UsbRedirPeer
 
 
@@ -61,10 +63,11 @@ def test_the_table_keeps_the_longest_run(tmp_path: Path):
 
 
 @pytest.fixture
-def qtest() -> Iterator[tuple[GuestLines, list[tuple[float, str]]]]:
-    """Lines on a socket that answers OK to everything, and the requests that it got, with times."""
+def qtest() -> Iterator[tuple[GuestLines, list[tuple[float, str]], GuestClock]]:
+    """Lines on a socket that answers OK to everything, and the requests that it got, with times of this machine."""
     ours, theirs = socket.socketpair()
     asked: list[tuple[float, str]] = []
+    clock = GuestClock(lambda: time.monotonic_ns() * HZ // 1_000_000_000 % WRAP)
 
     def answer() -> None:
         for line in theirs.makefile():
@@ -72,16 +75,16 @@ def qtest() -> Iterator[tuple[GuestLines, list[tuple[float, str]]]]:
             theirs.sendall(b"OK\n")
 
     threading.Thread(target=answer, daemon=True).start()
-    lines = GuestLines(ours, "/chip", ["START", "READY"])
-    yield lines, asked
+    lines = GuestLines(Qtest(ours), clock, "/chip", ["START", "READY"])
+    yield lines, asked, clock
     lines.close()
     theirs.close()
 
 
-def test_a_level_is_held_however_late_it_came(qtest: tuple[GuestLines, list[tuple[float, str]]]):
+def test_a_level_is_held_however_late_it_came(qtest: tuple[GuestLines, list[tuple[float, str]], GuestClock]):
     """A pulse of nothing becomes one of HOLD_NS, its edges in their order."""
-    lines, asked = qtest
-    now_ns = time.monotonic_ns()
+    lines, asked, clock = qtest
+    now_ns = clock.now_ns()
     lines.drive("START", False, now_ns + 1)
     lines.drive("START", True, now_ns)
     end = time.monotonic() + 10
@@ -96,11 +99,79 @@ def test_a_line_that_the_box_drives_is_seen():
     """Messages of the test socket become levels and a log."""
     ours, theirs = socket.socketpair()
     threading.Thread(target=lambda: (theirs.recv(99), theirs.sendall(b"OK\nIRQ raise 1\n")), daemon=True).start()
-    lines = GuestLines(ours, "/chip", ["START", "READY"])
+    clock = GuestClock(lambda: time.monotonic_ns() * HZ // 1_000_000_000 % WRAP)
+    lines = GuestLines(Qtest(ours), clock, "/chip", ["START", "READY"])
     assert lines.wait("READY", True, 10)
     assert [entry[1:] for entry in lines.log] == [("READY", True)]
     assert not lines.wait("START", True, 0.01)
     lines.close()
+
+
+class BusyHost:
+    """A host's clock that goes on only in waits, and the counter of a guest that gets a part of its time.
+
+    share: of the host's time that becomes the guest's. ticks: the counter as the guest's hardware shows it.
+    """
+
+    def __init__(self, share: float, at: int = 0) -> None:
+        self.share, self.ns, self._at = share, 0, at
+
+    def now_ns(self) -> int:
+        """The host's time."""
+        return self.ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Jump there."""
+        self.ns = max(self.ns + 1000, t_ns)
+
+    def ticks(self) -> int:
+        """The counter, 32 bits wide."""
+        return (self._at + round(self.ns * self.share * HZ / 1e9)) % WRAP
+
+
+@pytest.mark.parametrize("share", [1.0, 0.1, 1.7])
+def test_a_wait_is_as_long_as_the_guest_s_time(share: float):
+    """A guest that gets a tenth of the host's time is waited for ten times as long; the counter's wrap is no jump."""
+    host = BusyHost(share, at=WRAP - HZ)
+    clock = GuestClock(host.ticks, host)
+    begun_ns = clock.now_ns()
+    clock.sleep(5)
+    assert host.ns == pytest.approx(5e9 / share, rel=0.75 if share > 1 else 1e-3)
+    assert 5e9 <= clock.now_ns() - begun_ns <= 5e9 * max(1, share) + 1e5
+    host_ns = host.ns
+    assert not clock.until(lambda: False, 2)
+    assert host.ns - host_ns == pytest.approx(2e9 / share, rel=0.02)
+    assert clock.until(lambda: host.ns > host_ns, 0)
+
+
+def test_a_board_keeps_pace_with_a_guest_that_is_starved():
+    """A robot and a board by the guest's clock: a busy host makes them slow, and no frame is late or lost."""
+    host = BusyHost(0.05)
+    clock = GuestClock(host.ticks, host)
+    hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()
+    board = rig.Board(skin.FORMAT, hand, clock, fifo_frames=12)
+    board.request(packets.Request.START)
+    seqs = []
+    for _ in range(50):
+        clock.sleep_until(board.due_ns())
+        packet = packets.unpack(board.take()).packets[0]
+        assert clock.now_ns() - board.frame_ns(packet.seq + 5) < 2 * skin.FORMAT.period_ns
+        seqs.append(packet.seq)
+    assert seqs == list(range(seqs[0], seqs[0] + 300, 6))
+    assert host.ns > 20 * 300 * skin.FORMAT.period_ns * 0.9
+
+
+def test_a_guest_whose_clock_stands_still_is_said_to_have_crashed():
+    """A wait for a dead guest ends, and says why; so does one for a QEMU that has gone."""
+    host = BusyHost(0.0)
+    with pytest.raises(TimeoutError, match=f"stood still for {STILL_S} s"):
+        GuestClock(host.ticks, host).sleep(1)
+    assert host.ns / 1e9 == pytest.approx(STILL_S, abs=1.1)
+    ours, theirs = socket.socketpair()
+    qtest = Qtest(ours)
+    theirs.close()
+    with pytest.raises(OSError, match=r"qemu has gone|Broken pipe"):
+        qtest.ask("readl 0x0")
 
 
 class QemuEnd:
@@ -109,7 +180,7 @@ class QemuEnd:
     def __init__(self) -> None:
         self._socket, far = socket.socketpair()
         self._socket.settimeout(10)
-        self.peer = UsbRedirPeer(far)
+        self.peer = UsbRedirPeer(far, SystemClock())
         assert self.hear(12)[0] == HELLO
         self._socket.sendall(struct.pack("<III", HELLO, 68, 0) + bytes(64) + struct.pack("<I", 1 << 5 | 1 << 6))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import re
+import sys
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -29,6 +30,11 @@ from tests.rig.soak_judge import SAMPLE
 from train.reports.plot_style import SCHEMES
 
 RATE = skin.FORMAT.rate_hz
+SILENT_CPU_S, SILENT_S = 30, 300
+"""A box that starts says its first sentence after a second or two of a processor's time. Of the clock's it may take any,
+but none in which it gets no processor at all."""
+LATEST_S = 60
+"""The first answer comes after six seconds of the box's time."""
 UNANSWERED, ORDER, LOST, DROPPED, WRONG, MEMORY, FILES = range(7)
 """Targets, as soak_judge.targets lists them."""
 
@@ -112,7 +118,7 @@ class FakeBox:
 def soaked(box: FakeBox, length_s: float = 150) -> soak_judge.SoakRun:
     """A run of a box."""
     run = soak_judge.SoakRun(seed=1)
-    soak.record(box, run, length_s, lambda: None, clock=box.clock, log=lambda line: None)
+    soak.record(box, run, length_s, lambda: None, log=lambda line: None)
     return run
 
 
@@ -311,7 +317,7 @@ def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
     box, saved = FakeBox(), []
     box.mute_s = box.now_s + 40
     run = soak_judge.SoakRun(seed=1)
-    soak.record(box, run, 3600, lambda: saved.append(len(run.answers)), clock=box.clock, log=lambda line: None)
+    soak.record(box, run, 3600, lambda: saved.append(len(run.answers)), log=lambda line: None)
     assert run.ended == "gone"
     assert "nothing for 60 s" in run.faults[-1][1]
     assert saved[-1] == len(run.answers) > 5
@@ -322,7 +328,7 @@ def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
 def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
     """The first run is kept as it was, a second one takes what is left with the next seed, a third has nothing to do."""
     box, lines = FakeBox(), []
-    settings = {"clock": box.clock, "log": lines.append}
+    settings = {"log": lines.append}
     path = soak.soak(box, 7, 0.05, tmp_path, stopped=lambda: box.now_s > 170, **settings)
     first = json.loads(path.read_text())
     assert [run["ended"] for run in first["runs"]] == ["interrupted"]
@@ -342,7 +348,7 @@ def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
 def test_a_soak_that_is_killed_leaves_a_whole_record():
     """At any moment the sweeps that are due have their answers, though the run has not ended and one may be open."""
     box, run = FakeBox(), soak_judge.SoakRun(seed=1)
-    recorder = soak.Recorder(box, run, Script(1), box.clock)
+    recorder = soak.Recorder(box, run, Script(1))
     recorder.start()
     for _ in range(60):
         recorder.listen(1.0, lambda: False)
@@ -354,7 +360,7 @@ def test_a_soak_that_is_killed_leaves_a_whole_record():
 def test_another_seed_begins_anew(tmp_path):
     """Runs of other acts, code or machines are not put together."""
     box = FakeBox()
-    settings = {"clock": box.clock, "log": lambda line: None}
+    settings = {"log": lambda line: None}
     soak.soak(box, 7, 0.01, tmp_path, **settings)
     path = soak.soak(box, 8, 0.01, tmp_path, **settings)
     assert [run["seed"] for run in json.loads(path.read_text())["runs"]] == [8]
@@ -420,15 +426,60 @@ def test_a_process_is_read_from_proc():
     )
 
 
+def heard(box: ThisMachine) -> list[tuple[float, str]]:
+    """What a box says next. Raises AssertionError where it says nothing, although it has used a processor for SILENT_CPU_S or
+    done nothing at all for SILENT_S: however busy this machine is, a box that gets on is waited for."""
+    begun_s, begun_cpu_s = time.monotonic(), box.process()[2]
+    while not (lines := box.heard(0.2)):
+        used_s = box.process()[2] - begun_cpu_s
+        assert used_s < SILENT_CPU_S, f"the box has said nothing in {used_s:.1f} s of processor time"
+        assert used_s or time.monotonic() - begun_s < SILENT_S, f"the box has done nothing for {SILENT_S} s"
+    return lines
+
+
+def states(lines: list[tuple[float, str]]) -> int:
+    """State sentences; a box says one in each second of its work."""
+    return sum(line.startswith("$PPLP,STA,") for _, line in lines)
+
+
+class Mute(FakeBox):
+    """A box that says nothing before look number `from_look`, and uses so much of a processor between two looks."""
+
+    def __init__(self, step_s: float, from_look: int) -> None:
+        super().__init__()
+        self.step_s, self.from_look, self.looks, self.cpu_s = step_s, from_look, 0, 0.0
+
+    def heard(self, wait_s: float) -> list[tuple[float, str]]:
+        """Nothing, or a line."""
+        self.looks += 1
+        return [(0.0, "there")] if self.looks >= self.from_look else []
+
+    def process(self) -> tuple[int, int, float, int, int]:
+        """With the processor time of so many looks."""
+        self.cpu_s += self.step_s
+        return 1, 1, self.cpu_s, 1, 1
+
+
+def test_a_box_that_gets_on_is_waited_for_and_no_other(monkeypatch: pytest.MonkeyPatch):
+    """By processor time: one that uses much and says nothing has failed, as has one that gets none for minutes; one that
+    gets a little each time is waited for, however long that takes by the clock."""
+    monkeypatch.setattr(sys.modules[__name__], "SILENT_S", 0.0)
+    assert heard(Mute(SILENT_CPU_S / 1000, 500)) == [(0.0, "there")]
+    with pytest.raises(AssertionError, match=f"said nothing in {SILENT_CPU_S}"):
+        heard(Mute(SILENT_CPU_S / 10, 500))
+    with pytest.raises(AssertionError, match="has done nothing for"):
+        heard(Mute(0.0, 500))
+
+
 @pytest.mark.slow
 def test_this_machine_sweeps_answers_and_ends():
     """The installed command on a pseudo-terminal: an answer, a look at its process, and an orderly end."""
     box, sweeps, lines = ThisMachine(), Script(1), []
     try:
         box.start(1, sweeps)
-        end_s = time.monotonic() + 60
-        while not any(Answer.read(line) for _, line in lines) and time.monotonic() < end_s:
-            lines += box.heard(0.2)
+        while not any(Answer.read(line) for _, line in lines):
+            lines += heard(box)
+            assert states(lines) < LATEST_S, f"no answer in {LATEST_S} s of the box's time: {lines[-5:]}"
         rss_kib, pss_kib, cpu_s, files, threads = box.process()
         assert 20_000 < rss_kib < 500_000
         assert 0 < pss_kib <= rss_kib

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,14 +14,12 @@ from typing import Any
 import numpy as np
 
 from appliance.client.answers import Answer
-from appliance.core.clock import SystemClock
+from appliance.core.clock import Clock
 from appliance.sim import rig, script, skin
 from tests.rig.machine import Guest
 
 FIFO = 22_500
-"""Frames that a board holds: half a minute, so that what is lost was lost by the box and not by an emulator that stood
-still while this machine did something else.
-"""
+"""Frames that a board holds: half a minute, so that what is lost was lost by the box and not by a cable that came late."""
 IDLE = 75
 """Frames of an empty skin between two sweeps: a tenth of a second."""
 BEHIND_NS = 50_000_000
@@ -31,15 +28,15 @@ clock, would come at once and its sweep be too short.
 """
 SEEN_S = 20
 """Longest wait until the box has seen that the skin is gone."""
-BEGUN_S = 300
-"""Longest wait for a touch to begin, while a busy emulator works off what it has not taken yet."""
+BEGUN_S = 60
+"""Longest wait for a touch to begin, while a box that did something else works off what it has not taken yet."""
 ANSWER_S = 30
-"""Longest wait for an answer after the stop edge; an emulated processor that is busy takes seconds."""
+"""Longest wait for an answer after the stop edge, in the guest's time as all waits are."""
 
 
 @dataclass(slots=True)
 class Touch:
-    """One sweep as the robot made it. first: number of its first frame; start_ns, stop_ns: host times of its edges.
+    """One sweep as the robot made it. first: number of its first frame; start_ns, stop_ns: when its edges come.
 
     played: set once the board has come to it.
     """
@@ -56,14 +53,14 @@ class Touch:
 class CellRobot:
     """The script that a board plays: an empty skin, and a touch whenever one is asked for (see sim.rig.Robot)."""
 
-    def __init__(self, lines: rig.EdgeLines, seed: int) -> None:
+    def __init__(self, lines: rig.EdgeLines, clock: Clock, seed: int) -> None:
         self.skipped = None
         self.touches: queue.SimpleQueue[Touch] = queue.SimpleQueue()
-        self._lines, self._rng = lines, np.random.default_rng(seed)
+        self._lines, self._clock, self._rng = lines, clock, np.random.default_rng(seed)
 
     def next_act(self, first: int, frame_ns: Callable[[int], int]) -> rig.Act:
         """The next touch, its edges scheduled, or an empty skin."""
-        if self.touches.empty() or time.monotonic_ns() - frame_ns(first) > BEHIND_NS:
+        if self.touches.empty() or self._clock.now_ns() - frame_ns(first) > BEHIND_NS:
             return rig.Act(skin.idle(IDLE, self._rng), 0, 0, "")
         touch = self.touches.get_nowait()
         act = touch.act
@@ -85,8 +82,8 @@ class Cell:
 
     def __init__(self, machine: Guest, seed: int = 1) -> None:
         self.machine, self.lines, self.serial, self.cable = machine, machine.lines, machine.serial, machine.skin
-        self.clock = SystemClock()
-        self.hand = CellRobot(machine.lines, seed)
+        self.clock = machine.clock
+        self.hand = CellRobot(machine.lines, self.clock, seed)
         self.acts = script.tubes(seed)
         self.packet_frames = 6
 
@@ -123,9 +120,13 @@ class Cell:
         """A whole sweep; the touch and the answer of the box. Raises AssertionError if no answer comes."""
         since = len(self.serial.heard)
         touch = self.touch()
-        if not touch.played.wait(BEGUN_S):
-            raise AssertionError(f"the box is {BEGUN_S} s behind the skin; is this machine busy?")
+        self.begun(touch)
         return touch, self.answer(since, timeout_s + 6)
+
+    def begun(self, touch: Touch) -> None:
+        """Wait until the board has come to a touch. Raises AssertionError where it does not."""
+        if not self.clock.until(touch.played.is_set, BEGUN_S):
+            raise AssertionError(f"the box is {BEGUN_S} s behind the skin; the box says: {self.journal()}")
 
     def answer(self, since: int, timeout_s: float = ANSWER_S) -> Answer:
         """The first RES of the lines from number `since` on."""
@@ -158,5 +159,5 @@ class Cell:
         self.until_ready()
 
     def wait(self, seconds: float) -> None:
-        """Let time pass."""
-        time.sleep(seconds)
+        """Let the guest's time pass."""
+        self.clock.sleep(seconds)

@@ -1,22 +1,23 @@
-"""The robot's end of the guest's serial port. In: what to send. Out: the sentences that came, with host times."""
+"""The robot's end of the guest's serial port. In: what to send. Out: the sentences that came, with times of the guest."""
 
 from __future__ import annotations
 
 import socket
 import threading
-import time
 from pathlib import Path
+
+from tests.rig.guest_clock import GuestClock
 
 ADAPTER = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_R1-if00-port0"
 """What the guest calls an emulated USB serial adapter with the serial number R1."""
 
 
 class FarEnd:
-    """heard: (host ns, line) of all lines, in order. While `deaf` nothing is read, and the guest's port fills up."""
+    """heard: (ns, line) of all lines, in order. While `deaf` nothing is read, and the guest's port fills up."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, clock: GuestClock) -> None:
         self.heard: list[tuple[int, str]] = []
-        self._path, self._came = path, threading.Condition()
+        self._path, self._clock = path, clock
         self._reading = threading.Event()
         self._reading.set()
         self._socket: socket.socket | None = None
@@ -65,10 +66,9 @@ class FarEnd:
             found[:] = [line for _, line in self.heard[since:] if line.startswith(start)]
             return bool(found)
 
-        with self._came:
-            if not self._came.wait_for(there, timeout_s):
-                last = [line for _, line in self.heard[since:]][-5:]
-                raise AssertionError(f"no line {start}… within {timeout_s} s; the last ones were {last}")
+        if not self._clock.until(there, timeout_s):
+            last = [line for _, line in self.heard[since:]][-5:]
+            raise AssertionError(f"no line {start}… within {timeout_s} s; the last ones were {last}")
         return found[0]
 
     def _listen(self, port: socket.socket) -> None:
@@ -80,9 +80,7 @@ class FarEnd:
                 if not data:
                     return
                 *lines, rest = (rest + data).split(b"\n")
-                with self._came:
-                    now = time.monotonic_ns()
-                    self.heard += [(now, line.decode("ascii", "replace").rstrip("\r")) for line in lines]
-                    self._came.notify_all()
+                now_ns = self._clock.now_ns()
+                self.heard += [(now_ns, line.decode("ascii", "replace").rstrip("\r")) for line in lines]
         except OSError:
             return  # closed

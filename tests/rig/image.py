@@ -118,7 +118,13 @@ def _box_name() -> str:
         p for folder in ("appliance", "systemd", "firmware_config") for p in sorted((ROOT / folder).rglob("*"))
         if p.is_file() and "__pycache__" not in p.parts
     ]  # fmt: skip
-    parts += [ROOT / "pyproject.toml", GUEST / "install.sh", GUEST / "palpate.toml", HERE / "machine.py"]
+    parts += [
+        ROOT / "pyproject.toml",
+        GUEST / "install.sh",
+        GUEST / "palpate.toml",
+        HERE / "machine.py",
+        HERE / "guest_clock.py",
+    ]
     return f"box-{_hash(parts, _ground_name())}"
 
 

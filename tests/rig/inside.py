@@ -5,12 +5,10 @@ outside what such a test asks for (tests/backends/remote.py).
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Iterable
 from importlib.metadata import distribution
 from pathlib import Path
 
-from appliance.core.clock import SystemClock
 from tests.backends import Skin, skins
 from tests.factories.emulated_machines import ROOT
 from tests.rig.machine import Guest
@@ -42,7 +40,7 @@ class GuestControls:
     """The controls of a Backend, done to a guest from outside."""
 
     def __init__(self, machine: Guest) -> None:
-        self._machine, self._clock, self._told = machine, SystemClock(), 0
+        self._machine, self._clock, self._told = machine, machine.clock, 0
 
     def able(self) -> list[str]:
         """What can be done, as a Backend has it in `can`."""
@@ -93,7 +91,7 @@ class GuestControls:
         """What has come since the last call. Between calls nobody reads, so that a port may fill up."""
         port = self._machine.serial
         port.deaf = False
-        time.sleep(SETTLE_S)
+        self._clock.sleep(SETTLE_S)
         port.deaf = True
         lines, self._told = port.heard[self._told :], len(port.heard)
         return b"".join(line.encode() + b"\r\n" for _, line in lines)

@@ -73,7 +73,7 @@ def whole(line: str) -> list[str]:
 
 
 def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
-    """Answers whose sweep must be stored, and those whose sweep may be missing; heard: (host ns, line) of one boot."""
+    """Answers whose sweep must be stored, and those whose sweep may be missing; heard: (ns, line) of one boot."""
     must: list[Heard] = []
     may: list[Heard] = []
     last: Heard | None = None

@@ -1,5 +1,7 @@
 """The robot's ends of the guest's GPIO lines. In: levels to drive, each at its time. Out: what the box drives, with times.
 
+All times are the guest's.
+
 A PL061 of QEMU's `virt` machine: inputs are set and outputs watched through the qtest socket, and the guest's stock
 driver sees interrupts.
 """
@@ -7,14 +9,13 @@ driver sees interrupts.
 from __future__ import annotations
 
 import heapq
-import queue
-import socket
 import threading
-import time
 from collections.abc import Iterable, Sequence
 from itertools import count
 
-ANSWER_S = 20
+from tests.rig.guest_clock import GuestClock
+from tests.rig.qtest import Qtest
+
 HOLD_NS = 250_000_000
 """A level that was planned is held at least so long, however late it came: an emulated processor that is busy takes an
 interrupt long after the edge, and looks at the level only then.
@@ -22,23 +23,22 @@ interrupt long after the edge, and looks at the level only then.
 
 
 class GuestLines:
-    """levels: line name -> what the box drives it to. log: (host ns, name, level) of all changes, in order.
+    """levels: line name -> what the box drives it to. log: (ns, name, level) of all changes, in order, each with the time that
+    was read last.
 
     Fits where the rig's robot drives its edges (appliance.sim.rig.EdgeLines).
     """
 
-    def __init__(self, qtest: socket.socket, place: str, names: Sequence[str]) -> None:
+    def __init__(self, qtest: Qtest, clock: GuestClock, place: str, names: Sequence[str]) -> None:
         self.levels = dict.fromkeys(names, False)
         self.log: list[tuple[int, str, bool]] = []
-        self._names, self._place, self._qtest = list(names), place, qtest
-        self._answers: queue.Queue[str] = queue.Queue()
-        self._changed, self._asking = threading.Condition(), threading.Lock()
+        self._names, self._place, self._qtest, self._clock = list(names), place, qtest, clock
         self._plan: list[tuple[int, int, str, bool]] = []
         self._driven_ns: dict[str, int] = {}
         self._order, self._planned, self._closed = count(), threading.Condition(), False
-        threading.Thread(target=self._listen, daemon=True).start()
+        qtest.changed = self._note
+        qtest.ask(f"irq_intercept_out {place}")
         threading.Thread(target=self._drive_as_planned, daemon=True).start()
-        self._ask(f"irq_intercept_out {place}")
 
     def set(self, name: str, level: bool) -> None:
         """Drive an input of the box, now."""
@@ -47,10 +47,10 @@ class GuestLines:
     def run_through(self, steps: Iterable[tuple[str, bool]]) -> None:
         """Drive inputs one after the other, in one write to QEMU: some tens of microseconds from step to step."""
         into = f"set_irq_in {self._place} unnamed-gpio-in"
-        self._ask(*(f"{into} {self._names.index(name)} {int(level)}" for name, level in steps))
+        self._qtest.ask(*(f"{into} {self._names.index(name)} {int(level)}" for name, level in steps))
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
-        """Drive an input at a host time, or at once where that has passed."""
+        """Drive an input at a time, or at once where that has passed."""
         with self._planned:
             heapq.heappush(self._plan, (t_ns, next(self._order), name, level))
             self._planned.notify()
@@ -63,8 +63,7 @@ class GuestLines:
 
     def wait(self, name: str, level: bool, timeout_s: float) -> bool:
         """Wait until the box drives an output to `level`; False where it does not in time."""
-        with self._changed:
-            return self._changed.wait_for(lambda: self.levels[name] == level, timeout_s)
+        return self._clock.until(lambda: self.levels[name] == level, timeout_s)
 
     def code(self) -> int:
         """What the class bits say now."""
@@ -76,48 +75,28 @@ class GuestLines:
         with self._planned:
             self._closed = True
             self._planned.notify()
-        self._qtest.close()
 
-    def _ask(self, *lines: str) -> None:
-        with self._asking:
-            self._qtest.sendall("".join(f"{line}\n" for line in lines).encode())
-            answers = [self._answers.get(timeout=ANSWER_S) for _ in lines]
-        for line, answer in zip(lines, answers, strict=True):
-            if not answer.startswith("OK"):
-                raise RuntimeError(f"qtest: {line}: {answer}")
-
-    def _listen(self) -> None:
-        try:
-            for line in self._qtest.makefile():
-                word, *rest = line.split()
-                if word != "IRQ":
-                    self._answers.put(line.strip())
-                    continue
-                t_ns, name, level = time.monotonic_ns(), self._names[int(rest[1])], rest[0] == "raise"
-                with self._changed:
-                    self.levels[name] = level
-                    self.log.append((t_ns, name, level))
-                    self._changed.notify_all()
-        except OSError:
-            return  # closed
+    def _note(self, number: int, level: bool) -> None:
+        self.levels[self._names[number]] = level
+        self.log.append((self._clock.latest_ns, self._names[number], level))
 
     def _drive_as_planned(self) -> None:
-        while True:
-            with self._planned:
-                wait_s = (self._plan[0][0] - time.monotonic_ns()) / 1e9 if self._plan else None
-                if wait_s is None or wait_s > 0:
-                    self._planned.wait(wait_s)
-                if self._closed:
-                    return
-                if not self._plan or self._plan[0][0] > time.monotonic_ns():
+        try:
+            while True:
+                with self._planned:
+                    if self._closed:
+                        return
+                    left_ns = self._plan[0][0] - self._clock.now_ns() if self._plan else None
+                    if left_ns is None or left_ns > 0:
+                        # the guest's time is the host's at most, nearly: look again then
+                        self._planned.wait(None if left_ns is None else left_ns / 1e9)
+                        continue
+                    _, _, name, level = heapq.heappop(self._plan)
+                held_ns = self._driven_ns.get(name, -HOLD_NS) + HOLD_NS
+                if held_ns > self._clock.now_ns():
+                    self.drive(name, level, held_ns)
                     continue
-                _, _, name, level = heapq.heappop(self._plan)
-            held_ns = self._driven_ns.get(name, 0) + HOLD_NS
-            if held_ns > time.monotonic_ns():
-                self.drive(name, level, held_ns)
-                continue
-            try:
                 self.set(name, level)
-            except (OSError, queue.Empty):
-                return  # the guest has gone
-            self._driven_ns[name] = time.monotonic_ns()
+                self._driven_ns[name] = self._clock.now_ns()
+        except OSError:
+            return  # the guest has gone

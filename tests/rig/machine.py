@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import select
 import shutil
 import socket
 import subprocess
@@ -17,13 +18,17 @@ from pathlib import Path
 from typing import Any, Self
 
 from tests.factories.emulated_machines import run
+from tests.rig import guest_clock
 from tests.rig.far_end import FarEnd
 from tests.rig.image import LINES, MACHINE, Image
 from tests.rig.lines import GuestLines
+from tests.rig.qtest import Qtest
 from tests.rig.usbredir import UsbRedirPeer
 
-START_S = 20
+START_S = 60
 """Longest wait for QEMU to open its sockets, or to load a snapshot."""
+CARDS_S = 600
+"""Longest wait for a kernel that boots to set up its cards, by the host's time: no other is known yet."""
 
 
 class GuestFailed(AssertionError):
@@ -43,7 +48,7 @@ class Guest:
 
     image: what it runs. folder: where its sockets and its disk go. snapshot: go on from there, instead of booting.
     disk: use this disk as it is and write into it. code: a folder that is its second disk, read-only.
-    lines, serial, skin: the robot's ends of trigger and result lines, of the serial port, and of the USB cable.
+    clock: its time. lines, serial, skin: the robot's ends of trigger and result lines, of the serial port, and of the USB cable.
     """
 
     def __init__(
@@ -69,8 +74,10 @@ class Guest:
             self.qmp("qmp_capabilities")
             self._agent = self._connect("agent")
             self._rest = b""
-            self.serial = FarEnd(self._folder / "robot")
-            self.lines = GuestLines(self._connect("qtest"), self._find("pl061"), LINES)
+            self._qtest = Qtest(self._connect("qtest"))
+            self.clock = guest_clock.find(self._qtest, CARDS_S)
+            self.serial = FarEnd(self._folder / "robot", self.clock)
+            self.lines = GuestLines(self._qtest, self.clock, self._find("pl061"), LINES)
             self.skin = self._plug_cable(redir)
         except BaseException:
             self.cut()
@@ -91,7 +98,7 @@ class Guest:
             return "-chardev", f"socket,id={name},path={at}/{name},server=on,wait=off"
 
         return [
-            "qemu-system-aarch64", *MACHINE, "-accel", "tcg,thread=multi", "-display", "none",
+            "qemu-system-aarch64", *MACHINE, "-accel", "tcg,thread=single", *guest_clock.STEADY, "-display", "none",
             "-kernel", image.kernel, "-initrd", image.ground / "ramdisk", "-dtb", image.ground / "tree.dtb",
             "-append", "console=ttyAMA0 quiet systemd.show_status=0 panic=-1", "-no-reboot",
             "-drive", f"file={self.disk},format=qcow2,if=none,id=d0", "-device", "virtio-blk-pci,drive=d0,addr=4",
@@ -99,7 +106,7 @@ class Guest:
             "-device", "virtio-blk-pci,drive=d1,addr=5",
             "-device", "qemu-xhci,id=xhci,addr=6", "-device", "virtio-rng-pci,addr=7",
             *port("robot"), "-device", "pci-serial,chardev=robot,addr=8",
-            "-device", "virtio-serial-pci,addr=9",
+            "-device", "virtio-serial-pci,addr=9", *guest_clock.DEVICE,
             *port("agent"), "-device", "virtserialport,chardev=agent,name=palpate.agent",
             *port("bench"), "-device", "virtserialport,chardev=bench,name=palpate.bench",
             "-chardev", f"file,id=console,path={at}/console", "-serial", "chardev:console",
@@ -133,7 +140,7 @@ class Guest:
         self.qmp("chardev-add", id="skin", backend={"type": "socket", "data": {"addr": address, "server": False}})
         self.qmp("device_add", driver="usb-redir", id="cable", chardev="skin", bus="xhci.0")
         listener.settimeout(START_S)
-        return UsbRedirPeer(listener.accept()[0])
+        return UsbRedirPeer(listener.accept()[0], self.clock)
 
     def qmp(self, execute: str, **arguments: Any) -> Any:
         """Ask QEMU's monitor; what it returns. Raises Failed where it refuses."""
@@ -154,22 +161,24 @@ class Guest:
     def run(self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b"") -> Done:
         """Run a shell line as root; waits for its end. Raises Failed where the guest says nothing, or check asks."""
         request = {"run": line, "timeout_s": timeout_s, "stdin": base64.b64encode(stdin).decode()}
-        self._agent.settimeout(timeout_s + START_S)
-        try:
-            self._agent.sendall(json.dumps(request).encode() + b"\n")
-            while b"\n" not in self._rest:
-                more = self._agent.recv(1 << 20)
-                if not more:
-                    raise GuestFailed(f"the guest has left during: {line}")
-                self._rest += more
-        except TimeoutError as e:
-            raise GuestFailed(f"the guest sent nothing for {timeout_s + START_S:.0f} s to: {line}") from e
+        self._agent.sendall(json.dumps(request).encode() + b"\n")
+        if not self.clock.until(lambda: self._heard_answer(line), timeout_s + START_S):
+            raise GuestFailed(f"the guest sent nothing for {timeout_s + START_S:.0f} s to: {line}")
         answer, _, self._rest = self._rest.partition(b"\n")
         reply = json.loads(answer)
         done = Done(reply["rc"], base64.b64decode(reply["out"]).decode(errors="replace"))
         if check and done.rc:
             raise GuestFailed(f"rc {done.rc} of: {line}\n{done.out[-2000:]}")
         return done
+
+    def _heard_answer(self, line: str) -> bool:
+        """Whether the agent's answer is there whole."""
+        if b"\n" not in self._rest and select.select([self._agent], [], [], 0)[0]:
+            more = self._agent.recv(1 << 20)
+            if not more:
+                raise GuestFailed(f"the guest has left during: {line}")
+            self._rest += more
+        return b"\n" in self._rest
 
     def put(self, path: str, data: bytes) -> None:
         """Write a file of the guest."""
@@ -200,7 +209,7 @@ class Guest:
         """Cut the power: the guest cannot shut down."""
         self._process.kill()
         self._process.wait()
-        for part in ("serial", "lines", "skin"):
+        for part in ("serial", "lines", "skin", "_qtest"):
             if hasattr(self, part):
                 getattr(self, part).close()
 

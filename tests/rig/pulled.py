@@ -25,7 +25,7 @@ def before(cell: Cell, i: int) -> str:
 def during(cell: Cell, i: int) -> str:
     """Pulled while the finger slides: answered at once."""
     touch, since = begin(cell)
-    until(touch.start_ns + (i * 37 % 25) * SECOND // 10)
+    until(cell, touch.start_ns + (i * 37 % 25) * SECOND // 10)
     cell.unplug()
     let_go(cell)  # no stop edge comes to bring the answer about
     return not_wrong(touch, only_answer(cell, since))
@@ -34,6 +34,6 @@ def during(cell: Cell, i: int) -> str:
 def after(cell: Cell, i: int) -> str:
     """Pulled within 30 ms of the stop edge: the answer is out, or it is that the skin was lost."""
     touch, since = begin(cell)
-    until(touch.stop_ns + i % 4 * SECOND // 100)
+    until(cell, touch.stop_ns + i % 4 * SECOND // 100)
     cell.unplug()
     return not_wrong(touch, only_answer(cell, since))

@@ -12,7 +12,6 @@ import math
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -34,7 +33,6 @@ from train.metrics import score
 from train.reports import html, provenance
 
 BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
-Clock = Callable[[], float]
 WAIT_S, SAMPLE_S, MINUTE_S = 0.2, 10.0, 60.0
 SILENT_S = 60.0
 """A box that sends nothing for this long is gone; a working one sends its state each second."""
@@ -47,13 +45,13 @@ NOTED = 200
 
 
 class Recorder:
-    """Writes the record of a run from the sentences of a box and samples of its process. clock: monotonic seconds."""
+    """Writes the record of a run from the sentences of a box and samples of its process. All times are the box's."""
 
-    def __init__(self, box: BoxUnderTest, run: SoakRun, sweeps: Script, clock: Clock) -> None:
+    def __init__(self, box: BoxUnderTest, run: SoakRun, sweeps: Script) -> None:
         self.run = run
-        self._box, self._sweeps, self._clock = box, sweeps, clock
+        self._box, self._sweeps, self._clock = box, sweeps, box.clock
         self._last, self._behind = 0, math.inf
-        self._begun_s = self._heard_s = self._looked_s = clock()
+        self._begun_s = self._heard_s = self._looked_s = box.clock()
         self._state: list[int] = []
         self._streaming = False
 
@@ -138,10 +136,10 @@ class Recorder:
 
 def record(
     box: BoxUnderTest, run: SoakRun, length_s: float, save: Callable[[], None], *,
-    stopped: Callable[[], bool] = lambda: False, clock: Clock = time.monotonic, log: Callable[[str], None] = print,
+    stopped: Callable[[], bool] = lambda: False, log: Callable[[str], None] = print,
 ) -> None:  # fmt: skip
     """Have a box sweep for so long; `save` is called each minute and at the end. What goes wrong stands in the run."""
-    recorder = Recorder(box, run, Script(run.seed), clock)
+    recorder = Recorder(box, run, Script(run.seed))
     try:
         recorder.start()
         while run.length_s < length_s and not stopped():
@@ -201,7 +199,7 @@ def _text(value: Any, indent: str = "") -> str:
 
 def soak(
     box: BoxUnderTest, seed: int, hours: float, work: Path, *, stopped: Callable[[], bool] = lambda: False,
-    clock: Clock = time.monotonic, log: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> Path:  # fmt: skip
     """Record one box for what is left of `hours`; its record."""
     path = work / f"{box.name.replace(' ', '-')}.json"
@@ -224,7 +222,7 @@ def soak(
     def save() -> None:
         write(path, about | {"started": started, "hours": hours, "runs": [asdict(r) for r in runs]})
 
-    record(box, run, hours * 3600 - done_s, save, stopped=stopped, clock=clock, log=log)
+    record(box, run, hours * 3600 - done_s, save, stopped=stopped, log=log)
     log(f"{box.name}: ended ({run.ended}); {progress(run)}")
     return path
 

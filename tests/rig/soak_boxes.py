@@ -91,9 +91,13 @@ class Script:
 
 
 class BoxUnderTest(Protocol):
-    """A box with a robot that sweeps without pause. All times are seconds of this machine's monotonic clock."""
+    """A box with a robot that sweeps without pause. All times are seconds of its clock."""
 
     name: str
+
+    def clock(self) -> float:
+        """The time by which robot and skin go: this machine's, or the guest's. Raises Gone."""
+        ...
 
     def start(self, seed: int, sweeps: Script) -> None:
         """Start the box and its robot."""
@@ -180,6 +184,7 @@ class ThisMachine:
     def __init__(self, before: Sequence[str] = (), sets: Sequence[str] = ()) -> None:
         self._stack, self._rest = ExitStack(), b""
         self._before, self._sets = before, [f"--set={text}" for text in sets]
+        self.clock = time.monotonic
 
     @staticmethod
     def missing() -> str:

@@ -11,7 +11,6 @@ import platform
 import re
 import tempfile
 import threading
-import time
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -21,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from appliance.core.clock import SystemClock
 from appliance.io import packets
 from appliance.sim import rig, script, skin
 from tests.factories.emulated_machines import LOCK
@@ -74,6 +72,7 @@ class VirtualBox:
 
     def __init__(self) -> None:
         self._stack, self._heard = ExitStack(), 0
+        self._guest: Guest | None = None
         self._sent: deque[tuple[float, int]] = deque(maxlen=SENT)
         self._thrown, self._anew = 0, False
 
@@ -96,16 +95,26 @@ class VirtualBox:
             raise Gone(str(e)) from e
         self._guest.skin.mangle = self._note
         self._hand = SoakRobot(self._guest.lines, seed)
-        self._board = rig.Board(skin.FORMAT, self._hand, SystemClock(), fifo_frames=2250)
+        self._board = rig.Board(skin.FORMAT, self._hand, self._guest.clock, fifo_frames=2250)
         self._answer, self._board.request = self._board.request, self._request  # type: ignore[method-assign]
         self._guest.skin.plug(self._board)
         if not self._guest.lines.wait("READY", True, READY_S):
             raise Gone(f"the guest was not READY within {READY_S} s")
         self._hand.ready.set()
 
+    def clock(self) -> float:
+        """As BoxUnderTest; 0 before it has been started."""
+        try:
+            return self._guest.clock.now_s() if self._guest else 0.0
+        except OSError as e:
+            raise Gone(f"the guest has ended: {e}") from e
+
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
         """As BoxUnderTest."""
-        time.sleep(wait_s)
+        try:
+            self._guest.clock.sleep(wait_s)
+        except OSError as e:
+            raise Gone(f"the guest has ended: {e}") from e
         lines = self._guest.serial.heard[self._heard :]
         self._heard += len(lines)
         return [(t_ns / 1e9, line) for t_ns, line in lines]
@@ -128,7 +137,7 @@ class VirtualBox:
             # what it took from the box's STOP to its START it was asked not to send
             self._thrown += seq - self._thrown - self._sent[-1][1]
         self._anew = False
-        self._sent.append((time.monotonic(), seq + count - self._thrown))
+        self._sent.append((self.clock(), seq + count - self._thrown))
         return packet
 
     def _request(self, request: int) -> bytes | None:

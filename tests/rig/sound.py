@@ -5,7 +5,6 @@ In: a cell. Out: right sweeps, state fields, or AssertionError with the journal 
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
@@ -17,7 +16,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
 from appliance.sim import rig, skin
-from tests.rig.cell import BEGUN_S, Cell, Touch
+from tests.rig.cell import Cell, Touch
 
 FIELDS = (
     "time", "state", "sweeping", "answered", "received", "lost", "garbage", "enumerations", "dropped", "bundle",
@@ -27,7 +26,7 @@ FIELDS = (
 LATE = {
     "gap", "short", "long", "no-start", "no-stop", "edges-lost", "sensor-lost", "not-ready", "unsure", "unknown",
 }  # fmt: skip
-"""Answers to sound sweeps while the emulator stands still: frames or edges come to its kernel late or not at all, and the
+"""Answers to sound sweeps while the guest is busy with something else: frames or edges come to the box late, and the
 window lies beside its place. None names a wrong material.
 """
 OPEN_NS = 1_000_000_000
@@ -78,22 +77,22 @@ def state(cell: Cell) -> dict[str, str]:
 
 def until_state(cell: Cell, wanted: str, timeout_s: float = 30) -> None:
     """Wait until the skin is in a state. Raises AssertionError where it does not come to it."""
-    end, seen = time.monotonic() + timeout_s, Counter[str]()
+    end, seen = cell.clock.now_s() + timeout_s, Counter[str]()
     while (now := state(cell)["state"]) != wanted:
         seen[now] += 1
-        assert time.monotonic() < end, f"never {wanted}, but {dict(seen)}; the box says: {cell.journal()}"
-        time.sleep(0.02)
+        assert cell.clock.now_s() < end, f"never {wanted}, but {dict(seen)}; the box says: {cell.journal()}"
+        cell.wait(0.02)
 
 
 def begin(cell: Cell) -> tuple[Touch, int]:
-    """A sweep that the box says is open, and the number of lines heard before it. Tried again where the emulator stood
-    still while the start edge came and went. Raises AssertionError where none opens."""
+    """A sweep that the box says is open, and the number of lines heard before it. Tried again where the box was doing
+    something else while the start edge came and went. Raises AssertionError where none opens."""
     for _ in range(TRIES):
         since = len(cell.serial.heard)
         touch = cell.touch()
-        assert touch.played.wait(BEGUN_S), "the board did not come to it"
-        until(touch.start_ns)
-        while time.monotonic_ns() < touch.start_ns + OPEN_NS:
+        cell.begun(touch)
+        until(cell, touch.start_ns)
+        while cell.clock.now_ns() < touch.start_ns + OPEN_NS:
             if state(cell)["sweeping"] == "1":
                 return touch, since
         let_go(cell)
@@ -101,9 +100,9 @@ def begin(cell: Cell) -> tuple[Touch, int]:
     raise AssertionError(f"{TRIES} start edges opened no sweep; the box says: {cell.journal()}")
 
 
-def until(host_ns: int) -> None:
-    """Wait until that time."""
-    time.sleep(max(0.0, (host_ns - time.monotonic_ns()) / 1e9))
+def until(cell: Cell, t_ns: int) -> None:
+    """Wait until that time of the guest's."""
+    cell.clock.sleep_until(t_ns)
 
 
 def let_go(cell: Cell) -> None:
@@ -116,8 +115,8 @@ def let_go(cell: Cell) -> None:
 def only_answer(cell: Cell, since: int, seconds: float = 0.3) -> Answer:
     """The one answer since line number `since`. Raises AssertionError where a second comes within `seconds`."""
     first = cell.answer(since)
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+    end = cell.clock.now_s() + seconds
+    while cell.clock.now_s() < end:
         assert len(cell.answers(since)) == 1, cell.answers(since)
-        time.sleep(0.02)
+        cell.wait(0.02)
     return first

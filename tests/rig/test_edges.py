@@ -5,7 +5,6 @@ Seen from the robot: statuses, READY, FAULT and the other lines, and a right swe
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -41,6 +40,7 @@ max_duration_s = 4.0
 port = "/dev/palpate-robot"
 """
 BUSY, DECIDED = "CLASS-0", "CLASS-1"
+SECOND = 1_000_000_000
 PULSE_NS = 500_000_000
 """After so long the robot's own pulse is over: both edges of a glitch within it would be an end of it."""
 MANY = 10_000
@@ -57,10 +57,10 @@ def robot(shared: Cell) -> None:
 
 
 def pulse(cell: Cell, name: str, width_s: float = 0.1) -> None:
-    """A pulse that the host ends `width_s` after it began, or later where it is busy; then as long a pause."""
+    """A pulse of `width_s`, or a little longer; then as long a pause."""
     for level in (True, False):
         cell.lines.set(name, level)
-        time.sleep(width_s)
+        cell.wait(width_s)
 
 
 def glitch(cell: Cell, name: str) -> None:
@@ -70,9 +70,9 @@ def glitch(cell: Cell, name: str) -> None:
 
 def answers(cell: Cell, since: int, n: int) -> list[Answer]:
     """The first `n` answers of the lines from number `since` on, when they are there."""
-    end = time.monotonic() + 30
-    while len(found := cell.answers(since)) < n and time.monotonic() < end:
-        time.sleep(0.01)
+    end = cell.clock.now_s() + 30
+    while len(found := cell.answers(since)) < n and cell.clock.now_s() < end:
+        cell.wait(0.01)
     assert len(found) >= n, f"{len(found)} answers instead of {n}; the box says: {cell.journal()}"
     return found[:n]
 
@@ -110,7 +110,7 @@ def test_glitches(cell: Cell, count: Count, note: Note) -> None:
     for _ in range(times):
         for name in ("START", "STOP"):
             glitch(cell, name)
-            time.sleep(0.01)
+            cell.wait(0.01)
     cell.wait(0.2)
     assert cell.answers(since) == []
     note("glitch, both edges in one interrupt", "nothing", 2 * times)
@@ -138,9 +138,9 @@ def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: No
         touch = cell.touch()
         first = cell.answer(since)
         assert first.status == "no-stop"
-        until(touch.start_ns + PULSE_NS)
+        until(cell, touch.start_ns + PULSE_NS)
         glitches = 0
-        while time.monotonic_ns() < touch.stop_ns - PULSE_NS:
+        while cell.clock.now_ns() < touch.stop_ns - PULSE_NS:
             glitch(cell, "START")
             glitch(cell, "STOP")
             glitches += 2
@@ -212,8 +212,8 @@ def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
     since = len(cell.serial.heard)
     with halted(cell):
         pulse(cell, "START")
-        begun, end = interrupts(cell), time.monotonic() + HALT_S
-        while interrupts(cell) < begun + MANY and time.monotonic() < end:
+        begun, end = interrupts(cell), cell.clock.now_s() + HALT_S
+        while interrupts(cell) < begun + MANY and cell.clock.now_s() < end:
             toggle(cell, "STOP", 1000)
     cell.until_ready(20)
     cell.state()
@@ -227,7 +227,7 @@ def one_line_sweep(cell: Cell) -> tuple[Touch, int]:
     """A whole sweep of a robot with one line, and the number of the line that was heard before it."""
     since = len(cell.serial.heard)
     touch = cell.touch(start=False, stop=False)
-    assert touch.played.wait(60)
+    cell.begun(touch)
     cell.lines.drive("START", True, touch.start_ns)
     cell.lines.drive("START", False, touch.stop_ns)
     return touch, since
@@ -254,7 +254,7 @@ def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
         touch, since = one_line_sweep(cell)
         results += [(touch, *answers(cell, since, 1))]
         assert cell.lines.wait("READY", True, 10)
-        cell.wait(max(0.0, (touch.stop_ns - time.monotonic_ns()) / 1e9) + 0.3)
+        until(cell, touch.stop_ns + SECOND // 3)
         seen = [(name, level) for _, name, level in cell.lines.log[begun:]]
         assert (
             seen.index((BUSY, True)) < seen.index((DECIDED, True)) if results[-1][1].share < 1 else (BUSY, True) in seen

@@ -4,7 +4,6 @@ another program. Out: sentences again by themselves, and meanwhile sweeps that a
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -39,9 +38,9 @@ def shown(cell: Cell) -> Touch:
     """A sweep that is answered on the lines at least: RESULT VALID rises over the code of what was touched, or of nothing."""
     cell.until_ready()
     before, touch = len(cell.lines.log), cell.touch()
-    end = time.monotonic() + 60
+    end = cell.clock.now_s() + 60
     while ("RESULT-VALID", True) not in [(name, level) for _, name, level in cell.lines.log[before:]]:
-        assert time.monotonic() < end, f"the sweep was not answered; the box says: {cell.journal()}"
+        assert cell.clock.now_s() < end, f"the sweep was not answered; the box says: {cell.journal()}"
         cell.wait(0.02)
     assert cell.lines.code() in (0, 1 + bundle.load(bundle.DEFAULT).manifest.labels.index(touch.act.label))
     return touch
@@ -62,14 +61,14 @@ def test_cable_out(cell: Cell, note: Note) -> None:
 
 def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
     """Sentences pile up, the oldest are dropped and counted, no frame is lost; when it reads the newest come, whole."""
-    begun, before = time.monotonic(), cell.state()
+    begun, before = cell.clock.now_s(), cell.state()
     cell.serial.deaf = True
     since = len(cell.serial.heard)
     for _ in range(200):  # the line alone holds some: QEMU's, the port's and the kernel's
         cell.serial.say(b"$PPLP,STATE\r\n")
-        time.sleep(0.01)
+        cell.wait(0.01)
     touch = shown(cell)
-    cell.wait(begun + count(8, 60) - time.monotonic())
+    cell.clock.sleep_until(round((begun + count(8, 60)) * 1e9))
     assert len(cell.serial.heard) <= since + 9  # a last look had begun, and may have brought several lines
     cell.serial.deaf = False
     cell.serial.say(b"$PPLP,ID\r\n")
@@ -147,8 +146,8 @@ def test_another_program_and_an_adapter(cell: Cell, tmp_path: Path, count: Count
     assert cell.lines.wait("READY", False, 20)
     assert tries(cell, PORT) == ""
     cell.until_ready()
-    end = time.monotonic() + 20
-    while "end the program that has it" not in cell.journal() and time.monotonic() < end:
+    end = cell.clock.now_s() + 20
+    while "end the program that has it" not in cell.journal() and cell.clock.now_s() < end:
         cell.wait(0.2)
     assert "end the program that has it" in cell.journal()
     assert far.heard == []
@@ -178,7 +177,7 @@ def plug(cell: Cell, path: Path, *, first: bool = False) -> FarEnd:
     address = {"type": "unix", "data": {"path": str(path)}}
     backend = {"type": "socket", "data": {"addr": address, "server": True, "wait": False}}
     cell.machine.qmp("chardev-add", id="adapter", backend=backend)
-    far = FarEnd(path)
+    far = FarEnd(path, cell.clock)
     cell.machine.qmp(
         "device_add", driver="usb-serial", id="adapter", chardev="adapter", bus="xhci.0", serial="R1",
         **{"always-plugged": True},

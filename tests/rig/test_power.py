@@ -10,7 +10,6 @@ from __future__ import annotations
 import random
 import shutil
 import subprocess
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -50,12 +49,13 @@ class EndlessRobot:
 
     def for_seconds(self, seconds: float) -> str:
         """Go on sweeping; what the box was doing at the end."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
+        clock = self.cell.clock
+        end = clock.now_s() + seconds
+        while (left := end - clock.now_s()) > 0:
             if self.cell.lines.levels["READY"] and not self._sweeping():
                 self.touches.append(self.cell.touch())
-            time.sleep(min(0.05, left))
-        if self.touches and 0 < self.touches[-1].start_ns < time.monotonic_ns() and self._sweeping():
+            self.cell.wait(min(0.05, left))
+        if self.touches and 0 < self.touches[-1].start_ns < clock.now_ns() and self._sweeping():
             return "sweeping"
         return "idle" if self.cell.lines.levels["READY"] else "starting"
 
@@ -64,10 +64,10 @@ class EndlessRobot:
         if not self.touches:
             return False
         touch = self.touches[-1]
-        return not touch.played.is_set() or time.monotonic_ns() < touch.stop_ns + 300_000_000
+        return not touch.played.is_set() or self.cell.clock.now_ns() < touch.stop_ns + 300_000_000
 
     def harmed(self, kills: list[int]) -> list[str]:
-        """Answers `ok` to sweeps in which the box was killed, each with its times; kills: host ns."""
+        """Answers `ok` to sweeps in which the box was killed, each with its times; kills: ns."""
         wrong = []
         for heard_ns, line in self.cell.serial.heard:
             touched = [t for t in self.touches if t.played.is_set() and t.stop_ns < heard_ns]
@@ -87,13 +87,13 @@ def statuses(cell: Cell) -> Counter[str]:
 
 
 def kill(cell: Cell) -> int:
-    """SIGKILL, as soon as there is a program to kill; host ns. READY falls, although nobody is there to lower it."""
+    """SIGKILL, as soon as there is a program to kill; when, in ns. READY falls, although nobody is there to lower it."""
     cell.machine.run(
         "until pid=$(systemctl show -P MainPID palpate) && [ $pid != 0 ]; do sleep .05; done; kill -KILL $pid",
         timeout_s=60,
         check=True,
     )
-    killed_ns = time.monotonic_ns()
+    killed_ns = cell.clock.now_ns()
     assert cell.lines.wait("READY", False, BACK_S), "READY stays high after the program was killed"
     return killed_ns
 
@@ -172,10 +172,10 @@ def cut(
         cell.acts = known(script.tubes(rng.randrange(1 << 30)))
         cell.packet_frames = PACKET
         cell.plug()
-        robot, begun, ready_s, parts = EndlessRobot(cell), time.monotonic(), None, 0
+        robot, begun, ready_s, parts = EndlessRobot(cell), cell.clock.now_s(), None, 0
         if not booting:
             cell.until_ready(BACK_S)
-            ready_s = round(time.monotonic() - begun, 1)
+            ready_s = round(cell.clock.now_s() - begun, 1)
             parts = int(machine.run(f"ls {KEPT} | grep -c part").out)
         doing = robot.for_seconds(rng.uniform(0, BOOT_S if booting else WORK_S))
         machine.cut()

@@ -7,7 +7,6 @@ that records, and what `palpate check` says. The skin is played on the host into
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -74,13 +73,13 @@ class SerialCell(Cell):
         with self._hold:
             self.player.unplug()
         self.machine.qmp("device_del", id="adapter")
-        end = time.monotonic() + START_S
-        while time.monotonic() < end:  # the adapter lets go of its line a moment later
+        end = self.clock.now_s() + START_S
+        while self.clock.now_s() < end:  # the adapter lets go of its line a moment later
             with suppress(GuestFailed):
                 self.machine.qmp("chardev-remove", id="adapter")
                 self._plugged = False
                 return
-            time.sleep(0.01)
+            self.wait(0.01)
         raise AssertionError(f"qemu kept the adapter's line for {START_S} s")
 
     def end(self) -> None:

@@ -91,10 +91,10 @@ def journal_count(cell: Cell, text: str) -> int:
 
 def until_logged(cell: Cell, text: str, since: int = 0, timeout_s: float = START_S) -> None:
     """Wait until more than `since` lines hold it."""
-    end = time.monotonic() + timeout_s
+    end = cell.clock.now_s() + timeout_s
     while journal_count(cell, text) <= since:
-        assert time.monotonic() < end, f"the box has not logged {text!r}, but: {cell.journal()}"
-        time.sleep(1)
+        assert cell.clock.now_s() < end, f"the box has not logged {text!r}, but: {cell.journal()}"
+        cell.wait(1)
 
 
 def files(cell: Cell) -> dict[str, str]:
@@ -193,8 +193,8 @@ def by_hand(cell: Cell) -> str:
     for name in ("START", "STOP"):
         for level in (True, False):
             cell.lines.set(name, level)
-            time.sleep(0.3)
-        time.sleep(2.5)
+            cell.wait(0.3)
+        cell.wait(2.5)
     return cell.answer(since, ANSWER_S).status
 
 
@@ -202,7 +202,7 @@ def swept(cell: Cell) -> str:
     """The status of a sweep; by hand where the board cannot know when its frames reach a box that is behind."""
     since = len(cell.serial.heard)
     touch = cell.touch()
-    if touch.played.wait(10):
+    if cell.clock.until(touch.played.is_set, 10):
         return not_wrong(touch, cell.answer(since, ANSWER_S))
     cell.hand.touches.get_nowait()
     return by_hand(cell)

@@ -1,14 +1,13 @@
 """Trigger and frames on one time line, on a real kernel: is the middle of a window what was taken between the edges?
 
 In: a guest that keeps its sweeps. Out: how far each window's middle lies from the truth, which the board outside knows.
-The guest's clock is put to the host's by the shortest of many round trips, so that edges as the guest's kernel stamped
+What the guest's kernel calls its time is put to the clock by which the board goes by the shortest of many round trips, so that edges as the guest's kernel stamped
 them can be held against the moments at which the board took its frames.
 """
 
 from __future__ import annotations
 
 import struct
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,41 +55,41 @@ while True:
 
 @dataclass(frozen=True, slots=True)
 class Offset:
-    """Host time minus guest time in ns, and by how much it may be wrong."""
+    """The board's time minus that of the guest's kernel in ns, and by how much it may be wrong."""
 
     ns: int
     within_ns: int
 
 
-class GuestClock:
-    """Asks the guest for its time. Each trip's answer was read between its two ends, so the offset lies in all of them."""
+class KernelClock:
+    """Asks the guest's kernel for its time. Each trip's answer was read between its two ends, so the offset lies in all of them."""
 
     def __init__(self, machine: Guest) -> None:
         machine.put("/run/report_time.py", REPORT_TIME.encode())
         machine.run("python3 /run/report_time.py < /dev/null > /dev/null 2>&1 &", check=True)
-        self._port = machine.bench()
+        self._port, self._clock = machine.bench(), machine.clock
         self._port.settimeout(60)
 
     def offset(self) -> Offset:
         """Raises AssertionError where trips contradict each other: the clocks do not go alike."""
         low, high = -(1 << 63), 1 << 63
         for _ in range(TRIPS):
-            sent_ns = time.monotonic_ns()
+            sent_ns = self._clock.now_ns()
             self._port.sendall(b".")
             (guest_ns,) = struct.unpack("<q", self._port.recv(8))
-            low, high = max(low, sent_ns - guest_ns), min(high, time.monotonic_ns() - guest_ns)
+            low, high = max(low, sent_ns - guest_ns), min(high, self._clock.now_ns() - guest_ns)
         assert low <= high, f"the guest's clock went {(low - high) / 1e6:.3f} ms away during {TRIPS} trips"
         return Offset((low + high) // 2, (high - low) // 2)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def clock(shared: Cell) -> GuestClock:
+def clock(shared: Cell) -> KernelClock:
     """The service keeps its sweeps; sweeps whose answer is known."""
     shared.acts, shared.packet_frames = known(script.tubes(2)), 12
     runs_with(shared.machine, f"record --out {KEPT}")
     shared.machine.run("systemctl stop palpate; systemctl start --no-block palpate", check=True, timeout_s=60)
     shared.serial.wait_for("$PPLP,STA,", 120, len(shared.serial.heard))
-    return GuestClock(shared.machine)
+    return KernelClock(shared.machine)
 
 
 def kept(cell: Cell, number: int, folder: Path) -> Sweep:
@@ -131,7 +130,7 @@ def windows(cell: Cell, folder: Path, n: int) -> Iterator[Sweep]:
 
 
 @pytest.mark.parametrize("what", CASES)
-def test_windows_lie_in_the_middle(cell: Cell, clock: GuestClock, note: Note, tmp_path: Path, what: str):
+def test_windows_lie_in_the_middle(cell: Cell, clock: KernelClock, note: Note, tmp_path: Path, what: str):
     """The window's middle is the frame taken half-way between the edges: within one frame at 80 ppm, and beyond what the
     box takes for possible within what it then cannot know. All stamps are late alike, by a transfer's shortest way."""
     ppm, seen = CASES[what], []

@@ -5,7 +5,6 @@ A sweep that was harmed says so; what harms none is answered right; a sound skin
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from appliance.core.clock import Clock
 from appliance.io import packets
 from appliance.sim import script
 from tests.rig.cell import Cell
@@ -116,13 +116,13 @@ QUICK = "garbage in the window", "clock 1 s ahead"
 class Cable:
     """The mangle of one sweep: `left` transfers are still to be harmed, none before `begin_ns`."""
 
-    def __init__(self, fault: Fault, begin_ns: int) -> None:
+    def __init__(self, fault: Fault, clock: Clock, begin_ns: int) -> None:
         self.left = fault.transfers
-        self._harm, self._begin_ns = fault.make(), begin_ns
+        self._harm, self._clock, self._begin_ns = fault.make(), clock, begin_ns
 
     def __call__(self, data: bytes) -> bytes:
         """A transfer, harmed or not."""
-        if not self.left or time.monotonic_ns() < self._begin_ns:
+        if not self.left or self._clock.now_ns() < self._begin_ns:
             return data
         self.left -= 1
         return self._harm(data)
@@ -142,9 +142,9 @@ def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: s
     for _ in range(n):
         had = int(state(cell)[fault.counter]) if fault.counter else 0
         touch, since = begin(cell)
-        cell.cable.mangle = cable = Cable(fault, touch.start_ns + round(fault.begin_s * SECOND))
+        cell.cable.mangle = cable = Cable(fault, cell.clock, touch.start_ns + round(fault.begin_s * SECOND))
         status = not_wrong(touch, cell.answer(since))
-        until(touch.stop_ns + SECOND // 2)
+        until(cell, touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
         assert cable.left < fault.transfers, "nothing was harmed"
         cell.cable.mangle = bytes
@@ -164,11 +164,11 @@ def test_a_skin_that_stops_sending(cell: Cell, count: Count, note: Note, what: s
     n = count(1, 3)
     for _ in range(n):
         touch, since = begin(cell)
-        until(touch.start_ns + SECOND)
+        until(cell, touch.start_ns + SECOND)
         setattr(cell.cable, what, True)
         assert not_wrong(touch, only_answer(cell, since)) == "sensor-lost"
         cell.cable.silent = False
-        until(touch.stop_ns + SECOND // 2)
+        until(cell, touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
         check_recovers(cell)
         assert not cell.cable.halted

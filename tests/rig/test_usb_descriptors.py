@@ -6,7 +6,6 @@ The kernel refuses some, libusb or the box others; the service neither dies nor 
 from __future__ import annotations
 
 import struct
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -100,13 +99,13 @@ def service(cell: Cell) -> str:
 
 def looked_at(cell: Cell) -> set[str]:
     """The states that the skin is in until the box has an opinion of it, or the kernel has given it up."""
-    seen, asked, since = set[str](), cell.cable.asked, time.monotonic()
+    seen, asked, since = set[str](), cell.cable.asked, cell.clock.now_s()
     end = since + LOOK_S
-    while not seen & OPINIONS and (cell.cable.asked == 0 or time.monotonic() < since + QUIET_S):
-        assert time.monotonic() < end, f"the kernel goes on asking; the box says: {cell.journal()}"
+    while not seen & OPINIONS and (cell.cable.asked == 0 or cell.clock.now_s() < since + QUIET_S):
+        assert cell.clock.now_s() < end, f"the kernel goes on asking; the box says: {cell.journal()}"
         seen.add(state(cell)["state"])
         if cell.cable.asked != asked:
-            asked, since = cell.cable.asked, time.monotonic()
+            asked, since = cell.cable.asked, cell.clock.now_s()
     return seen
 
 

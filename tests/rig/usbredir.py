@@ -10,11 +10,11 @@ import select
 import socket
 import struct
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from appliance.core.clock import Clock
 from appliance.sim import rig
 from appliance.sim.usb import MAX_PACKET, PRODUCT_ID, VENDOR_ID
 
@@ -58,22 +58,23 @@ class UsbRedirPeer:
     """A cable. `plug` hangs a board on it, `unplug` takes it off; both may be called from any thread.
 
     mangle: what the cable does to a transfer; more than was asked for is a babble. silent: transfers never end.
-    deaf: requests are never answered. slow_s: they are answered so late. halted: the endpoint stalls until it is cleared.
+    deaf: requests are never answered. slow_s: they are answered so late. All times are those of `clock`, the guest's.
+    halted: the endpoint stalls until it is cleared.
     sent: transfers that the guest took. asked: requests that it made. opened: how often the guest's kernel has set up a device.
     """
 
-    def __init__(self, connection: socket.socket) -> None:
+    def __init__(self, connection: socket.socket, clock: Clock) -> None:
         self.board: rig.Board | None = None
         self.mangle: Callable[[bytes], bytes] = bytes
         self.silent = self.deaf = self.halted = False
         self.slow_s = 0.0
         self.descriptors = Descriptors()
         self.sent = self.asked = self.opened = 0
-        self._socket, self._wide = connection, False
+        self._socket, self._clock, self._wide = connection, clock, False
         self._waiting: deque[tuple[int, int]] = deque()  # (id, length) of bulk transfers that the guest has asked for
         self._replied: dict[int, bytes] = {}
         self._again: deque[bytes] = deque()
-        self._later: deque[tuple[float, bytes, int]] = deque()  # (monotonic s, body, id) of answers to requests
+        self._later: deque[tuple[int, bytes, int]] = deque()  # (ns, body, id) of answers to requests
         self._jobs: deque[Callable[[], None]] = deque()
         self._wake, self._woken = socket.socketpair()
         self._said_hello = threading.Event()
@@ -162,8 +163,8 @@ class UsbRedirPeer:
         if self._again and self._waiting:
             return 0.0
         due_ns = self.board.due_ns() if self.board and self._waiting and not self.silent else None
-        due_s = [at_s for at_s, _, _ in self._later] + ([due_ns / 1e9] if due_ns is not None else [])
-        return max(0.0, min(due_s) - time.monotonic()) if due_s else None
+        due = [at_ns for at_ns, _, _ in self._later] + ([due_ns] if due_ns is not None else [])
+        return max(0.0, (min(due) - self._clock.now_ns()) / 1e9) if due else None
 
     def _take(self, data: bytes) -> bytes:
         """Answer all whole messages; the rest."""
@@ -221,18 +222,18 @@ class UsbRedirPeer:
         status, data = (STALL, b"") if reply is None else (DONE, reply[:length] if kind & 0x80 else b"")
         size = len(data) if kind & 0x80 else length
         answer = struct.pack("<BBBBHHH", ep, request, kind, status, value, index, size) + data
-        self._later.append((time.monotonic() + self.slow_s, answer, ident))
+        self._later.append((self._clock.now_ns() + round(self.slow_s * 1e9), answer, ident))
 
     def _deliver(self) -> None:
         """Give the guest what is due."""
-        while self._later and self._later[0][0] <= time.monotonic():
+        while self._later and self._later[0][0] <= self._clock.now_ns():
             _, answer, ident = self._later.popleft()
             self._send(CONTROL, ident, answer)
         while self._waiting and self.halted:
             self._reply(self._waiting.popleft()[0], STALL, b"")
         while self._waiting and self.board and not self.silent:
             due_ns = self.board.due_ns()
-            if not self._again and (due_ns is None or due_ns > time.monotonic_ns()):
+            if not self._again and (due_ns is None or due_ns > self._clock.now_ns()):
                 return
             ident, _ = self._waiting.popleft()
             data = self._again.popleft() if self._again else self.mangle(self.board.take())
