@@ -198,6 +198,17 @@ def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: del
     assert wrong(points) == []
 
 
+def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_without(shop: delivery.Shop, work: Path):
+    """As a delivery: and at each moment what the box has of the label is signed, or it runs without it."""
+    played = ScenePlay(shop.learns("right"), work)
+    points = []
+    for moment in played.moments():
+        if moment.call and moment.call.name.startswith("rename"):
+            points.append((played.power if moment.call.paths[1].endswith("/current") else played.kill)(moment))
+    assert [point.states for point in points] == [1, 1, 4]
+    assert wrong(points) == []
+
+
 @pytest.mark.parametrize(
     ("way", "call", "what"),
     [

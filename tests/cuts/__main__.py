@@ -26,6 +26,7 @@ SCENES: dict[str, Callable[[Path], CutScene]] = {
     "palpate-record": lambda beside: recording.palpate(),
     "black-box": lambda beside: black_box.scene(),
     "delivery": lambda beside: delivery.Shop.opened(beside).scene(),
+    "enrolment": lambda beside: delivery.Shop.opened(beside).enrolment(),
 }
 """Each gets an empty folder for what it needs."""
 HOWS = ("kill", "power", "kill_then_power")

@@ -1,39 +1,55 @@
-"""Delivery, cut short. In: signed bundles that are copied to the box, taken, started, committed and left again. Out: a
-scene, whose judge finds each box that does not come back with the old bundle or the new one, whole.
+"""Delivery and enrolment, cut short. In: signed bundles that are copied to the box, taken, started, committed and left again,
+and labels that it learns. Out: scenes, whose judge finds each box that does not come back with the old bundle or the new one,
+whole.
 
 `python -m tests.cuts.delivery WAY ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is wrong on purpose.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from subprocess import run
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
 
 from appliance.bundle import bundle
 from appliance.bundle.manifest import SCHEMA
+from appliance.cli import commands
 from appliance.cli.main import main
 from appliance.core import storage
+from appliance.core.config import Config
 from appliance.deployment import signature
+from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.deployment.store import SHA
 from appliance.deployment.trial import Trial
 from tests.cuts.calls import DEADLINE_S, NotFollowed
 from tests.cuts.scene import CutScene, Found, SceneStep
+from tests.factories.install_scripts import enrolment_key
+from tests.factories.paths import ROOT
 
 STORE, INCOMING = "store", "store/incoming"
+ENROLMENT = "enrolment"
+"""Folder of the key of the box, beside the shop's bundles."""
 APART = re.compile(r"store/(incoming/.+|bundles/\.[^/]+/.+)")
 """What is copied, until it is installed, and what is in the folders that are not complete: nobody reads that."""
 PROBATION = 2
 """Sweeps."""
 ANSWER = re.compile(r"\$PPLP,RES,\d+,[\d.]+,(?:ok|unsure|undecided),(?:[^,]*,){6}([0-9a-f]{8}),")
-PROMISE = re.compile(r"bundle ([0-9a-f]{8}) (?:is installed; it )?runs (?:on trial )?from the next start on.*")
+PROMISE = re.compile(
+    r"bundle ([0-9a-f]{8}) (?:is installed; it )?runs (?:on trial )?from the next start on.*"
+    r"|palpate: installed: .*, ([0-9a-f]{8}), \d+ labels; it runs on trial from the next start on.*"
+)
 DIED = 3
+LABELS = ("cork", "felt")
+"""What the box learns, one after the other; each from a sweep of another simulated tube."""
 NAMES = ("packaged", "first", "second", "third", "fourth", "fifth", "last")
 START = ("run", "--sim", "skin", "--virtual", "--sweeps", "1")
 START_AND_COMMIT = (*START[:-1], str(PROBATION))
@@ -47,7 +63,8 @@ for path in sorted(old.iterdir()): (new / path.name).write_bytes(path.read_bytes
 
 @dataclass(frozen=True, slots=True)
 class Shop:
-    """What the box gets, in a folder beside it: bundles of these NAMES, one counter higher each, signed by one key."""
+    """What the box gets, in a folder beside it: bundles of these NAMES, one counter higher each, signed by one key. There lies
+    its own key for enrolments, too."""
 
     folder: Path
 
@@ -57,6 +74,7 @@ class Shop:
         key = folder / "key"
         run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", key], check=True)
         (folder / "signers").write_text(f"shop {key.with_suffix('.pub').read_text()}")
+        enrolment_key(folder / ENROLMENT)
         for counter, name in enumerate(NAMES[1:], 1):
             shutil.copytree(bundle.DEFAULT, folder / name)
             manifest = replace(bundle.load(folder / name).manifest, name=name, counter=counter, schema=SCHEMA).json()
@@ -72,14 +90,14 @@ class Shop:
         """A command of the box in `folder`. @: where bundles are copied to."""
         output = [str(word).replace("@", f"{folder / INCOMING}/") for word in words]
         where = f"store.folder={folder / STORE}", f"store.signers={self.folder / 'signers'}"
-        how = "store.status=", f"store.trial_sweeps={PROBATION}"
+        how = "store.status=", f"store.trial_sweeps={PROBATION}", f"store.enrolment_key={self.folder / ENROLMENT}"
         return output + [word for value in (*where, *how) for word in ("--set", value)]
 
-    def palpate(self, name: str, *words: str, way: str = "") -> SceneStep:
-        """A command of the box, in one of WAYS or as it is."""
+    def palpate(self, name: str, *words: str, way: str = "", code: int | None = None) -> SceneStep:
+        """A command of the box, in one of WAYS or as it is. code: how it ends, if not as its way does."""
         program = ["tests.cuts.delivery", way] if way else ["appliance"]
-        code = DIED if way == "crash" else 0
-        return SceneStep(name, lambda folder: [sys.executable, "-m", *program, *self.words(folder, *words)], code)
+        ends = code if code is not None else DIED if way == "crash" else 0
+        return SceneStep(name, lambda folder: [sys.executable, "-m", *program, *self.words(folder, *words)], ends)
 
     def copy(self, name: str) -> SceneStep:
         """Somebody copies a bundle to the box."""
@@ -116,22 +134,65 @@ class Shop:
 
     def scene(self) -> CutScene:
         """All steps, each command of which is cut short."""
-        return self._scene(_bare, list(self.steps()))
+        return self._scene("delivery", _bare, list(self.steps()))
+
+    def enrolment(self) -> CutScene:
+        """A box that runs the first bundle learns LABELS, one after the other, gives one up, and gets another bundle; each
+        command is cut short."""
+        return self._scene("enrolment", self._delivered, list(self._enrolments()), self._learned())
+
+    def enrols(self, label: str, way: str = "right") -> SceneStep:
+        """The box learns a label from a sweep of the simulated skin, and signs it."""
+        words = ("enrol", label, "--sweeps", "1", "--sim", "skin", "--virtual", "--seed", str(LABELS.index(label) + 1))
+        return self.palpate(f"enrol {label}", *words, way=way, code=0)
+
+    def learns(self, way: str) -> CutScene:
+        """Nothing but an enrolment, in one of WAYS, on a box that runs the first bundle."""
+        steps = [("first cork", self.enrols(LABELS[0], way))]
+        return self._scene("enrolment", self._delivered, steps, self._learned(LABELS[:1]))
+
+    def _enrolments(self) -> Iterator[tuple[str, SceneStep]]:
+        """As `steps`; a label stands for the bundle that ends with it."""
+        do = self.palpate
+        yield "first cork", self.enrols("cork")
+        yield "cork", do("start it and end in order", *START)
+        yield "cork", do("start and commit it", *START_AND_COMMIT)
+        yield "cork felt", self.enrols("felt")
+        yield "felt cork", do("roll back", "rollback")
+        yield "cork felt", do("roll forward", "rollback")
+        yield "felt", do("commit it by hand", "commit")
+        yield "felt", self.copy("second")
+        yield "felt second", do("install another", "install", "@second")
+
+    def _learned(self, labels: tuple[str, ...] = LABELS) -> dict[str, str]:
+        """The id that the bundle has with each of the labels: the same sweeps give the same bytes."""
+        with TemporaryDirectory() as aside:
+            self._delivered(folder := Path(aside))
+            ids = {}
+            for label in labels:
+                done = run(self.enrols(label).command(folder), cwd=ROOT, capture_output=True, text=True, check=False)
+                ids[label] = _promised(done.stdout + done.stderr)
+                if not ids[label]:
+                    raise NotFollowed(f"{label} cannot be enrolled: {_end(done.stdout + done.stderr)}")
+        return ids
 
     def alone(self, way: str) -> CutScene:
         """Nothing but an install, in one of WAYS, on a box that runs the first bundle."""
         step = self.palpate("install another", "install", str(self.at("second")), way=way)
-        return self._scene(self._delivered, [("first second", step)])
+        return self._scene("delivery", self._delivered, [("first second", step)])
 
-    def _scene(self, prepare: Callable[[Path], None], reported: list[tuple[str, SceneStep]]) -> CutScene:
+    def _scene(
+        self, name: str, prepare: Callable[[Path], None], reported: list[tuple[str, SceneStep]],
+        learned: Mapping[str, str] = MappingProxyType({}),
+    ) -> CutScene:  # fmt: skip
         may = {step.name: names.split() for names, step in reported}
-        ids = {name: bundle.load(self.at(name)).id for name in NAMES}
+        ids = {name: bundle.load(self.at(name)).id for name in NAMES} | learned
 
         def judge(found: Found) -> list[str]:
             ran = {found.heard} if found.heard else {ids[name] for name in may[found.step]}
             return self._comes_back(found.folder, ran) or self._takes_another(found.folder, ids["last"])
 
-        return CutScene("delivery", prepare, tuple(step for _, step in reported), judge, APART, _promised)
+        return CutScene(name, prepare, tuple(step for _, step in reported), judge, APART, _promised)
 
     def _delivered(self, folder: Path) -> None:
         """A box that runs the first bundle."""
@@ -171,7 +232,7 @@ def _bare(folder: Path) -> None:
 def _promised(output: str) -> str:
     """The bundle that is to run from the next start on, where the command that is cut has just said so."""
     reported = PROMISE.fullmatch(output.splitlines()[-1])
-    return reported[1] if reported else ""
+    return reported[1] or reported[2] if reported else ""
 
 
 def _end(output: str) -> str:
@@ -196,6 +257,11 @@ def _apart(words: list[str]) -> tuple[int, str]:
         return os.waitstatus_to_exitcode(status), file.read().decode("utf-8", "replace")
 
 
+def _signs(args: argparse.Namespace, settings: Config) -> EnrolmentKey:
+    """What a simulated skin taught is signed as what a real one did; the box itself refuses to."""
+    return EnrolmentKey(Path(settings.store.enrolment_key))
+
+
 def _gone_for_a_moment(path: Path, target: str) -> None:
     path.unlink(missing_ok=True)
     path.symlink_to(target)
@@ -212,5 +278,6 @@ WAYS: dict[str, tuple[object, str, Callable[..., object]]] = {
 
 
 if __name__ == "__main__":
+    commands._enrolment_key = _signs
     setattr(*WAYS[sys.argv[1]])
     sys.exit(main(sys.argv[2:]))
