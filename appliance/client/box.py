@@ -170,11 +170,12 @@ class Palpate:
         raise NoAnswer(f"no answer to a sweep within {timeout_s:g} s; {self._why_silent()}")
 
     def ask(self, name: str, *texts: str, timeout_s: float | None = None) -> list[str]:
-        """Send a command; the fields of its answer.
+        """Send a command; the fields of its answer. What follows a comma in `name` is taken as the first of `texts`.
 
         Raises CommandRefused with the box's reason, NoAnswer if it does not answer in time, LinkLost if the line is not
         open or is lost.
         """
+        name, *given = name.split(",")  # as a person writes it: the box answers under the name alone
         wait_s = self._timeout_s if timeout_s is None else timeout_s
         end_ns = self._end_ns(wait_s)
         if not self._asking.acquire(timeout=max(0.0, wait_s)):
@@ -183,7 +184,7 @@ class Palpate:
             with self._news:
                 self._replies.clear()
                 losses = self._line.losses
-            self._line.write(sentence(name, *texts))
+            self._line.write(sentence(name, *given, *texts))
             with self._news:
                 while True:
                     self._news.wait_for(

@@ -55,6 +55,12 @@ def test_a_sweep_by_command(speaking: SpeakingBox, box: Palpate):
     assert all(s.summed for s in speaking.heard)
 
 
+def test_a_command_is_asked_in_one_text_or_in_several(box: Palpate):
+    """As it stands in a sentence, or each field by itself: the box answers under its first word."""
+    assert box.ask("LABEL,1") == box.ask("LABEL", "1")
+    assert box.ask("LABEL,1")[:2] == ["1", LABELS[0]]
+
+
 def test_what_the_box_is(box: Palpate):
     """State, identity, labels and tare."""
     assert box.state().frames == 3000
