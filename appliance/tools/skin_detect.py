@@ -99,7 +99,8 @@ def _on_port(
     for name, p in others.items():
         if taxels := other_grid(p, heard[p.baud]):
             grid = f"the marks of {name}, but {taxels} taxels a frame; set sensor.grid to their rows x columns"
-            yield PortFinding(port, name, f'{known}{grid}, sensor.skin = "{name}", sensor.port = "{port.path}"')
+            own = "if it is another skin, describe it with `palpate skin new`"
+            yield PortFinding(port, name, f'{known}{grid}, sensor.skin = "{name}", sensor.port = "{port.path}"; {own}')
             return
     if write and (who := _asked(port.path, open_port, clock)):
         yield PortFinding(port, DEFAULT, f'{known}{who}; set sensor.link = "serial", sensor.port = "{port.path}"')

@@ -56,6 +56,7 @@ def test_another_grid_of_a_known_skin():
     port = WirePort(clock, lambda i: b"\xaa\x55" + bytes((i + k) % 160 for k in range(384)), 1e7)
     found = found_on(port, clock)
     assert "384 taxels a frame; set sensor.grid" in found.detail
+    assert "if it is another skin, describe it with `palpate skin new`" in found.detail
     assert found.profile in ("flexitac", "matrix")
 
 
