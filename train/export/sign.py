@@ -24,6 +24,11 @@ def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
     bundle is incomplete or has no counter yet, and ConfigError where `key` does not sign.
     """
     loaded = bundle.load(folder)
+    if counter is not None and counter < (had := loaded.manifest.counter):
+        raise BundleError(
+            f"{folder} has counter {had} already, and a box that has committed that takes no {counter}; "
+            f"use --counter {had + 1}, or export the bundle again"
+        )
     held = _with_labels(loaded) if loaded.added else {}
     entries = {name: bundle.file_entry(data) for name, data in held.items()}
     manifest = replace(loaded.manifest, files=loaded.manifest.files | entries)

@@ -172,6 +172,10 @@ def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.Captu
         assert Manifest.parse(text) == made
         assert made.counter == (counter if again else 7)
         assert signature.verify(text, (folder / bundle.SIGNATURE).read_bytes(), signers.file) == SIGNER
+    text = (folder / bundle.MANIFEST).read_bytes()
+    with pytest.raises(BundleError, match=r"has counter 9 already, .* takes no 8; use --counter 10, or export"):
+        sign.sign(folder, signers.ours, 8)
+    assert (folder / bundle.MANIFEST).read_bytes() == text
     bundle.load(folder)
     (folder / bundle.MODEL).write_bytes(b"altered")
     with pytest.raises(BundleError, match="was altered"):
