@@ -46,7 +46,8 @@ class BundleScore:
     groups [n] that the interval resamples, and their name; None, "" where sweeps are independent. answered: of each
     material the answers and their counts: a label, or a status in parentheses. statuses: counts.
     unsure_right: answers that were unsure but named the material. recordings: right ones of those with several sweeps,
-    fused; None where there are none. foreign: as `answered`, of materials that the bundle does not have.
+    fused; None where there are none. foreign: as `answered`, of materials that the bundle does not have. moved: what the
+    box says of the sweeps whose contact lies outside the trained positions, each with its count.
     """
 
     about: dict[str, str]
@@ -59,6 +60,7 @@ class BundleScore:
     unsure_right: int
     recordings: Array | None
     foreign: dict[str, Counter[str]]
+    moved: Counter[str]
 
     def json(self) -> dict[str, Any]:
         """The figures for scripts, with where they come from."""
@@ -67,6 +69,7 @@ class BundleScore:
             "named_rightly": Score.of(self.right).json() | {"interval": interval(self.right, self.clusters)},
             "interval_by": self.by, "statuses": self.statuses, "unsure_right": self.unsure_right,
             "answers": self.answered, "not_in_the_bundle": self.foreign,
+            "moved": self.moved.total(),
         }  # fmt: skip
         if self.recordings is not None:
             result["recordings"] = Score.of(self.recordings).json() | {"interval": interval(self.recordings)}
@@ -85,6 +88,12 @@ class BundleScore:
         sure = f" ({self.unsure_right} of them with the right label)" if self.statuses[Status.UNSURE] else ""
         counts = [f"{status} {n}{sure * (status == Status.UNSURE)}" for status, n in self.statuses.most_common()]
         lines.append(f"answers: {', '.join(counts)}")
+        if self.moved:
+            most = self.moved.most_common(1)[0][0]
+            lines.append(
+                f"outside the trained positions: {self.moved.total()} sweeps, most often {most}; "
+                "record there, too, or align the skin"
+            )
         wide = max(map(len, (*self.answered, *self.foreign)))
         for material, given in self.answered.items():
             others = ", ".join(f"{answer} {n}" for answer, n in given.most_common() if answer != material)
@@ -113,11 +122,12 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
     known = np.isin(material, manifest.labels)
     given = np.empty(len(sweeps), object)
     statuses: Counter[str] = Counter()
-    hinted = 0
+    hinted, moved = 0, Counter[str]()
     for i, verdict in answers(classifier, sweeps):
         statuses[str(verdict.status)] += 1
         given[i] = verdict.label if verdict.status is Status.OK else f"({verdict.status})"
         hinted += verdict.status is Status.UNSURE and verdict.label == material[i]
+        moved.update([verdict.moved] if verdict.moved else [])
     clusters, by = _clusters(sweeps)
     return BundleScore(
         {"name": manifest.name, "version": manifest.version, "id": classifier.bundle.id}, sweeps,
@@ -125,6 +135,7 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
         {name: Counter(given[material == name].tolist()) for name in present if name in manifest.labels},
         statuses, hinted, _recordings(classifier, sweeps.take(known)),
         {name: Counter(given[material == name].tolist()) for name in present if name not in manifest.labels},
+        moved,
     )  # fmt: skip
 
 

@@ -113,3 +113,19 @@ def test_the_command_prints_and_writes_what_it_found(tmp_path: Path, capsys: pyt
     assert "no material is called 'Q'" in capsys.readouterr().err
     assert main(["score", str(tmp_path / "none"), *args[2:]]) != 0
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_sweeps_outside_the_trained_positions_are_told(classifier: Classifier, monkeypatch: pytest.MonkeyPatch):
+    """How many the box calls moved, the most frequent of its words for them, and what to do; nothing where there are none."""
+    s = sweeps(*HERE, (0, 0), labels=[0, 1, 2, 0])
+    assert "trained positions" not in bundle_score.score(classifier, s).text()
+    given = bundle_score.answers
+    words = {0: "moved 2.1 mm too far towards row 6", 2: "moved 2.1 mm too far towards row 6", 3: "moved 1.9 mm"}
+    monkeypatch.setattr(
+        bundle_score, "answers",
+        lambda *args, **more: ((i, replace(verdict, moved=words.get(i, ""))) for i, verdict in given(*args, **more)),
+    )  # fmt: skip
+    found = bundle_score.score(classifier, s)
+    assert found.json()["moved"] == 3
+    told = "outside the trained positions: 3 sweeps, most often moved 2.1 mm too far towards row 6; record there, too, or align the skin"
+    assert told in found.text().splitlines()
