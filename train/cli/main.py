@@ -43,7 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as e:
-        print(f"palpate-train: {e.filename}: {e.strerror}", file=sys.stderr)
+        # one of a library may name neither file nor cause
+        print(f"palpate-train: {e if e.filename is None else f'{e.filename}: {e.strerror}'}", file=sys.stderr)
         return ApplianceError.exit_code
     except KeyboardInterrupt:
         kept = "goes on where it was" if getattr(args, "resumes", hasattr(args, "cache")) else "begins anew"

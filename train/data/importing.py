@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.types import DATA_TYPES
-from train.data import labels, raw_files, sampling
+from train.data import labels, raw_files, readers, sampling
 from train.data.file_names import NamePattern, group
 from train.data.progress import Progress
 from train.data.raw_files import Table
@@ -153,6 +153,7 @@ def _named(folder: Path, plan: ImportPlan, left_out: list[LeftOut]) -> dict[str,
     """The fields of each file whose name fits the pattern, by its path below `folder`; materials are renamed."""
     if not folder.is_dir():
         raise FormatError(f"{folder} is no folder; name one that holds the recordings")
+    readers.check_folder(folder)
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = [name for path in paths if not (name := path.relative_to(folder).as_posix()).startswith(".")]
     found: dict[str, dict[str, str]] = {}

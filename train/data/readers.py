@@ -92,6 +92,10 @@ def read(path: Path, kind: type[Set]) -> Set:
         )
     if path.is_dir():
         return recordings(path, kind)
+    try:
+        path.open("rb").close()
+    except OSError as e:
+        raise FormatError(f"{path.name}: not a sweep set: the file cannot be read: {e.strerror}") from e
     if path.suffix in HDF5 or h5py.is_hdf5(path):
         return hdf5(path, kind)
     if path.suffix.lower() in FRAMES:
@@ -173,14 +177,19 @@ def recorded(folder: Path) -> list[RecordedSweep]:
 
     Raises FormatError naming the file that is broken, or the folder where it may not be read or holds no recorded sweep.
     """
-    try:
-        next(folder.iterdir(), None)
-    except OSError as e:
-        raise FormatError(f"{folder}: not a sweep set: the folder cannot be read: {e.strerror}") from e
+    check_folder(folder)
     paths = sorted(folder.rglob("*.npy"))
     if not any(path.with_suffix(".json").exists() for path in paths):
         raise FormatError(f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_instead(folder)}")
     return [RecordedSweep.load(path) for path in paths]
+
+
+def check_folder(folder: Path) -> None:
+    """Raises FormatError where what is in the folder may not be seen: a search in it would find nothing, without a word."""
+    try:
+        next(folder.iterdir(), None)
+    except OSError as e:
+        raise FormatError(f"{folder}: not a sweep set: the folder cannot be read: {e.strerror}") from e
 
 
 def _instead(folder: Path) -> str:

@@ -120,3 +120,17 @@ def test_real_sweeps_come_back_from_csv(tmp_path: Path):
     for group in ("force", "speed"):
         np.testing.assert_array_equal(made.groups[group][order], real.groups[group])
     assert [made.materials[k] for k in made.labels[order]] == [real.materials[k] for k in real.labels]
+
+
+def test_a_folder_that_may_not_be_read_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The cause, not that it is empty."""
+
+    def denied(self: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    out = str(tmp_path / "x.npz")
+    assert main(["import", str(tmp_path), "--pattern", "{material}.csv", "--rate", "100", "--out", out]) == 65
+    assert "the folder cannot be read: Permission denied" in capsys.readouterr().err

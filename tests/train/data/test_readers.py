@@ -414,3 +414,16 @@ def test_a_folder_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Path, "iterdir", denied)
     with pytest.raises(FormatError, match="the folder cannot be read: Permission denied"):
         sets.load(str(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.data"])
+def test_a_file_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str):
+    """The cause, before any library looks into it with words of its own."""
+    file = Path(write(tmp_path / "a.npz")).rename(tmp_path / name)
+
+    def denied(self: Path, mode: str = "r") -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "open", denied)
+    with pytest.raises(FormatError, match=rf"{name}: not a sweep set: the file cannot be read: Permission denied"):
+        sets.load(str(file))
