@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from appliance.bundle.bundle import Known, Moved
-from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
 from train.calibration import early_exit, novelty
 from train.calibration.early_exit import EarlyRule, Heads
@@ -29,6 +28,7 @@ from train.models.compact.augment import Augmentation
 from train.models.compact.copies import COPIES, copies
 from train.models.compact.fitted import Fit
 from train.models.compact.heads import HeadPart, HeadPlan
+from train.models.linear_head import hold_out
 from train.onnx_tools.graph_builder import joined, run
 from train.onnx_tools.quantize import sixteen_bits
 
@@ -147,7 +147,7 @@ def posthoc_inputs(fit: Fit) -> PosthocInputs:
     augmented copies of the first two. Raises FormatError where none was held out: nothing could judge."""
     train, held, by = fit.train, fit.held, fit.about["held_out_by"]
     if by == "nothing":
-        raise FormatError(f"{train.source}: too few groups to hold some out; record more positions")
+        hold_out(train, fit.about["seed"])  # says why
     trunk, features, seed = fit.trunk(), [], fit.about["seed"]
     some = train.take(np.random.default_rng(seed + DISTURBED_SEED).permutation(len(train))[::ONE_IN])
     (disturbed,) = copies(some, DISTURBED, seed + DISTURBED_SEED, 1)

@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import shlex
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -25,7 +24,6 @@ from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import labels
 from train.data.sets import Dataset, digest
-from train.data.summary import warnings_of
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
 from train.export import bundle_score, measure, pack, quantized_bundle
@@ -34,6 +32,7 @@ from train.models.compact import recipe
 from train.models.compact.architectures import ARCHITECTURES
 from train.models.compact.augment import Augmentation, default_augmentation
 from train.models.compact.fitted import Fit
+from train.models.linear_head import hold_out
 
 STEPS = recipe.Settings().steps
 LEAST_STEPS = 2
@@ -136,8 +135,6 @@ def run_fit(args: argparse.Namespace) -> None:
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}")
     sweeps, rest = labels.check(options.load(args, args.seed)), None
-    for line in warnings_of(sweeps):
-        print(f"palpate-train: {line}", file=sys.stderr)
     if args.split:
         by, share = _by_share(args.split)
         sweeps, rest = sweeps.split(by, share, args.seed)
@@ -195,6 +192,12 @@ def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augment
 
 def _print_held_out(made: Fit) -> None:
     """The accuracy on the sweeps that judged the fit, and how they differ from those of --rest."""
+    if made.about["held_out_by"] == "nothing":
+        try:
+            hold_out(made.train, made.about["seed"])
+        except FormatError as e:
+            print(f"nothing was held out that could judge the model, so export will refuse it: {e}")
+        return
     by = f"held-out {made.about['held_out_by']}"
     print(
         f"{by}: sweeps of this set, by heads that did not see them; they helped to choose the model, so expect less of it"

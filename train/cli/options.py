@@ -17,6 +17,7 @@ from appliance.core.errors import FormatError
 from train.cli import numbers
 from train.data import labels, sets
 from train.data.progress import ProgressLine
+from train.data.summary import warnings_of
 from train.evaluation import evaluate
 from train.models import methods
 
@@ -88,11 +89,18 @@ def writable_file(path: Path, option: str = "--out") -> None:
 
 
 def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
-    """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated ones that name none."""
+    """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated ones that name none.
+
+    Warns of materials without a sweep, which are left out, and of taxels that never change.
+    """
     pairs = labels.renames(args.rename)
     loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
     labels.check_known(pairs, (name for sweeps in loaded for name in sweeps.materials))
-    return sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded]).select(args.only)
+    whole = sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded])
+    part = whole.select(args.only)
+    for line in warnings_of(part if args.only else whole):
+        print(f"palpate-train: {line}", file=sys.stderr)
+    return part
 
 
 def report_line(what: Path, sweeps: str = "") -> str:

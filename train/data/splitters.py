@@ -30,8 +30,8 @@ SPLIT = re.compile(r"split:(\w+)=(-?\d+(?:,-?\d+)*)->(-?\d+(?:,-?\d+)*)")
 class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn ships no types
     """Whole recordings divided into `folds` parts at random, materials in equal shares: the paper's overestimate."""
 
-    def __init__(self, folds: int, seed: int) -> None:
-        self.folds, self.seed = folds, seed
+    def __init__(self, folds: int, seed: int, materials: Sequence[str]) -> None:
+        self.folds, self.seed, self.materials = folds, seed, materials
 
     def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
         """How many folds there are."""
@@ -45,11 +45,11 @@ class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn shi
         for label in np.unique(y):
             if (n := len(np.unique(groups[y == label]))) < 2:
                 raise FormatError(
-                    f"material {label} has one recording; record two of each or more, to test on one of them"
+                    f"material {self.materials[label]!r} has one recording; record two of each or more, to test on one"
                 )
             if n < self.folds:
                 raise FormatError(
-                    f"random:{self.folds} needs {self.folds} recordings of each material; material {label} has {n}: "
+                    f"random:{self.folds} needs {self.folds} recordings of each material; {self.materials[label]!r} has {n}: "
                     f"use random:{n} or less"
                 )
         yield from StratifiedGroupKFold(self.folds, shuffle=True, random_state=self.seed).split(y, y, groups)
@@ -113,7 +113,7 @@ class Protocol:
     def splitter(self, sweeps: Dataset, seed: int) -> BaseCrossValidator:
         """The scikit-learn splitter for `sweeps`; seed: of random folds. Raises FormatError for an unknown group."""
         if found := RANDOM.fullmatch(self.text):
-            return RandomFolds(int(found[1]), seed)
+            return RandomFolds(int(found[1]), seed, sweeps.materials)
         if found := LEAVE.fullmatch(self.text):
             return LeaveOneGroupOut(found[1], sweeps.group(found[1]))
         found = SPLIT.fullmatch(self.text)

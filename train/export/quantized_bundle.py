@@ -24,6 +24,7 @@ from train.metrics.score import provenance
 from train.models.compact import graph, recipe
 from train.models.compact.bank import LEAST_FILTERS, Bank
 from train.models.compact.fitted import Fit
+from train.models.linear_head import hold_out
 from train.models.methods import model_inputs
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import with_head
@@ -55,6 +56,8 @@ def export(
 ) -> bundle.Manifest:  # fmt: skip
     """Quantize `fit`, check it, and pack it; see pack.pack. Where int8 differs too much the bundle holds the float form, and
     `made` says why. Raises ExportRefused where another check fails."""
+    if fit.about["held_out_by"] == "nothing":
+        hold_out(fit.train, fit.about["seed"])  # says why: no sweep is left that could judge the bundle
     reference, model = graphs(fit)
     about = (
         fit.about

@@ -178,3 +178,57 @@ def test_signing_does_without_the_imports_of_training():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "usage: palpate-train sign" in done.stdout
     assert not {"sklearn", "scipy", "torch", "onnx", "pandas", "matplotlib"} & {*done.stdout.split()}
+
+
+def few(tmp_path: Path) -> Path:
+    """A set in which one material has a single recording, one none, and one taxel never changes."""
+    whole = easy(6)
+    held = whole.take((whole.labels < 2) | (np.arange(len(whole)) == 12))
+    held.samples[:, :, 0, 1] = 7
+    replace(held, materials=(*held.materials, "ghost")).save(file := tmp_path / "few.npz")
+    return file
+
+
+@pytest.mark.parametrize("only", [[], ["--only", "material=low,middle"]])
+def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], only: list[str]
+):
+    """Materials without a sweep, which are left out, and taxels that never change; materials that --only leaves out are
+    meant."""
+    args = ["evaluate", "--set", str(few(tmp_path)), "--method", "L-svm", "--protocol", "leave:speed", "--jobs", "1"]
+    assert main([*args, "--cache", str(tmp_path), *only]) == 0
+    err = capsys.readouterr().err
+    assert "warning: taxels that never change in any sweep: 1.2;" in err
+    assert ("warning: materials without a sweep: ghost;" in err) == (not only)
+
+
+def test_a_material_of_one_recording_is_told_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """By fit, which has nothing to judge with; by export, which refuses such a fit; by evaluate."""
+    args = ["--set", str(few(tmp_path)), "--only", "material=low,high"]
+    why = "split by 'recording' leaves one sweep of 'high'; record more of it"
+    fit = str(tmp_path / "fit.npz")
+    assert main(["fit", *args, "--seed", "1", "--steps", "0", "--out", fit]) == 0
+    assert (
+        f"nothing was held out that could judge the model, so export will refuse it: few.npz: {why}"
+        in capsys.readouterr().out
+    )
+    assert main(["export", fit, "--out", str(tmp_path / "b"), "--name", "b", "--version", "1"]) == 65
+    assert why in capsys.readouterr().err
+    assert main(["evaluate", *args, "--method", "L-svm", "--protocol", "random:2"]) == 65
+    assert "material 'high' has one recording" in capsys.readouterr().err
+    assert main(["evaluate", "--set", str(tmp_path / "few.npz"), "--only", "material=low,middle",
+                 "--method", "L-svm", "--protocol", "random:9"]) == 65  # fmt: skip
+    assert "'low' has 6: use random:6 or less" in capsys.readouterr().err
+
+
+def test_an_error_of_a_library_without_a_file_is_told_in_its_words(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Not as "None: None"."""
+
+    def fails(*args: object) -> None:
+        raise OSError("the disk is on fire")
+
+    monkeypatch.setattr(sets, "load", fails)
+    assert main(["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H"]) == 1
+    assert capsys.readouterr().err == "palpate-train: the disk is on fire\n"

@@ -84,7 +84,7 @@ def test_scikit_learn_takes_them_as_splitters(text: str):
 
 def test_a_material_of_one_recording_needs_more():
     """No number of folds would help; the message does not name one."""
-    with pytest.raises(FormatError, match=r"^material 1 has one recording; record two of each or more"):
+    with pytest.raises(FormatError, match=r"^material 'b' has one recording; record two of each or more"):
         Protocol("random:2").folds(a_set([0, 0, 1]), 1)
 
 
@@ -93,7 +93,7 @@ def test_a_material_of_one_recording_needs_more():
     [
         ("loo", "cannot be read; use random:FOLDS"),
         ("random:1", "too few folds"),
-        ("random:4", "needs 4 recordings of each material; material 0 has 3: use random:3 or less"),
+        ("random:4", "needs 4 recordings of each material; 'a' has 3: use random:3 or less"),
         ("leave:speed", "no group 'speed'; it has one, position, recording"),
         ("leave:one", "all sweeps have 7"),
         ("split:position=0->9", "has no 9; it has 0, 1, 2"),
