@@ -58,6 +58,7 @@ REMEDIES = (
     ("host key", "if the box was set up anew, forget its old key: ssh-keygen -R HOST"),
     ("Could not resolve", "check the name, or use the address"),
     ("Could not connect", "check the address, and that the box is on: ssh USER@HOST must get in"),
+    ("SSH", "what answers there is no ssh, or too busy for it: ssh USER@HOST must get in"),
 )  # fmt: skip
 """Words in what a box or the way to it says, and what to do then; the first that fits."""
 

@@ -132,6 +132,8 @@ class ContactTracker:
             hint = "this bundle does not say where the skin sat in training; export it again"
             if self._expected.bundle == NO_BUNDLE:
                 hint = "no bundle fits this skin, so there is no trained position; palpate record needs none"
+            elif self._expected.contact is None:
+                hint = "this bundle cannot tell contact, so it has no trained position; train one on sweeps of palpate record"
             return self._view("no-positions", "the contact's centre alone", hint, **shown, centre=found)
         offset = place.offset(found)
         at = found[0] * place.pitch_mm, found[1] * place.pitch_mm

@@ -90,7 +90,10 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
         except OSError as e:
             raise LineError(f"cannot list the gpio lines of {path}: {e}; see the kernel log (dmesg)") from e
     if not chips and not denied:
-        raise LineError("this machine has no /dev/gpiochip*; load the driver of its gpio chip or plug in one on USB")
+        raise LineError(
+            "this machine has no /dev/gpiochip*; load the driver of its gpio chip or plug in one on USB; "
+            "without lines leave `board` out and set trigger.mode to serial, key or timed"
+        )
     return places, denied
 
 

@@ -412,6 +412,7 @@ def test_boxes_that_fail_do_not_stop_the_others(site: hosts.Hosts, host: hosts.H
     assert "is READY" in lines["good"]
     assert lines["refuses"].startswith("FAILED: cannot be reached: Could not connect")
     assert lines["dumb"].startswith("FAILED: cannot be reached: SSH error")
+    assert "what answers there is no ssh, or too busy for it: ssh USER@HOST must get in" in lines["dumb"]
     assert lines["bare"].startswith("FAILED: asking for its settings: no Palpate is installed there")
     assert lines["hangs"].startswith("FAILED: ")
     assert "no answer within" in lines["hangs"] or "not done within 40 s" in lines["hangs"]

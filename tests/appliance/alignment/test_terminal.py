@@ -119,7 +119,9 @@ def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
     without = replace(model, manifest=replace(m, place=None, moved=None, thresholds=limits))
     last = [v for v in views_of(resting(), without)(14.5) if v.centre][-1]
     assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
-    assert "export it again" in last.hint
+    assert last.hint == (
+        "this bundle cannot tell contact, so it has no trained position; train one on sweeps of palpate record"
+    )
 
 
 def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
