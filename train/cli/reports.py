@@ -44,15 +44,7 @@ def register(add: Add) -> None:
     """reports, figures, paper, chart, development, fabrics, matrix, overview, report."""
     _add_reports(add)
     add("figures", run_figures, "write the figures of results into README, manual and pages")
-    paper = add("paper", run_paper, "run the paper's experiment on the simulated skin and write a page about it")
-    paper.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
-    paper.add_argument(
-        "--quick", action="store_true", help="small sets, hardly trained: to try everything out, not for figures"
-    )
-    paper.add_argument("--draw", action="store_true", help="run nothing: draw the page of results.json in --out again")
-    paper.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
-    paper.add_argument("--method", metavar="NAME[,NAME...]",
-                       help="run these; all others stay as results.json in --out has them (all)")  # fmt: skip
+    paper = _add_paper(add)
     chart = add("chart", run_chart, "chart accuracy against cost: every method as a bundle, timed as on the box")
     chart.add_argument("--out", type=Path, default=Path("docs/chart"), metavar="DIR", help="where it goes (docs/chart)")
     chart.add_argument(
@@ -67,20 +59,7 @@ def register(add: Add) -> None:
                      help="results.json of palpate-train certainty, for the touch time of its method")  # fmt: skip
     _add_report(add)
     development = _add_development(add)
-    fabrics = add(
-        "fabrics", run_fabrics, "evaluate methods on real fabrics with a condition left out, and write a page about it"
-    )
-    fabrics.add_argument(
-        "--out", type=Path, default=Path("docs/fabricslide"), metavar="DIR", help="where it goes (docs/fabricslide)"
-    )
-    fabrics.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
-                         help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
-    fabrics.add_argument("--method", default="all", metavar="NAME[,NAME...]",
-                         help="run these; all others stay as results.json in --out has them (all)")  # fmt: skip
-    fabrics.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
-    fabrics.add_argument(
-        "--draw", action="store_true", help="run nothing: draw the page of results.json in --out again"
-    )
+    fabrics = _add_fabrics(add)
     for command in (paper, chart, development, fabrics):
         options.add_effort(command)
         options.add_where(command)
@@ -95,6 +74,39 @@ def register(add: Add) -> None:
         "--out", type=Path, default=Path("docs/overview.svg"), metavar="FILE.svg", help="(docs/overview.svg)"
     )
     overview.add_argument("--material", default="wood", metavar="NAME", help="of the tube (wood)")
+
+
+def _add_fabrics(add: Add) -> argparse.ArgumentParser:
+    """fabrics."""
+    fabrics = add(
+        "fabrics", run_fabrics, "evaluate methods on real fabrics with a condition left out, and write a page about it"
+    )
+    fabrics.add_argument(
+        "--out", type=Path, default=Path("docs/fabricslide"), metavar="DIR", help="where it goes (docs/fabricslide)"
+    )
+    fabrics.add_argument("--data", type=Path, default=os.environ.get("PALPATE_DATA"), metavar="DIR",
+                         help="folder of real sweeps (PALPATE_DATA)")  # fmt: skip
+    fabrics.add_argument("--method", default="all", metavar="NAME[,NAME...]",
+                         help="run these; all others stay as results.json in --out has them (all)")  # fmt: skip
+    fabrics.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
+    fabrics.add_argument(
+        "--draw", action="store_true", help="run nothing: draw the page of results.json in --out again"
+    )
+    return fabrics
+
+
+def _add_paper(add: Add) -> argparse.ArgumentParser:
+    """paper."""
+    paper = add("paper", run_paper, "run the paper's experiment on the simulated skin and write a page about it")
+    paper.add_argument("--out", type=Path, default=Path("docs/paper"), metavar="DIR", help="where it goes (docs/paper)")
+    paper.add_argument(
+        "--quick", action="store_true", help="small sets, hardly trained: to try everything out, not for figures"
+    )
+    paper.add_argument("--draw", action="store_true", help="run nothing: draw the page of results.json in --out again")
+    paper.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
+    paper.add_argument("--method", metavar="NAME[,NAME...]",
+                       help="run these; all others stay as results.json in --out has them (all)")  # fmt: skip
+    return paper
 
 
 def _add_reports(add: Add) -> None:
