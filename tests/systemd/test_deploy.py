@@ -54,6 +54,7 @@ def installed(site: hosts.Hosts, wheel: Path) -> str:
         "--signers", site.work / "signers", inside=site.hosts[0],
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
+    assert "No host key for 127.0.0.1 found in known_hosts, accepting" in done.stderr  # told, not taken in silence
     return done.stdout
 
 

@@ -27,9 +27,13 @@ def five() -> list[list[str]]:
 
 @pytest.mark.slow
 def test_the_five_commands_of_the_page_make_a_bundle(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ):
-    """As they stand there, on simulated sweeps written as CSV: the sweeps come back, and most of the rest is named."""
+    """As they stand there, on simulated sweeps written as CSV: the sweeps come back, most of the rest is named, and no
+    library says a word."""
     monkeypatch.chdir(tmp_path)
     folder = csv_folder(tmp_path / "recordings", each=3, positions=6)
     assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in PAGE
@@ -43,7 +47,8 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     expected = samples[(labels < 3) & (position < 6)]
     assert len(made) == len(expected) == 54
     assert {s.tobytes() for s in made.samples} == {s.tobytes() for s in expected}
-    out = capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert [*caplog.messages, *re.findall(".*[Ww]arning.*|.*Gemm.*", err)] == []
     assert "they helped to choose the model" in out
     assert "which no part of the fit has seen; after export: palpate-train score BUNDLE --set build/rest.npz\n" in out
     assert f"what it names of the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
