@@ -44,9 +44,12 @@ def run(args: argparse.Namespace) -> None:
     page = args.page or args.out.with_name(f"{args.out.name}-why")
     options.writable(page / "choice.json", "--page")
     requested = scene.read(args.scene)
-    sweeps, log = requested.sweeps(), options.Log()
-    choice = select.choose(sweeps, requested, options.effort(args), options.where(args), log)
-    curves, change, accuracy = reduction_curves.curves(choice, requested, log)
+    sweeps = requested.sweeps()
+    choice = select.choose(
+        sweeps, requested, options.effort(args), options.where(args), options.Log(),
+        lambda trials: reduction_curves.most(trials, requested.reduce),
+    )  # fmt: skip
+    curves, change, accuracy = reduction_curves.curves(choice, requested)
     result = choice.json(requested) | {"less": curves, "applied": asdict(change), "left": accuracy}
     result["bundle"] = _packed(args, requested, sweeps, result, change)
     result |= _origin(args, requested, sweeps)

@@ -32,6 +32,10 @@ class Progress:
         self._total, self._log, self._clock = total, log, clock
         self._start, self.done = clock(), 0
 
+    def left(self, most: int) -> None:
+        """So many tasks are left at most: the total, where it is found out on the way."""
+        self._total = self.done + most
+
     def __call__(self, what: str) -> None:
         """One more task is done: `what`."""
         self.done += 1

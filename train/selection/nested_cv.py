@@ -7,7 +7,7 @@ is held out, and the other way round.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
@@ -18,10 +18,11 @@ from scipy.stats import t as student
 
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import softmax
+from train.data.progress import Progress
 from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol
 from train.data.transforms import WHOLE, Change
-from train.evaluation import corruptions, parallel
+from train.evaluation import corruptions
 from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Where, folds
 from train.evaluation.fold import Fold, FoldTask
@@ -106,13 +107,12 @@ class Difference:
 class Trials:
     """Trains and tests on a scene's sweeps, each training once. sweeps: as recorded; asked: with the corrupted ones too.
 
-    conditions: names of the corruptions of the test sweeps, of which each counts the same; the first is none.
+    conditions: names of the corruptions of the test sweeps, of which each counts the same; the first is none. progress:
+    counts the trainings.
     """
 
-    def __init__(
-        self, sweeps: Dataset, scene: Scene, effort: methods.Effort, where: Where, log: Callable[[str], None]
-    ) -> None:
-        self.sweeps, self._effort, self._where, self._log = sweeps, effort, where, log
+    def __init__(self, sweeps: Dataset, scene: Scene, effort: methods.Effort, where: Where, progress: Progress) -> None:
+        self.sweeps, self._effort, self._where, self.progress = sweeps, effort, where, progress
         self.seeds = range(1, scene.seeds + 1)
         self.parts = parts(sweeps, scene.varies, scene.folds)
         self.groups = list(dict.fromkeys(part.group for part in self.parts))
@@ -127,6 +127,11 @@ class Trials:
         )  # fmt: skip
         self._done: dict[Any, Fold] = {}
 
+    @property
+    def most(self) -> int:
+        """The trainings that a method takes at most: without each part, and without each two."""
+        return len(self.seeds) * (len(self.parts) + len(self.pairs()))
+
     def pairs(self) -> list[Unseen]:
         """All pairs of parts without which two materials are left to train on."""
         every = combinations(range(len(self.parts)), 2)
@@ -139,7 +144,6 @@ class Trials:
         left = [(method, c, s, u) for u, c in zip(what, changes, strict=True) for s in self.seeds
                 if (method, c, s, u) not in self._done]  # fmt: skip
         (known,) = methods.find([method], self._effort)
-        progress = parallel.Progress(len(left), self._log)
         for change in dict.fromkeys(name[1] for name in left):
             changed = change.of(self.asked)
             tasks = {
@@ -149,7 +153,7 @@ class Trials:
             }
             for name, fold in folds(tasks, changed, digest(changed), known.input, self._where):
                 self._done[name] = fold
-                progress(f"{method}{'' if change == WHOLE else f', {change}'}")
+                self.progress(f"{method}{'' if change == WHOLE else f', {change}'}")
         for name in ((method, c, s, u) for u, c in zip(what, changes, strict=True) for s in self.seeds):
             if self._done[name].refused:
                 raise Refused(self._done[name].refused)

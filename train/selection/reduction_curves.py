@@ -6,7 +6,7 @@ by sweep. Kept is the strongest reduction for which it, and every weaker one, lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from train.data import transforms
-from train.data.progress import Progress
 from train.data.transforms import WHOLE, Change
 from train.selection.nested_cv import Trials
 from train.selection.scene import Scene
@@ -37,13 +36,19 @@ HOW_TO_SET = {
 }
 
 
-def curves(choice: Selection, scene: Scene, log: Callable[[str], None]) -> tuple[list[Json], Change, Json]:
+def most(trials: Trials, kinds: Collection[str]) -> int:
+    """The trainings that the curves of these kinds, and what is applied of them together, take at most."""
+    taxels = trials.sweeps.format.rows * trials.sweeps.format.cols
+    points = {"window": len(WINDOWS), "rate": len(RATES), "bits": len(BITS), "taxels": (taxels - 1).bit_length()}
+    return sum(1 + points[kind] for kind in kinds if kind in points) * len(trials.parts) * len(trials.seeds)
+
+
+def curves(choice: Selection, scene: Scene) -> tuple[list[Json], Change, Json]:
     """The curves of scene.reduce; the reductions of scene.apply as one Change, and the accuracy with it."""
     found: list[Json] = []
     strongest: dict[str, Step] = {}
-    progress = Progress(len(scene.reduce), log)
-    for kind in scene.reduce:
-        progress.begin(f"reduced: {kind}")
+    for at, kind in enumerate(scene.reduce):
+        choice.trials.progress.left(most(choice.trials, scene.reduce[at:]))
         if kind == "classes":
             found.append(classes(choice, scene.accuracy))
             continue

@@ -87,7 +87,7 @@ def candidates(scene: Scene) -> list[str]:
 
 
 def bundle_costs(
-    names: Sequence[str], sweeps: Dataset, scene: Scene, effort: Effort, where: Where, log: Log
+    names: Sequence[str], sweeps: Dataset, scene: Scene, effort: Effort, where: Where, progress: Progress
 ) -> dict[str, BundleCost]:
     """The cost of each method's bundle, the cheapest first and refused ones last.
 
@@ -97,15 +97,13 @@ def bundle_costs(
         kept = (where.cache or Path(aside)) / "bundles"
         found: dict[str, BundleCost] = {}
         folders: dict[str, Path] = {}
-        progress = Progress(len(names), log)
         for method in methods.find(names, effort):
-            progress.begin(f"bundle of {method.name}")
             folder, refused = _packed(method, sweeps, scene, kept)
             if refused:
                 found[method.name] = BundleCost(refused=refused)
             else:
                 folders[method.name] = folder
-        log(f"{len(folders)} bundles are timed in turns")
+            progress(f"bundle of {method.name}; all are timed in turns")
         found |= _measured(folders, sweeps, kept)
     return dict(sorted(found.items(), key=lambda item: (bool(item[1].refused), item[1].order(scene.budget))))
 
@@ -289,20 +287,26 @@ class Selection:
         ]
 
 
-def choose(sweeps: Dataset, scene: Scene, effort: Effort, where: Where, log: Log) -> Selection:
-    """Search the candidates from the cheapest up.
+def choose(
+    sweeps: Dataset, scene: Scene, effort: Effort, where: Where, log: Log, later: Callable[[Trials], int] = lambda _: 0
+) -> Selection:
+    """Search the candidates from the cheapest up. later: so many trainings come after that, for what is left in all.
 
     Raises NothingFits where no candidate can be taken, and FormatError where the scene cannot be judged.
     """
-    trials = Trials(sweeps, scene, effort, where, log)
+    progress = Progress(0, log)
+    trials = Trials(sweeps, scene, effort, where, progress)
     for p in (p for p in range(len(trials.parts)) if not trials.seen_from(p)):
         raise FormatError(f"{scene.path.name}: without {trials.parts[p].group} {trials.parts[p].values[0]} nothing is left "
                           "to choose by; a group that varies needs three values: one to train on, one to choose by, one "
                           "to judge the choice by")  # fmt: skip
-    costs = bundle_costs(candidates(scene), sweeps, scene, effort, where, log)
+    names = candidates(scene)
+    progress.left(len(names) * (1 + trials.most) + later(trials))
+    costs = bundle_costs(names, sweeps, scene, effort, where, progress)
     why_not = {name: cost.refused or _over(cost, scene) for name, cost in costs.items()}
     final, inner = SizeSearch(trials, None), [SizeSearch(trials, p) for p in range(len(trials.parts))]
-    for name in costs:
+    for at, name in enumerate(costs):
+        progress.left(sum(not why_not[other] for other in [*costs][at:]) * trials.most + later(trials))
         if why_not[name]:
             continue
         why_not[name] = final.enough(name)

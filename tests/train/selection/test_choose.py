@@ -15,6 +15,7 @@ import pytest
 from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from train.cli.main import main
+from train.data.progress import Progress, ProgressLine
 from train.data.sets import Dataset
 from train.evaluation import evaluate
 from train.evaluation.evaluate import Where
@@ -112,7 +113,7 @@ def chosen(sweeps: Dataset, where: Where = HERE, **more) -> select.Selection:
 
 def parts_of(sweeps: Dataset, **more) -> nested_cv.Trials:
     """Trials of which none has been run."""
-    return nested_cv.Trials(sweeps, asked(**more), FULL_EFFORT, HERE, lambda line: None)
+    return nested_cv.Trials(sweeps, asked(**more), FULL_EFFORT, HERE, Progress(0, lambda line: None))
 
 
 @cache
@@ -298,7 +299,7 @@ def test_parts_are_whole_and_few():
 def reduced(sweeps: Dataset, **more) -> dict[str, dict]:
     """The curves of a scene by what there is less of, and under "change" what would be left out of the bundle."""
     wish = asked(**more)
-    result, change, accuracy = reduction_curves.curves(chosen(sweeps, **more), wish, lambda line: None)
+    result, change, accuracy = reduction_curves.curves(chosen(sweeps, **more), wish)
     return {curve["kind"]: curve for curve in result} | {"change": change, "accuracy": accuracy}
 
 
@@ -396,6 +397,23 @@ def test_an_interrupted_choice_continues(fakes, tmp_path: Path, monkeypatch: pyt
     assert len(calls) == 8 + 2 * 6 - 7
     assert chosen(two(), where).json(asked()) == first
     assert len(calls) == 8 + 2 * 6 - 7
+
+
+def test_all_trainings_have_one_count(fakes):
+    """From the first candidate to the last reduction: it never starts anew, and what is left at most only shrinks."""
+    lines: list[ProgressLine] = []
+    wish = asked(reduce=("window", "taxels", "classes"), apply=("window",))
+    choice = select.choose(
+        two(), wish, FULL_EFFORT, HERE, lines.append, lambda t: reduction_curves.most(t, wish.reduce)
+    )
+    before = len(lines)
+    reduction_curves.curves(choice, wish)
+    assert [line.done for line in lines] == [*range(1, len(lines) + 1)]
+    totals = [line.total for line in lines]
+    assert totals == sorted(totals, reverse=True)
+    assert totals[0] == 4 * 6 + (1 + 3 + 1 + 3) * 3
+    assert before < len(lines) <= totals[-1]
+    assert lines[-1].endswith("(see-2, taxels 1)")
 
 
 @pytest.mark.slow
