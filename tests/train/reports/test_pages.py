@@ -55,7 +55,8 @@ def paper_facts(summary: Any) -> Facts:
     for row in summary["table"]:
         mean, low, high = row["share"]
         yield f"{number(mean)} % {number(low)} – {number(high)} %"
-        yield f"{row['right']} / {row['total']} {len(row['worlds'])} {row['ms_p50']:.2f}"
+        ms = "–" if row["ms_p50"] is None else f"{row['ms_p50']:.2f}"  # of a CNN that was followed, not evaluated
+        yield f"{row['right']} / {row['total']} {len(row['worlds'])} {ms}"
     yield from (f"Commit {commit}" for commit in {one["commit"] for one in summary["results"]})
     yield f"On {summary['results'][0]['machine']}"
     yield f"{len(summary['results'])} evaluations"
