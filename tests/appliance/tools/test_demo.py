@@ -30,6 +30,7 @@ def test_demo_prints_plain_lines_without_a_terminal(capsys: pytest.CaptureFixtur
     assert out.count("$PPLP,RES,") == 3
     assert out.count(" -> ") == 3
     assert "frames lost     0 of" in out
+    assert "latency         not measured: --virtual lets no time pass" in out
     assert "\033" not in out
 
 
