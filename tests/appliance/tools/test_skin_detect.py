@@ -115,7 +115,7 @@ def test_the_commands(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkey
     to do."""
     assert main(["skin", "list"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert sorted(line.split()[0] for line in lines) == sorted(PROFILES)
+    assert {line.split()[0] for line in lines} >= set(PROFILES), "this computer may have others in /etc/palpate"
     assert "lacks sequence, time, checksum; not measured on a device" in next(li for li in lines if "flexitac" in li)
     assert main(["skin", "detect", "--write"]) == 78
     assert "--port" in capsys.readouterr().err
