@@ -291,4 +291,5 @@ def _by_share(text: str) -> tuple[str, float]:
 
 
 def _text(figure: dict[str, float]) -> str:
-    return f"{figure['accuracy']:.3f} [{figure['low']:.3f}, {figure['high']:.3f}] of {figure['n']}"
+    share, low, high = (100 * figure[name] for name in ("accuracy", "low", "high"))
+    return f"{share:.1f} % [{low:.1f}, {high:.1f}] of {figure['n']}"

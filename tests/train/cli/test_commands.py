@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -42,8 +43,9 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
     assert sum(map(len, parts)) == len(set.union(*parts)) == len(np.unique(whole.groups["recording"]))
     assert len(made.train) + len(made.held) + len(rest) == len(whole)
     out = capsys.readouterr().out
-    assert "held-out recording, as the box answers: " in out
-    assert "held-out recording, network alone: " in out
+    figure = r"\d+\.\d % \[\d+\.\d, \d+\.\d\] of \d+"
+    assert re.search(f"held-out recording, as the box answers: {figure}; ", out)
+    assert re.search(f"held-out recording, network alone: {figure}\n", out)
 
 
 @pytest.mark.parametrize(
