@@ -45,7 +45,7 @@ def mutated(rng: Random) -> bytes:
         arrays = dict(z.items())
     for _ in range(rng.randint(1, 4)):
         name = rng.choice(ARRAYS)
-        arrays[name] = _changed(arrays.get(name, np.zeros(1)), rng)
+        arrays[name] = changed(arrays.get(name, np.zeros(1)), rng)
         if rng.random() < 0.05:
             del arrays[name]
     file = io.BytesIO()
@@ -53,7 +53,7 @@ def mutated(rng: Random) -> bytes:
     return file.getvalue()
 
 
-def _changed(values: np.ndarray, rng: Random) -> np.ndarray:
+def changed(values: np.ndarray, rng: Random) -> np.ndarray:
     """Another number in it, other sizes, another type, or a label that is not one."""
     if values.dtype.kind == "U":
         text = rng.choice(("", "wood", "a,b", "x" * 25, "\0", "cork", "é", "$PPLP"))

@@ -21,7 +21,7 @@ from tests.fuzz.targets import TARGETS
 WORK = seeds.ROOT / "build" / "fuzz"
 LONGEST_INPUT = 5000
 """Bytes of an input: the largest packet there can be, and something around it."""
-LONGEST_SAVED = 1024
+LONGEST_SAVED = 2048
 """Bytes of an input that is saved: longer ones do the same things more often."""
 OPTIONS = (f"-max_len={LONGEST_INPUT}", "-timeout=300", "-print_final_stats=1", "-reload=0")
 """libFuzzer counts seconds of the clock, so its limit is only for what never ends; the engine has one in processor time."""

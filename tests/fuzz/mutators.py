@@ -13,6 +13,7 @@ from typing import Any
 
 from appliance.core.sentences import checksum
 from appliance.io import packets as wire
+from tests.fuzz import enrolments
 from tests.fuzz.skins import GRIDS
 
 Plain = Callable[[bytes], bytes]
@@ -140,6 +141,7 @@ MUTATORS: dict[str, Mutator] = {
     "feed": tables,
     "settings": tables,
     "manifest": trees,
+    "enrolment": enrolments.mutated,
     "recording": headed,
     "capture": headed,
     "profile": tables,

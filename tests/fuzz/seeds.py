@@ -22,7 +22,7 @@ from appliance.io.skin_profile import SkinProfile
 from appliance.recording.capture import MAGIC, CaptureWriter
 from appliance.sim import script, skin
 from tests.factories.paths import ROOT
-from tests.fuzz import skins
+from tests.fuzz import enrolments, skins
 from tests.fuzz.files import NPY
 
 ENDLESS = packets.HEADER.pack(
@@ -139,6 +139,7 @@ def capture() -> list[bytes]:
 
 SEEDS: dict[str, Callable[[], list[bytes]]] = {
     **{f.__name__: f for f in (unpack, command, feed, settings, manifest, recording, capture)}, "profile": skins.profile_seeds,
+    "enrolment": enrolments.seeds,
     **{f"skin-{name}": partial(skins.seeds, name) for name in skins.GRIDS},
 }  # fmt: skip
 
@@ -159,6 +160,8 @@ def words(target: str) -> Sequence[bytes]:
         keys = [f.name for group in sections.values() for f in fields(group)]
         odd = ["board = ", " = ", '"', "[", "]", "true", "nan", "-0.0", "1e-9", "0x", '"\\u0000"', "1979-05-27", "'''"]
         return [text.encode() for text in (*(f"[{name}]" for name in sections), *keys, *odd)]
+    if target == "enrolment":
+        return enrolments.words()
     if target == "profile":
         return [f"{field.name} = ".encode() for field in fields(SkinProfile)]
     if target.startswith("skin-"):
