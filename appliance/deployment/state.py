@@ -8,7 +8,7 @@ PACKAGED.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 from appliance.core.errors import BundleError
@@ -122,8 +122,21 @@ class StoreState:
 
     @classmethod
     def parse(cls, text: bytes) -> StoreState:
-        """From the content of ledger.json. Raises ValueError or TypeError naming what is wrong."""
+        """From the content of ledger.json. Raises ValueError or TypeError naming what is wrong.
+
+        A field that this version does not know is left out: a newer program wrote it before it was gone back from, and its
+        bundles must still start. What this version writes is then without it, and a newer one takes its default.
+        """
         raw = json.loads(text)
-        if isinstance(raw, dict) and "standings" not in raw:
-            raise TypeError("it has no standings")
-        return typed(cls, raw)
+        if isinstance(raw, dict):
+            if "standings" not in raw:
+                raise TypeError("it has no standings")
+            if isinstance(raw["standings"], dict):
+                raw["standings"] = {sha: _known(Standing, one) for sha, one in raw["standings"].items()}
+        return typed(cls, _known(cls, raw))
+
+
+def _known(kind: type[Standing | StoreState], raw: Any) -> Any:
+    """A JSON object without the fields that `kind` does not have."""
+    names = {f.name for f in fields(kind)}
+    return {name: value for name, value in raw.items() if name in names} if isinstance(raw, dict) else raw

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -396,7 +397,15 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", '{"standings": {}, "floor": 1}', '{"standings": {"": {"starts": "many"}}}']
+    "text",
+    [
+        "{",
+        "[]",
+        '{"floor": 1}',
+        '{"standings": []}',
+        '{"standings": {"": []}}',
+        '{"standings": {"": {"starts": "many"}}}',
+    ],
 )
 def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
     """Its content is not guessed."""
@@ -404,6 +413,25 @@ def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
     Path(box.how.folder, "ledger.json").write_text(text)
     with pytest.raises(BundleError, match=r"ledger\.json cannot be read"):
         box.start()
+
+
+@pytest.mark.slow
+def test_a_program_that_was_gone_back_to_reads_what_a_newer_one_wrote(box: Delivery):
+    """Fields that it does not know, of the store and of each bundle, are nothing to it: bundle, trial and counter are as they
+    were, and the newer program reads what this one writes."""
+    one, two = box.committed(1), box.installed(2)
+    ledger = Path(box.how.folder, "ledger.json")
+    newer = json.loads(ledger.read_text()) | {"format": 9, "kept": {"a": [1]}}
+    newer["standings"] = {sha: held | {"heat": 4.5, "owner": {"name": "x"}} for sha, held in newer["standings"].items()}
+    assert two in newer["standings"]
+    ledger.write_text(json.dumps(newer))
+    assert box.start() == two
+    assert box.store.state.of(two).starts == 1
+    assert box.store.commit()
+    assert box.store.rollback() == one == box.start()
+    assert "heat" not in ledger.read_text()
+    with pytest.raises(BundleError, match="counter 1, and 2 was committed"):
+        box.store.install(box.made(1, name="older"))
 
 
 def test_a_link_out_of_the_store_is_refused(box: Delivery):
