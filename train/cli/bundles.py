@@ -29,11 +29,13 @@ from train.evaluation.fold import fingerprint
 from train.export import bundle_score, measure, pack, quantized_bundle
 from train.models import methods
 from train.models.compact import recipe
-from train.models.compact.architectures import ARCHITECTURES
+from train.models.compact.architectures import ARCHITECTURES, MAINS_HZ
 from train.models.compact.augment import Augmentation, default_augmentation
 from train.models.compact.fitted import Fit
 from train.models.linear_head import hold_out
 
+MAINS = (50, 60)
+"""Hz; there are no others for the public."""
 STEPS = recipe.Settings().steps
 LEAST_STEPS = 2
 """Of the training of a network alone: its learning rate rises and falls."""
@@ -80,6 +82,8 @@ def _add_fit(add: Add) -> None:
                      help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
     command.add_argument("--stretch", type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"), metavar="SHARE",
                      help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
+    command.add_argument("--mains", type=int, choices=MAINS, default=int(MAINS_HZ), metavar="HZ",
+                     help=f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}: its hum is not heard (default {MAINS_HZ:g})")  # fmt: skip
     command.add_argument("--reattached", action="store_true",
                      help="the skin will be taken off and put back after the recordings: all heads see copies that look so")  # fmt: skip
     command.add_argument(
@@ -158,7 +162,7 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
     Raises FormatError where they contradict one another.
     """
     changes = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
-    architecture = ARCHITECTURES.get(args.size, recipe.FIXED)
+    architecture = replace(ARCHITECTURES.get(args.size, recipe.FIXED), mains_hz=float(args.mains))
     augmentation = replace(default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes)
     unfinished = _unfinished(args, sweeps, augmentation)
     if args.size in ARCHITECTURES:
@@ -178,7 +182,9 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
         raise FormatError(
             f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default recipe removes means"
         )
-    settings = recipe.Settings(args.steps, augmentation, unfinished=unfinished, reattached=args.reattached)
+    settings = recipe.Settings(
+        args.steps, augmentation, unfinished=unfinished, reattached=args.reattached, mains_hz=float(args.mains)
+    )
     made = recipe.fit(sweeps, args.seed, settings, options.Log())
     print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
     return made, unfinished
@@ -186,7 +192,7 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
 
 def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augmentation) -> Path:
     """Where a training is kept until the fit is written: its name is a fingerprint of all that it depends on."""
-    about = [digest(sweeps), args.seed, args.size, args.steps, asdict(augmentation)]
+    about = [digest(sweeps), args.seed, args.size, args.steps, asdict(augmentation), args.mains]
     return CACHE / f"{fingerprint(about, 'train.models.compact.recipe', 'train.models.compact.fit')}.pt"
 
 

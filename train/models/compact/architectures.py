@@ -20,7 +20,8 @@ LATER = (5, 2)
 SHORT_KERNEL = 4
 """The first kernel for a window that does not allow any stride."""
 MAINS_HZ = 50.0
-"""Frequency that is filtered out. Three quarters of 60 Hz still pass a kernel of 32 frames at 750 Hz."""
+"""Frequency that is filtered out unless a fit is asked for another. Of 50 Hz nothing passes then, but of 60 Hz three quarters
+pass a kernel of 32 frames at 750 Hz."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ class Architecture:
     planned: how many stages there were before some were cut off, 0 if none were; with none left the head sees only the
     spectrum. spectrum: whether the head sees the bands of spectrum.py after the stages' responses. fewest: number of
     stages that are never cut off. pools: how the filter bank of bank.py is pooled: 0 where there is none, 1 by magnitudes,
-    2 by shares as well. distribution: whether the head sees the shares of distribution.py.
+    2 by shares as well. distribution: whether the head sees the shares of distribution.py. mains_hz:
+    of the mains whose hum stages and spectrum do not respond to.
     """
 
     channels: tuple[int, ...]
@@ -63,6 +65,7 @@ class Architecture:
     fewest: int = 1
     pools: int = 0
     distribution: bool = False
+    mains_hz: float = MAINS_HZ
 
     def cut(self, depth: int, spectrum: bool = False) -> Architecture:
         """The first `depth` stages, each as it was, with the spectrum or without."""

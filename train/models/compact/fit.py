@@ -108,7 +108,8 @@ def fit_on(
         model, weights = _select_depth(model, inputs, np.tile(train.labels, COPIES + 1), held.labels)
         logits = features(model, held) @ weights["head.weight"].T + weights["head.bias"]
     right = int(np.sum(logits.argmax(1) == held.labels))
-    about = {"seed": seed, "recipe": recipe.json(), "held_out_by": by, "validation": accuracy_figure(right, len(held))}
+    kept = recipe.json() | {"mains_hz": architecture.mains_hz}
+    about = {"seed": seed, "recipe": kept, "held_out_by": by, "validation": accuracy_figure(right, len(held))}
     ranges = replace(ranges, responses=ranges.responses[: len(model.convs)])
     plan = HeadPlan((HeadPart(tuple(range(weights["head.weight"].shape[1])), copies=True),))
     return Fit(weights, scale, model.architecture, ranges, train, held, about, plan, cost)

@@ -93,7 +93,7 @@ def trunk_graph(
         counts = nodes.known_steps(nodes.frames(form.window), form.window, tenths)
         parts.append(g("Mul", _levels(g, g("Cast", raw, to=FLOAT), form, counts), g.constant(scale)))
     if architecture.spectrum:
-        parts.append(spectrum.nodes(g, raw, attenuation, form, scale, tenths))
+        parts.append(spectrum.nodes(g, raw, attenuation, form, scale, architecture.mains_hz, tenths))
     size = max(part.stop for part in layout(form, weights, architecture, keep_means).values())
     features = nodes.side_by_side(g, parts)
     shape = [1, TENTHS, size] if tenths else [1, size]

@@ -16,7 +16,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from appliance.core.types import SweepFormat
 from train.models.compact import spectrum
-from train.models.compact.architectures import DEFAULT, FLOOR, MAINS_HZ, NOISE_LIMIT, Architecture
+from train.models.compact.architectures import DEFAULT, FLOOR, NOISE_LIMIT, Architecture
 from train.models.compact.graph import Ranges, level_frames, trunk_graph
 from train.models.networks import Network
 from train.models.training import batches, float_batches
@@ -58,10 +58,10 @@ def limit_noise(x: Tensor) -> Tensor:
     return torch.where((noise > limit) & (limit > 0), x * (limit / noise), x)
 
 
-def band_powers(x: Tensor, form: SweepFormat) -> Tensor:
+def band_powers(x: Tensor, form: SweepFormat, mains_hz: float) -> Tensor:
     """Scaled taxels [B, R * C * A, T] -> log band powers [B, count(form)], those of the first axis first."""
     length = form.window // spectrum.SEGMENTS
-    waves, averaging = (torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(form)))
+    waves, averaging = (torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(form, mains_hz)))
     mean = x.unflatten(1, (-1, form.axes)).mean(1)[:, :, : length * spectrum.SEGMENTS]
     cut = mean.unflatten(2, (spectrum.SEGMENTS, length))
     return torch.log(((cut @ waves).square() @ averaging).mean(2) + spectrum.QUIET).flatten(1)
@@ -94,8 +94,8 @@ class Compact(Network):
         )
         if architecture.channels and architecture.zero_sum(form.window):
             first = stages[0]
-            periods = first.kernel * MAINS_HZ / form.rate_hz
-            mains = MAINS_HZ / form.rate_hz if norm and 1 <= periods <= first.kernel / 4 else 0.0
+            periods = first.kernel * architecture.mains_hz / form.rate_hz
+            mains = architecture.mains_hz / form.rate_hz if norm and 1 <= periods <= first.kernel / 4 else 0.0
             self.convs[0] = ZeroSum(inputs[0], inputs[1], first.kernel, first.stride, mains)
         self.norms = nn.ModuleList(nn.BatchNorm1d(n) if norm else nn.Identity() for n in architecture.channels)
         bands = architecture.spectrum * spectrum.count(form)
@@ -120,7 +120,7 @@ class Compact(Network):
         if self.keep_means:
             parts.append(counts.flatten(2).float().mean(1) * self.scale)
         if self.architecture.spectrum:
-            parts.append(band_powers(limit_noise(prepared), self.form))
+            parts.append(band_powers(limit_noise(prepared), self.form, self.architecture.mains_hz))
         return torch.cat(parts, 1)
 
     def fused(self) -> Compact:

@@ -22,7 +22,7 @@ from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
 from train.metrics.score import interval
 from train.models.compact import bank, choice, distribution, graph, spectrum
-from train.models.compact.architectures import ARCHITECTURES, Architecture
+from train.models.compact.architectures import ARCHITECTURES, MAINS_HZ, Architecture
 from train.models.compact.augment import Augmentation, default_augmentation
 from train.models.compact.bank import Bank
 from train.models.compact.choice import Court, Judged
@@ -51,13 +51,14 @@ class Settings:
     """What a user may set. steps: of the training of stages; 0 to try none. augmentation: None for the usual one. choose:
     whether anything is chosen; else all zero-sum filters are seen by one discriminant. unfinished: a file that keeps the
     training of stages from time to time, from which it goes on with the same bits. reattached: the skin will be taken off
-    and put back after these recordings, so that all heads see augmented copies, which look so."""
+    and put back after these recordings, so that all heads see augmented copies, which look so. mains_hz: see Architecture."""
 
     steps: int = 600
     augmentation: Augmentation | None = None
     choose: bool = True
     unfinished: Path | None = None
     reattached: bool = False
+    mains_hz: float = MAINS_HZ
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     may_train = settings.steps and len(sweeps) >= LEAST_SWEEPS and by != "nothing" and find_spec("torch")
     told = partial(_tell, log, 3 if may_train else 2)
     told(1, f"features of {len(sweeps)} sweeps and {COPIES} copies of each")
-    fixed = fixed_trunk(sweeps, seed)
+    fixed = fixed_trunk(sweeps, seed, settings.mains_hz)
     changed = list(copies(sweeps, augmentation, seed, COPIES))
     known, classes = _known(fixed, sweeps, changed), len(sweeps.materials)
     parts = inner_parts(sweeps)
@@ -111,7 +112,7 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
         weight, bias = plan.fit(_known(trunk, sweeps, changed, int8).given(), classes)
         heads |= {f"{name}.weight": weight - weight.mean(axis=0), f"{name}.bias": bias - bias.mean()}
     about = {
-        "seed": seed, "recipe": {"scene": vars(augmentation), "steps": settings.steps, "keep_means": False, "reattached": settings.reattached},
+        "seed": seed, "recipe": {"scene": vars(augmentation), "steps": settings.steps, "keep_means": False, "reattached": settings.reattached, "mains_hz": settings.mains_hz},
         "held_out_by": by, "chosen": describe(trunk, plan), "validation": _validation(court, judged),
     }  # fmt: skip
     return Fit(
@@ -132,7 +133,7 @@ def _tell(log: Log, parts: int, part: int, line: str) -> None:
     log(f"part {part} of {parts}, {line}")
 
 
-def fixed_trunk(sweeps: Dataset, seed: int) -> Trunk:
+def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk:
     """The trunk with the whole bank, the distribution and the spectrum.
 
     Raises FormatError where the window is shorter than a filter, or every taxel of every sweep is constant.
@@ -142,7 +143,7 @@ def fixed_trunk(sweeps: Dataset, seed: int) -> Trunk:
     if not np.ptp(sweeps.samples, axis=1).any():
         raise FormatError("every taxel of every sweep is constant; check the skin, nothing can be learnt from this")
     scale = texture_scale(sweeps.samples)
-    architecture = replace(FIXED, spectrum=spectrum.count(form) > 0, pools=2, distribution=True)
+    architecture = replace(FIXED, spectrum=spectrum.count(form) > 0, pools=2, distribution=True, mains_hz=mains_hz)
     kinds = (False,) if architecture.zero_sum(form.window) else (False, True)
     drawn = bank.draw(form, rng, kinds)
     seen: list[Array] = [np.empty(0)] * len(drawn)
@@ -243,8 +244,9 @@ def _stages(sweeps: Dataset, scale: float, seed: int, settings: Settings, log: L
     from train.models.compact import fit as training  # here: the rest of the recipe needs no PyTorch
 
     recipe = training.FitRecipe(steps=settings.steps, augmentation=settings.augmentation)
-    weights, ranges = training.train_stages(sweeps, scale, seed, recipe, log, STAGES, settings.unfinished)
-    return Trunk(sweeps, scale, weights, STAGES, ranges)
+    stages = replace(STAGES, mains_hz=settings.mains_hz)
+    weights, ranges = training.train_stages(sweeps, scale, seed, recipe, log, stages, settings.unfinished)
+    return Trunk(sweeps, scale, weights, stages, ranges)
 
 
 def _pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
@@ -258,7 +260,7 @@ def _pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, 
         for name in ("sizes", "shares", "levels", "bands")
     )
     architecture = replace(
-        stages.architecture if stages else FIXED,
+        stages.architecture if stages else fixed.architecture,
         pools=(len(filters) > 0) + (len(shares) > 0),
         distribution=len(levels) > 0,
         spectrum=len(bands) > 0,

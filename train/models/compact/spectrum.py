@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from onnx import TensorProto
 
 from appliance.core.types import SweepFormat
-from train.models.compact.architectures import MAINS_HZ
 from train.onnx_tools.graph_builder import GraphBuilder
 
 Array = NDArray[Any]
@@ -37,7 +36,9 @@ def count(form: SweepFormat) -> int:
     return form.axes * (len(_edges(length)) - 1) if length >= MIN_SEGMENT else 0
 
 
-def nodes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale: float, tenths: bool) -> str:
+def nodes(
+    g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale: float, mains_hz: float, tenths: bool
+) -> str:
     """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1, rows, bands], those of
     the first axis first.
 
@@ -52,7 +53,7 @@ def nodes(g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale:
     if axes > 1:
         x = g("Transpose", g("Reshape", x, g.constant([SEGMENTS, length, axes], "int64")), perm=[0, 2, 1])
     x = g("Reshape", x, g.constant([SEGMENTS * axes, length], "int64"))
-    x = g("MatMul", x, _wave_nodes(g, length, mains(form)))
+    x = g("MatMul", x, _wave_nodes(g, length, mains(form, mains_hz)))
     power = g("MatMul", g("Mul", x, x), _averaging_nodes(g, _edges(length)))
     if axes > 1:
         power = g("Reshape", power, g.constant([SEGMENTS, count(form)], "int64"))
@@ -72,9 +73,9 @@ def _edges(length: int) -> Array:
     return np.unique(np.rint(np.geomspace(2, length + 1, BANDS + 1)).astype(int))
 
 
-def mains(form: SweepFormat) -> float:
-    """Periods of the mains per frame; 0 where a segment holds less than two, or the hum is too fast to be told apart."""
-    periods = MAINS_HZ / form.rate_hz
+def mains(form: SweepFormat, mains_hz: float) -> float:
+    """Periods of mains of this frequency per frame; 0 where a segment holds less than two, or the hum is too fast to be told apart."""
+    periods = mains_hz / form.rate_hz
     return periods if periods * (form.window // SEGMENTS) >= 2 and periods <= 0.25 else 0.0
 
 

@@ -16,6 +16,7 @@ from appliance.core.errors import FormatError
 from tests.factories.sweep_sets import easy
 from train.cli import bundles
 from train.cli.main import main
+from train.data import sets
 from train.data.sets import Dataset
 from train.data.splitters import inner_parts
 from train.models import checkpoint, training
@@ -73,6 +74,40 @@ def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: 
     assert made.about["recipe"]["reattached"]
     assert all(part.copies for part in made.plan.parts)
     assert not any(part.copies for part in fitted.plan.parts)
+
+
+@pytest.mark.slow
+def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
+    """The command's option is kept with the fit and told; then 60 Hz moves the spectrum as little as 50 Hz that of the usual
+    fit, which hears 60 Hz."""
+    easy().save(tmp_path / "easy.npz")
+    made = [
+        "fit",
+        "--set",
+        str(tmp_path / "easy.npz"),
+        "--seed",
+        "1",
+        "--steps",
+        "0",
+        "--out",
+        str(tmp_path / "fit.npz"),
+    ]
+    assert main([*made, "--mains", "60"]) == 0
+    sixty = Fit.load(tmp_path / "fit.npz")
+    assert sixty.architecture.mains_hz == sixty.about["recipe"]["mains_hz"] == 60
+    assert fitted.architecture.mains_hz == fitted.about["recipe"]["mains_hz"] == 50
+    sweeps, moved = sets.load("sim:T-LAB:1:2", 1), {}
+    # away from the ends of the range, since what is clipped has overtones
+    sweeps = replace(sweeps, samples=(sweeps.samples.clip(None, 200) + 40).astype(np.uint8))
+    seconds = np.arange(sweeps.format.window)[:, None, None] / sweeps.rate_hz
+    for mains_hz in (50, 60):
+        trunk = recipe.fixed_trunk(sweeps, 1, mains_hz)
+        bands = trunk.layout()["bands"]
+        before = trunk.features(sweeps)[:, bands]
+        for hz in (50, 60):
+            hummed = np.rint(sweeps.samples + 6 * np.sin(2 * np.pi * hz * seconds)).astype(np.uint8)
+            moved[hz, mains_hz] = np.abs(trunk.features(replace(sweeps, samples=hummed))[:, bands] - before).mean()
+    assert max(moved[50, 50], moved[60, 60]) < min(moved[50, 60], moved[60, 50]) / 3, moved
 
 
 def test_int8_and_float_agree(fitted: Fit):
