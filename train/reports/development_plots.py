@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from train.reports import accuracy_axis
 from train.reports.development_chart import Accuracies, Json, plain_case
-from train.reports.development_experiment import EACH
+from train.reports.development_experiment import EACH, OURS
 from train.reports.method_names import plain_name
 from train.reports.plot_style import (
     ACCENT,
@@ -102,5 +102,5 @@ def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> st
 def _leader(those: Mapping[str, Mapping[int, Json]], ours: str) -> str:
     """The peer with the whole curve that is most accurate with all sweeps; "" where there is no peer."""
     points = max(map(len, those.values()))
-    whole = [name for name, line in those.items() if name != ours and len(line) == points]
+    whole = [name for name, line in those.items() if name not in (ours, *OURS) and len(line) == points]
     return max(whole, key=lambda name: float(those[name][0]["mean"]), default="")
