@@ -21,6 +21,7 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array, Set, build, load_file
 from appliance.core.types import Status, Sweep, SweepFormat, sidecar
 from appliance.core.types import load as load_recording
+from appliance.signal.unloaded import UnloadedSkin
 
 HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
@@ -243,13 +244,46 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
             [(str(one.path.parent), str(one.about.get("run", "")), one.sweep.object) for one in kept]
         )
     materials = [one.sweep.material for one in kept]
-    samples = np.stack([one.sweep.frames.taxels for one in kept])
-    unloaded = np.stack([one.unloaded for one in kept])
+    samples, unloaded, moved = one_level(
+        np.stack([one.sweep.frames.taxels for one in kept]), np.stack([one.unloaded for one in kept])
+    )
+    if moved:
+        source += f" ({moved} of {len(kept)} brought to the unloaded skin of the others: it was tared between)"
     rate = np.array(kept[0].format.rate_hz)
     about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
     if np.isfinite(unloaded).any():
         about["unloaded"] = unloaded
     return build({"samples": samples} | about | groups, source, kind)
+
+
+def one_level(samples: Array, unloaded: Array) -> tuple[Array, Array, int]:
+    """Raw counts [n, T, R, C] or [n, T, R, C, A] of skins that were tared at different times, as if they had been tared alike:
+    those whose unloaded skin lies elsewhere than that of most, by what counts as a load, are moved by the difference.
+
+    unloaded: as RecordedSweep.unloaded, of each [n, 2, R, C] or [n, 2, R, C, A]; a sweep of which it is not known stays as it
+    is. Smaller differences stay, too: a skin drifts like that in service. Whole counts stay whole, and in the range of their type.
+    Returns both as they are then, and how many were moved.
+    """
+    known = np.isfinite(unloaded).all(axis=tuple(range(1, unloaded.ndim)))
+    if not known.any():
+        return samples, unloaded, 0
+    levels = unloaded[known, 0]
+    away = np.abs(levels - np.median(levels, axis=0)).sum(axis=tuple(range(1, levels.ndim)))
+    usual = levels[away.argmin()]  # one that was there: the median of two halves would be a skin that nobody has
+    samples, unloaded, moved = samples.copy(), unloaded.copy(), 0
+    for i in np.flatnonzero(known):
+        level, noise = unloaded[i]
+        change = usual - level
+        if np.abs(change).max() < UnloadedSkin.of(level, noise, samples.dtype).contact:
+            continue
+        if samples.dtype.kind == "f":
+            samples[i] += change.astype(samples.dtype)
+        else:
+            change, limits = np.rint(change), np.iinfo(samples.dtype)
+            samples[i] = np.clip(samples[i] + change, limits.min, limits.max).astype(samples.dtype)
+        unloaded[i, 0] += change
+        moved += 1
+    return samples, unloaded, moved
 
 
 def counted(reasons: Counter[str]) -> str:

@@ -37,7 +37,8 @@ def describe(spec: str) -> str:
         )
     recorded = readers.recorded(folder)
     named, names = _named(recorded)
-    lines = description(readers.joined(named, folder, Dataset), names)
+    whole = readers.joined(named, folder, Dataset)
+    lines = [*description(whole, names), *(f"  {line}" for line in half_known(whole))]
     kept = [one.sweep for one in readers.ok(recorded)]
     if lost := [sweep.lost for sweep in kept if sweep.lost]:
         frames = sum(len(sweep.frames) for sweep in kept)
@@ -62,7 +63,20 @@ def warnings_of(sweeps: Dataset) -> list[str]:
         lines.append(
             f"warning: materials without a sweep: {', '.join(empty)}; record some, or leave them out with --only"
         )
-    return lines
+    return lines + half_known(sweeps)
+
+
+def half_known(sweeps: Dataset) -> list[str]:
+    """A line where some sweeps know the unloaded skin and others do not: whether these compare cannot be told."""
+    if sweeps.unloaded is None:
+        return []
+    known = int(np.isfinite(sweeps.unloaded).all(axis=tuple(range(1, sweeps.unloaded.ndim))).sum())
+    if known == len(sweeps):
+        return []
+    return [
+        f"warning: {known} sweeps know the unloaded skin and {len(sweeps) - known} do not; these are taken as they are, and do not "
+        "compare with the others where the skin was tared between; record with palpate record, and send TARE first"
+    ]
 
 
 def _unsendable(materials: Iterable[str]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
-from appliance.core.types import Status, SweepFormat, load, save
+from appliance.core.types import Frames, Status, Sweep, SweepFormat, load, save
 from tests.factories.recordings import FORMAT, record
 from tests.factories.sweep_sets import held, write
 from train.data import readers, sets
@@ -427,3 +428,46 @@ def test_a_file_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(Path, "open", denied)
     with pytest.raises(FormatError, match=rf"{name}: not a sweep set: the file cannot be read: Permission denied"):
         sets.load(str(file))
+
+
+def tared(folder: Path, levels: dict[str, float | None], dtype: str = "int16") -> np.ndarray:
+    """Recordings by name whose unloaded skin read so much, None where it was not noted; what was pressed on it, [8, 2, 3]."""
+    fmt, pressed = replace(FORMAT, dtype=dtype), np.arange(48).reshape(8, 2, 3) % 7 + 20
+    folder.mkdir(exist_ok=True)
+    for name, level in levels.items():
+        n = np.arange(fmt.window)
+        taxels = (pressed + (300 if level is None else level)).astype(fmt.numpy_type)
+        sweep = Sweep(1, 0, 1, Status.OK, Frames(n, n, taxels), material=name[0])
+        rest = level is not None and {"level": np.full((2, 3), level).tolist(), "noise": np.full((2, 3), 0.5).tolist()}
+        save(folder / f"{name}.npy", sweep, fmt, {"unloaded": rest or None})
+    return pressed
+
+
+@pytest.mark.parametrize("dtype", ["int16", "float32", "uint16"])
+def test_recordings_that_were_tared_differently_compare(tmp_path: Path, dtype: str):
+    """Those of a tared skin are moved to where most lie, in whole counts; what drifts a little, and what is not known, stays."""
+    pressed = tared(tmp_path, {"a0": 300.0, "a1": 301.0, "b0": 0.0, "b1": 300.0, "b2": None}, dtype)
+    s = sets.load(str(tmp_path))
+    assert s.samples.dtype == dtype
+    for samples, level in zip(s.samples, (300, 301, 300, 300, 300), strict=True):
+        np.testing.assert_array_equal(samples, pressed + level)
+    np.testing.assert_array_equal(s.unloaded[:4, 0, 0, 0], [300, 301, 300, 300])
+    assert np.isnan(s.unloaded[4]).all()
+    assert "1 of 5 brought to the unloaded skin of the others" in s.source
+
+
+def test_recordings_that_were_tared_alike_stay_to_the_bit(tmp_path: Path):
+    """And where one half was tared, the other is moved to a skin that there was; counts end where their type does."""
+    pressed = tared(tmp_path, {"a0": 300.0, "b0": 301.0, "b1": 300.5})
+    s = sets.load(str(tmp_path))
+    assert s.source == str(tmp_path)
+    assert s.samples[2].max() == (pressed + 300.5).astype(np.int16).max()
+    tared(tmp_path / "half", {"a0": 0.0, "b0": 300.0})
+    half = sets.load(str(tmp_path / "half"))
+    np.testing.assert_array_equal(half.samples[0], half.samples[1])
+    assert half.unloaded[0, 0, 0, 0] in (0, 300)
+    tared(tmp_path / "low", {"a0": 0.0, "a1": 0.0, "b0": 40.0}, "uint8")
+    low = sets.load(str(tmp_path / "low"))
+    np.testing.assert_array_equal(low.samples[2], low.samples[0])
+    tared(tmp_path / "clipped", {"a0": 230.0, "a1": 230.0, "b0": 0.0}, "uint8")
+    assert sets.load(str(tmp_path / "clipped")).samples[2].max() == 255

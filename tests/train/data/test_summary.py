@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -112,6 +113,21 @@ def test_recordings_are_described_by_name(tmp_path: Path):
         "    all  6    6",
         "  frames lost: 2 of 48, in 2 sweeps, filled in from their neighbours",
     ]
+
+
+def test_recordings_without_a_tare_are_told(tmp_path: Path):
+    """Where some recordings know the unloaded skin and others do not, both are counted; else there is nothing to say."""
+    for i in range(5):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
+    assert "warning" not in summary.describe(str(tmp_path))
+    for i in range(5):
+        path = tmp_path / f"{i}.json"
+        rest = {"level": [[1.0] * 3] * 2, "noise": [[0.5] * 3] * 2}
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"unloaded": rest}))
+        (found,) = [line for line in summary.describe(str(tmp_path)).splitlines() if "warning" in line] or [""]
+        assert found.startswith(f"  warning: {i + 1} sweeps know the unloaded skin and {4 - i} do not; ") == (i < 4)
+    sets.load(str(tmp_path)).save(tmp_path / "whole.npz")
+    assert "warning" not in summary.describe(str(tmp_path / "whole.npz"))
 
 
 def test_recordings_are_described_while_they_grow(tmp_path: Path):
