@@ -30,6 +30,7 @@ from appliance.cli.main import main
 from appliance.core import config
 from appliance.signal.contact import ContactPositions
 from appliance.sim import devices, rig, script, skin
+from tests.factories import terminals
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import SECOND, idle_devices
 
@@ -336,16 +337,10 @@ def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal
     command = [sys.executable, "-m", "appliance", "align", "--sim", "rest", "--set", f"classifier.bundle={folder}"]
     with subprocess.Popen(command, stdout=near, env=os.environ | {"TERM": kind}) as run:
         os.close(near)
-        shown, pressed = b"", False
-        try:
-            while data := os.read(far, 65536):
-                shown += data
-                if b"SIMULATED" in shown and not pressed:
-                    pressed = True
-                    run.send_signal(signal.SIGINT)
-        except OSError:  # the terminal's end where the last writer has gone
-            pass
-        assert run.wait() == 0
+        shown = terminals.read(far, run, lambda shown: b"SIMULATED" in shown)
+        run.send_signal(signal.SIGINT)
+        shown += terminals.read(far, run)
+        assert terminals.ended(run, shown) == 0
     text = shown.decode()
     live = kind != "dumb"
     assert (text.startswith(ENTER), text.endswith(LEAVE)) == (live, live)

@@ -7,7 +7,6 @@ import errno
 import fcntl
 import json
 import os
-import select
 import shutil
 import signal
 import subprocess
@@ -32,7 +31,7 @@ from appliance.inference.classifier import Classifier
 from appliance.io import packets
 from appliance.sim import skin
 from appliance.tools import pseudo_terminal
-from tests.factories import toy_bundle
+from tests.factories import terminals, toy_bundle
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
 
@@ -303,11 +302,11 @@ def test_the_space_bar_in_a_real_terminal(tmp_path: Path):
     ) as run:  # fmt: skip
         shown = b""
         for until, key in ((b"streaming", b" "), (b"bar stops the sweep", b" "), (b"no answer, short", b"\x03")):
-            while until not in shown and select.select([far], [], [], 60)[0]:
-                shown += os.read(far, 65536)
-            assert until in shown, run.kill()
+            before_it = shown
+            shown += terminals.read(far, run, lambda more, before=before_it, until=until: until in before + more)
+            assert until in shown
             os.write(far, key)
-        assert run.wait(timeout=60) == 0
+        assert terminals.ended(run, shown) == 0
     assert termios.tcgetattr(near) == before
     os.close(near)
     os.close(far)

@@ -17,7 +17,7 @@ from appliance.bundle.bundle import Bundle
 from appliance.cli.main import main
 from appliance.sim import script
 from appliance.tools import demo
-from tests.factories import deliveries
+from tests.factories import deliveries, terminals
 from tests.factories.simulated_box import numbered
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
@@ -135,16 +135,13 @@ def test_demo_paints_on_a_terminal():
     """On a terminal the skin is drawn in 16 shaded cells and painted over."""
     far, near = os.openpty()
     with subprocess.Popen(
-        [sys.executable, "-m", "appliance", "demo", "--virtual", "--sweeps", "1"], stdout=near, stderr=subprocess.PIPE
+        [sys.executable, "-m", "appliance", "demo", "--virtual", "--sweeps", "1"],
+        stdout=near,
+        stderr=subprocess.DEVNULL,
     ) as run:
         os.close(near)
-        shown = b""
-        try:
-            while data := os.read(far, 65536):
-                shown += data
-        except OSError:  # the terminal's end where the last writer has gone
-            pass
-        assert run.wait() == 0
+        shown = terminals.read(far, run)
+        assert terminals.ended(run, shown) == 0
     os.close(far)
     first = shown.split(b"\033[12A")[0]
     assert first.count(b"\033[48;5;") == 32

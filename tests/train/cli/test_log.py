@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from tests.factories import terminals
 from tests.factories.paths import ROOT
 from train.cli import options
 from train.data.progress import ProgressLine
@@ -37,15 +38,10 @@ def on_a_terminal(out_too: bool) -> tuple[str, str]:
         env=os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "30"},
     )  # fmt: skip
     os.close(near)
-    shown = b""
-    try:
-        while more := os.read(far, 65536):
-            shown += more
-    except OSError:  # all is read: the process has closed it
-        pass
+    shown = terminals.read(far, done)
     os.close(far)
     printed = done.stdout.read().decode() if done.stdout else ""
-    assert done.wait() == 3
+    assert terminals.ended(done, shown) == 3
     return shown.decode(), printed
 
 

@@ -1,0 +1,48 @@
+"""A program on a terminal, for tests. In: the far end, the process. Out: what it shows, or an AssertionError with what it has shown
+so far; the process never outlives that, so that no test waits for it for ever.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Any
+
+LIMIT_S = 300
+"""Far more than any of these programs takes, also on a machine that is very busy."""
+
+
+def read(
+    far: int,
+    run: subprocess.Popen[Any],
+    done: Callable[[bytes], object] = lambda shown: False,
+    limit_s: float = LIMIT_S,
+) -> bytes:
+    """What a program shows until `done`, or until it has closed the terminal."""
+    shown, end_s = b"", time.monotonic() + limit_s
+    while not done(shown):
+        if not select.select([far], [], [], max(0.0, end_s - time.monotonic()))[0]:
+            run.kill()
+            run.wait()
+            raise AssertionError(f"the program was not done within {limit_s} s; it has shown {shown[-3000:]!r}")
+        try:
+            more = os.read(far, 65536)
+        except OSError:  # the terminal's end where the last writer has gone
+            return shown
+        if not more:
+            return shown
+        shown += more
+    return shown
+
+
+def ended(run: subprocess.Popen[Any], shown: bytes, limit_s: float = LIMIT_S) -> int:
+    """The exit code of a program that should end now."""
+    try:
+        return run.wait(timeout=limit_s)
+    except subprocess.TimeoutExpired as e:
+        run.kill()
+        run.wait()
+        raise AssertionError(f"the program did not end within {limit_s} s; it has shown {shown[-3000:]!r}") from e
