@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 
 import atheris
 
-with atheris.instrument_imports(include=["appliance", "tomllib"]):
+with atheris.instrument_imports(include=["appliance", "tomllib", "train.data"]):
     from tests.fuzz import targets
 from tests.fuzz.mutators import MUTATORS
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from appliance.core.sentences import checksum
 from appliance.io import packets as wire
-from tests.fuzz import enrolments
+from tests.fuzz import enrolments, far_sides
 from tests.fuzz.skins import GRIDS
 
 Plain = Callable[[bytes], bytes]
@@ -145,5 +145,7 @@ MUTATORS: dict[str, Mutator] = {
     "recording": headed,
     "capture": headed,
     "profile": tables,
+    "import-text": tables,
+    **far_sides.MUTATORS,
     **{f"skin-{name}": frames for name in GRIDS},
 }

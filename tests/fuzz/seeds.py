@@ -22,7 +22,7 @@ from appliance.io.skin_profile import SkinProfile
 from appliance.recording.capture import MAGIC, CaptureWriter
 from appliance.sim import script, skin
 from tests.factories.paths import ROOT
-from tests.fuzz import enrolments, skins
+from tests.fuzz import enrolments, far_sides, skins
 from tests.fuzz.files import NPY
 
 ENDLESS = packets.HEADER.pack(
@@ -140,6 +140,7 @@ def capture() -> list[bytes]:
 SEEDS: dict[str, Callable[[], list[bytes]]] = {
     **{f.__name__: f for f in (unpack, command, feed, settings, manifest, recording, capture)}, "profile": skins.profile_seeds,
     "enrolment": enrolments.seeds,
+    **far_sides.SEEDS,
     **{f"skin-{name}": partial(skins.seeds, name) for name in skins.GRIDS},
 }  # fmt: skip
 
@@ -150,6 +151,8 @@ def words(target: str) -> Sequence[bytes]:
         return [packets.MAGIC, ENDLESS, *(b"%c%c" % (packets.VERSION, kind) for kind in packets.PacketKind)]
     if target == "command":
         return [b"$PPLP,", b"*", b"\r\n", b"\xff", *(name.encode() for name in robot_link.COMMANDS)]
+    if target in far_sides.WORDS:
+        return far_sides.WORDS[target]
     if target == "feed":
         return [b'{"frames": ', b'"sweeps": true', b"NaN", b"1e999", b"-0.0", b"null", b"}\n", b", "]
     if target == "settings":

@@ -23,7 +23,7 @@ from appliance.core.types import SweepFormat
 from appliance.io import packets as wire
 from appliance.io import robot_link, usb_sensor
 from appliance.service import feed
-from tests.fuzz import enrolments, files, skins
+from tests.fuzz import enrolments, far_sides, files, skins
 from tests.fuzz.files import one_line
 
 Target = Callable[[bytes, Path], None]
@@ -234,5 +234,5 @@ def _is_request(line: bytes) -> bool:
 
 TARGETS: dict[str, Target] = {
     "unpack": unpack, "command": command, "feed": requests, "settings": files.settings, "manifest": files.manifest,
-    "enrolment": enrolments.target,    "recording": files.recording, "capture": files.played, **skins.TARGETS,
+    "enrolment": enrolments.target, "recording": files.recording, "capture": files.played, **skins.TARGETS, **far_sides.TARGETS,
 }  # fmt: skip

@@ -86,11 +86,16 @@ def _hdf5(path: Path) -> dict[str, Array]:
         return {name: array_in(file, name) for name in names}
 
 
+def _printable(name: str) -> str:
+    """A name out of a file as a terminal can show it: a damaged one may hold anything."""
+    return name if name.isprintable() else repr(name)
+
+
 def _chosen(arrays: Mapping[str, Array], variable: str) -> Table:
     """The one array of frames, or the one called `variable`, and the vectors beside it."""
     numbers = {name: values for name, values in arrays.items() if values.dtype.kind in "biuf"}
     tables = {name: values for name, values in numbers.items() if values.ndim > 1 and min(values.shape) > 1}
-    listed = ", ".join(f"{name} {list(values.shape)}" for name, values in numbers.items()) or "nothing"
+    listed = ", ".join(f"{_printable(name)} {list(values.shape)}" for name, values in numbers.items()) or "nothing"
     if variable:
         if variable not in numbers:
             raise FormatError(f"has no array {variable!r}; it holds {listed}")

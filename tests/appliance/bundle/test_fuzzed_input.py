@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from appliance.bridges import modbus_pdu
 from appliance.bundle import arrays, bundle, enrolled, manifest
 from appliance.core import config, schema, sentences, types
 from appliance.core.errors import ApplianceError
@@ -21,6 +22,7 @@ from appliance.recording import capture
 from appliance.service import feed
 from tests.fuzz import corpus, enrolments, files, seeds, skins, targets
 from tests.fuzz.mutators import MUTATORS
+from train.data import raw_files
 
 TARGETS = sorted(targets.TARGETS)
 INPUTS = {
@@ -39,6 +41,7 @@ BROKE = {
     "command/checksum-beside-noise": "a byte above 127 and a checksum: UnicodeEncodeError, and one noisy line ended the box",
     "command/end-of-a-long-line": "a line of over 128 bytes, read in two parts: its end was carried out as a command",
     "command/name-without-end": "a command's name of 120 letters took `error` and its reason out of the answer",
+    "import-mat/name-of-a-control-character": "an array called NUL: it stood in the message as it is",
     "manifest/brackets-in-brackets": "5000 brackets: RecursionError",
     "manifest/dead-taxels-of-many-digits": "a number of 401 digits was taken",
     "manifest/figures-in-figures": "figures 800 levels deep were read, but enrolment could not write them: RecursionError",
@@ -130,6 +133,9 @@ READ: dict[str, Callable[[bytes, Path], Any]] = {
     "enrolment": enrolments.read,
     "recording": read_recording,
     "capture": lambda data, folder: capture.Playback(written(folder, "c", data)).format,
+    "modbus": lambda data, folder: modbus_pdu.requests(data)[0],
+    "import-text": lambda data, folder: raw_files.read(written(folder, "t.csv", data)).values.size,
+    "import-mat": lambda data, folder: raw_files.read(written(folder, "t.mat", data)).values.size,
     "profile": lambda data, folder: skin_profile.load(written(folder, "s.toml", data).stem, [folder]),
     **{f"skin-{name}": partial(frames_of, name) for name in skins.GRIDS},
 }
@@ -310,7 +316,7 @@ def test_each_promise_can_be_seen_broken(
     ("target", "module", "name"),
     [("unpack", packets, "unpack_identity"), ("command", sentences, "read"), ("feed", feed, "_request"), ("settings", config, "_checked"),
      ("manifest", manifest, "typed"), ("recording", types, "typed"), ("capture", capture, "typed"),
-     ("enrolment", arrays, "summed")],
+     ("enrolment", arrays, "summed"), ("modbus", modbus_pdu, "parse"), ("import-text", raw_files, "_is_number"), ("import-mat", raw_files.mat_files, "_matrix")],
 )  # fmt: skip
 def test_another_error_is_not_kept_back(
     target: str, module: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

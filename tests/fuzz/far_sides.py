@@ -1,0 +1,133 @@
+"""What must hold of what a controller sends over Modbus, and of files that a person imports. In: any bytes. Out: nothing, or an
+error where a promise is broken, as in `targets`; also where their fuzzing begins, and changes that keep the form.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import numpy as np
+from scipy.io import savemat
+
+from appliance.bridges import modbus_pdu
+from appliance.bridges.modbus_pdu import HEADER, MOST_PDU, ModbusRequest, Reading, RequestRefused
+from appliance.core.errors import FormatError
+from tests.fuzz.files import one_line
+from train.data import raw_files
+
+REGISTERS = [0] * 100
+WORDS = {
+    "modbus": [struct.pack(">H", number) for number in (0, 1, 6, 125, 2000, 0xFF00, 0xFFFF)],
+    "import-text": [b",", b";", b"\t", b"\n", b"1e999", b"nan", b"# ", b'"', b"-0.0", b"0x1p3"],
+    "import-mat": [b"IM", b"MI", *(struct.pack("<II", kind, 8) for kind in (1, 2, 5, 6, 9, 14, 15))],
+}
+"""What each format is made of."""
+
+
+def modbus(data: bytes, folder: Path) -> None:
+    """modbus_pdu: the same requests wherever the bytes were cut, each read or refused, and replies that fit a packet."""
+    try:
+        found, rest = modbus_pdu.requests(data)
+    except FormatError as e:
+        one_line(e)
+        return
+    assert len(rest) < HEADER.size + MOST_PDU, "a rest that could hold a whole request"
+    for cut in {len(data) // 2, len(data) // 3, len(rest)}:
+        first, left = modbus_pdu.requests(data[:cut])
+        more, left = modbus_pdu.requests(data[cut:], left)
+        assert ([*first, *more], left) == (found, rest), f"cut at {cut}, other requests are found"
+    for request in found:
+        answered = modbus_pdu.reply(request, _reply(request))
+        assert HEADER.unpack_from(answered)[2] == len(answered) - HEADER.size + 1
+        assert len(answered) <= HEADER.size + MOST_PDU
+
+
+def _reply(request: ModbusRequest) -> bytes:
+    try:
+        wanted = modbus_pdu.parse(request.pdu)
+        return modbus_pdu.read(wanted, REGISTERS) if isinstance(wanted, Reading) else modbus_pdu.written(request.pdu)
+    except RequestRefused as e:
+        return modbus_pdu.refusal(request.pdu, e.fault)
+
+
+def _imported(suffix: str) -> Callable[[bytes, Path], None]:
+    def target(data: bytes, folder: Path) -> None:
+        """raw_files.read: a table of numbers with a name for each column, or a FormatError."""
+        file = folder / f"recording{suffix}"
+        file.write_bytes(data)
+        try:
+            table = raw_files.read(file)
+        except FormatError as e:
+            one_line(e)
+            return
+        assert isinstance(table.values, np.ndarray)
+        assert table.values.dtype.kind in "biufc", f"{table.values.dtype} is no number"
+
+    return target
+
+
+def modbus_seeds() -> list[bytes]:
+    """A request of each kind, two in a row, one that is cut."""
+    pdus = [struct.pack(">BHH", function, 0, 8) for function in (1, 2, 3, 4)]
+    pdus += [struct.pack(">BHH", 5, 0, 0xFF00), struct.pack(">BHHBB", 15, 0, 3, 1, 5)]
+    each = [HEADER.pack(i, 0, len(pdu) + 1, 1) + pdu for i, pdu in enumerate(pdus)]
+    return [b"".join(each), *each, each[0] + each[1][:9]]
+
+
+def text_seeds() -> list[bytes]:
+    """Tables as people keep them: with and without a head, with commas, semicolons or spaces."""
+    return [b"t,a,b\n0,1,2\n1,3,4\n", b"1;2\n3;4\n", b"# rate 100\n1 2 3\n4 5 6\n", b"\xef\xbb\xbfa\tb\n1\t-2.5e3\n"]
+
+
+def mat_seeds() -> list[bytes]:
+    """Files of version 5, packed and not."""
+    found = []
+    for packed in (False, True):
+        file = io.BytesIO()
+        savemat(file, {"x": np.arange(6.0).reshape(2, 3), "y": np.arange(4, dtype=np.int16)}, do_compression=packed)
+        found.append(file.getvalue())
+    return found
+
+
+def requests_of(data: bytes) -> list[bytes]:
+    """Nothing, and the pieces of `data` by what their headers say of their length."""
+    found, at = [b""], 0
+    while at < len(data):
+        end = at + 6 + max(int.from_bytes(data[at + 4 : at + 6], "big"), 1)
+        found.append(data[at:end])
+        at = end
+    return found
+
+
+def elements_of(data: bytes) -> list[bytes]:
+    """The head of a MAT file, and its elements by what their tags say of their length."""
+    found, at = [data[:128]], 128
+    while at < len(data):
+        end = at + 8 + int.from_bytes(data[at + 4 : at + 8], "little")
+        found.append(data[at:end])
+        at = end
+    return found
+
+
+def shuffled(split: Callable[[bytes], list[bytes]]) -> Callable[[bytes, Random, Callable[[bytes], bytes]], bytes]:
+    """A mutator that repeats a part of an input, puts it elsewhere or leaves it out, or changes bytes."""
+
+    def mutate(data: bytes, random: Random, plain: Callable[[bytes], bytes]) -> bytes:
+        head, *parts = split(data)
+        if not parts or random.random() < 0.5:
+            return plain(data)
+        parts.insert(random.randrange(len(parts) + 1), random.choice(parts))
+        if random.random() < 0.5:
+            parts.remove(random.choice(parts))
+        return head + b"".join(parts)
+
+    return mutate
+
+
+MUTATORS = {"modbus": shuffled(requests_of), "import-mat": shuffled(elements_of)}
+TARGETS = {"modbus": modbus, "import-text": _imported(".csv"), "import-mat": _imported(".mat")}
+SEEDS = {"modbus": modbus_seeds, "import-text": text_seeds, "import-mat": mat_seeds}
