@@ -173,7 +173,8 @@ def _beside_stages(court: Court, judged: Judged, fixed: Trunk, settings: Setting
     """What was chosen with a discriminant of trained stages, with as few filters as then do.
 
     For a skin that will be reattached stages and the spectrum are enough unless held-out sweeps and their copies show that
-    more is better: what corrupts sweeps moves filters more. Sweeps in place alone would not: they do not show what a view is good for in a condition that nobody recorded.
+    more is better: what corrupts sweeps moves filters more. Sweeps in place alone would not do as judges: they do not show what
+    a view is good for in a condition that nobody recorded.
     """
     size, full = sum(STAGES.channels), court.judge(_with_stages(judged.plan))
     if not settings.choose:
