@@ -169,7 +169,7 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
     [
         (["L-gaus"], "leave:session", "method 'L-gaus' is unknown; use some of L-gauss, L-knn"),
         (["L-gauss"], "leave:speed", "no group 'speed'"),
-        (["L-gauss"], "random:7", "needs 7 recordings of each material; material 0 has 6"),
+        (["L-gauss"], "random:7", "needs 7 recordings of each material; 'a' has 6"),
     ],
 )
 def test_what_cannot_be_evaluated_is_named(names: list[str], protocol: str, why: str):
