@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import select
 import shutil
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from tests.factories.paths import ROOT
 
 FIRMWARE = ROOT / "firmware_config" / "pico"
 SHELL = Path(__file__).with_name("pico_shell.py")
+START_S = 60
 
 
 def module() -> ModuleType:
@@ -51,11 +53,18 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @contextmanager
 def plugged_in(**options: Any) -> Iterator[str]:
-    """A board whose port is a pseudo-terminal; its name. options: settings and `pico_shell.OPTIONS`."""
+    """A board whose port is a pseudo-terminal; its name. options: settings and `pico_shell.OPTIONS`.
+
+    It is plugged in once its firmware runs: on a busy machine the program takes longer to start than a board may to answer.
+    """
     with pseudo_terminal.pair() as (far, name):
         command = [interpreter(), str(SHELL), str(FIRMWARE), json.dumps(options)]
-        board = subprocess.Popen(command, stdin=far, stdout=far)
+        board = subprocess.Popen(command, stdin=far, stdout=far, stderr=subprocess.PIPE, text=True)
+        assert board.stderr
         try:
+            assert select.select([board.stderr], [], [], START_S)[0], f"the Pico did not start within {START_S} s"
+            said = board.stderr.readline()
+            assert said == "serves\n", said + board.stderr.read()
             yield name
         finally:
             board.kill()

@@ -1,7 +1,7 @@
 """Runs firmware_config/pico under MicroPython's unix port: only pins, converter and timer are replaced.
 
 In: the firmware's folder, and a JSON object: SETTINGS by name, and the options of `OPTIONS`. The firmware serves standard
-input and output, as it does its port. Taxel k of the frame that is scanned as number n reads (n % 97 + k) % 256 in its
+input and output, as it does its port, once it has said so on standard error. Taxel k of the frame that is scanned as number n reads (n % 97 + k) % 256 in its
 upper 8 bits, n in its lower ones: so the wiring is tested, too.
 """
 
@@ -135,6 +135,7 @@ def main(folder, text):
     sys.modules["machine"] = PicoMachine(settings, options)
     sys.modules["time"] = PicoTicks(options["ticks"])
     firmware = __import__("main")
+    sys.stderr.write("serves\n")
     firmware.run(settings, seq=tuple(options["seq"]), t_us=tuple(options["t_us"]))
 
 
