@@ -185,15 +185,21 @@ def shop(tmp_path_factory: pytest.TempPathFactory) -> delivery.Shop:
     return delivery.Shop.opened(tmp_path_factory.mktemp("shop"))
 
 
+def cut_at_renames(played: ScenePlay) -> list[CrashPoint]:
+    """Killed before each file is renamed; without power where it is the link to the bundle."""
+    return [
+        (played.power if moment.call.paths[1].endswith("/current") else played.kill)(moment)
+        for moment in played.moments()
+        if moment.call and moment.call.name.startswith("rename")
+    ]
+
+
 def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: delivery.Shop, work: Path):
     """Killed before it names the bundle's folder and the ledger, and without power before the link is swapped: the box
     starts, answers, and takes the next bundle.
     """
     played = ScenePlay(shop.alone("right"), work)
-    points = []
-    for moment in played.moments():
-        if moment.call and moment.call.name.startswith("rename"):
-            points.append((played.power if moment.call.paths[1].endswith("/current") else played.kill)(moment))
+    points = cut_at_renames(played)
     assert [point.states for point in points] == [1, 1, 4]
     assert wrong(points) == []
 
@@ -201,10 +207,7 @@ def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: del
 def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_without(shop: delivery.Shop, work: Path):
     """As a delivery: and at each moment what the box has of the label is signed, or it runs without it."""
     played = ScenePlay(shop.learns("right"), work)
-    points = []
-    for moment in played.moments():
-        if moment.call and moment.call.name.startswith("rename"):
-            points.append((played.power if moment.call.paths[1].endswith("/current") else played.kill)(moment))
+    points = cut_at_renames(played)
     assert [point.states for point in points] == [1, 1, 4]
     assert wrong(points) == []
 

@@ -1,5 +1,5 @@
 """What must hold of what a controller sends over Modbus, and of files that a person imports. In: any bytes. Out: nothing, or an
-error where a promise is broken, as in `targets`; also where their fuzzing begins, and changes that keep the form.
+error where a promise is broken, as in `targets`; also where their fuzzing begins, and what their formats are made of.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ import io
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import numpy as np
 from scipy.io import savemat
@@ -113,21 +112,5 @@ def elements_of(data: bytes) -> list[bytes]:
     return found
 
 
-def shuffled(split: Callable[[bytes], list[bytes]]) -> Callable[[bytes, Random, Callable[[bytes], bytes]], bytes]:
-    """A mutator that repeats a part of an input, puts it elsewhere or leaves it out, or changes bytes."""
-
-    def mutate(data: bytes, random: Random, plain: Callable[[bytes], bytes]) -> bytes:
-        head, *parts = split(data)
-        if not parts or random.random() < 0.5:
-            return plain(data)
-        parts.insert(random.randrange(len(parts) + 1), random.choice(parts))
-        if random.random() < 0.5:
-            parts.remove(random.choice(parts))
-        return head + b"".join(parts)
-
-    return mutate
-
-
-MUTATORS = {"modbus": shuffled(requests_of), "import-mat": shuffled(elements_of)}
 TARGETS = {"modbus": modbus, "import-text": _imported(".csv"), "import-mat": _imported(".mat")}
 SEEDS = {"modbus": modbus_seeds, "import-text": text_seeds, "import-mat": mat_seeds}

@@ -25,17 +25,29 @@ ODD: tuple[Any, ...] = (
 )  # fmt: skip
 
 
+def rearranged(pieces: list[bytes], random: Random) -> bytes:
+    """The pieces of an input, one of them repeated, put elsewhere or replaced by another."""
+    piece = random.choice(pieces)
+    pieces.insert(random.randrange(len(pieces) + 1), piece)
+    if random.random() < 0.5:
+        pieces.remove(random.choice(pieces))
+    return b"".join(pieces)
+
+
+def parts(split: Callable[[bytes], list[bytes]]) -> Mutator:
+    """A mutator that rearranges what follows the first of the pieces that `split` finds, or changes bytes."""
+
+    def mutate(data: bytes, random: Random, plain: Plain) -> bytes:
+        head, *pieces = split(data)
+        return head + rearranged(pieces, random) if pieces and random.random() < 0.5 else plain(data)
+
+    return mutate
+
+
 def packets(data: bytes, random: Random, plain: Plain) -> bytes:
     """Packets left out, repeated or put elsewhere, bytes changed, and then most checksums made right again."""
     pieces = [p for p in re.split(rb"(?=\x50\xc1)", data) if p]
-    if pieces and random.random() < 0.3:
-        piece = random.choice(pieces)
-        pieces.insert(random.randrange(len(pieces) + 1), piece)
-        if random.random() < 0.5:
-            pieces.remove(random.choice(pieces))
-        data = b"".join(pieces)
-    else:
-        data = plain(data)
+    data = rearranged(pieces, random) if pieces and random.random() < 0.3 else plain(data)
     changed = bytearray(data)
     for start in [m.start() for m in re.finditer(re.escape(wire.MAGIC), data)]:
         end = start + wire.HEADER.size + int.from_bytes(changed[start + 4 : start + 6], "little")
@@ -108,14 +120,7 @@ def headed(data: bytes, random: Random, plain: Plain) -> bytes:
 def frames(data: bytes, random: Random, plain: Plain) -> bytes:
     """A skin's frames left out, repeated or put elsewhere, or bytes changed; then most sums of PapillArray made right."""
     pieces = [p for p in re.split(rb"(?=\xaa\x55|\x55\x66\x77\x88|\x9a\x00)|(?<=\n)|(?<=\r)", data) if p]
-    if len(pieces) > 1 and random.random() < 0.4:
-        piece = random.choice(pieces)
-        pieces.insert(random.randrange(len(pieces) + 1), piece)
-        if random.random() < 0.5:
-            pieces.remove(random.choice(pieces))
-        data = b"".join(pieces)
-    else:
-        data = plain(data)
+    data = rearranged(pieces, random) if len(pieces) > 1 and random.random() < 0.4 else plain(data)
 
     def seal(match: re.Match[bytes]) -> bytes:
         right = (sum(match[1]) & 0xFFFF).to_bytes(2, "little")
@@ -146,6 +151,7 @@ MUTATORS: dict[str, Mutator] = {
     "capture": headed,
     "profile": tables,
     "import-text": tables,
-    **far_sides.MUTATORS,
+    "modbus": parts(far_sides.requests_of),
+    "import-mat": parts(far_sides.elements_of),
     **{f"skin-{name}": frames for name in GRIDS},
 }

@@ -41,9 +41,10 @@ def run(
     _page(out)
     found: list[Json] = []
     left_out: dict[str, str] = {}
-    for removed in (True, False):
-        for only, protocols in PARTS:
-            sweeps = sets.load(str(data / FABRICS)).select(only)
+    whole = sets.load(str(data / FABRICS))
+    for only, protocols in PARTS:
+        sweeps = whole.select(only)
+        for removed in (True, False):
             plan = Plan(names, protocols, (SEED,), removed, effort)
             for result in evaluate.evaluate(sweeps, plan, where, log):
                 if result.refused:

@@ -55,22 +55,20 @@ def test_the_trunk_holds_what_the_heads_see_and_no_more(fitted: Fit):
     assert not Bank.of(usual.weights).free.any()
 
 
+def fitted_by_command(folder: Path, *options: str) -> Fit:
+    """What `palpate-train fit` makes of the easy set without stages."""
+    easy().save(folder / "easy.npz")
+    out = folder / "fit.npz"
+    assert (
+        main(["fit", "--set", str(folder / "easy.npz"), "--seed", "1", "--steps", "0", "--out", str(out), *options])
+        == 0
+    )
+    return Fit.load(out)
+
+
 def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: Fit):
     """The command's option: all discriminants see copies, which else the held-out parts of the easy set do not ask for."""
-    easy().save(tmp_path / "easy.npz")
-    fit = [
-        "fit",
-        "--set",
-        str(tmp_path / "easy.npz"),
-        "--seed",
-        "1",
-        "--steps",
-        "0",
-        "--out",
-        str(tmp_path / "fit.npz"),
-    ]
-    assert main([*fit, "--reattached"]) == 0
-    made = Fit.load(tmp_path / "fit.npz")
+    made = fitted_by_command(tmp_path, "--reattached")
     assert made.about["recipe"]["reattached"]
     assert all(part.copies for part in made.plan.parts)
     assert not any(part.copies for part in fitted.plan.parts)
@@ -80,20 +78,7 @@ def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: 
 def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
     """The command's option is kept with the fit and told; then 60 Hz moves the spectrum as little as 50 Hz that of the usual
     fit, which hears 60 Hz."""
-    easy().save(tmp_path / "easy.npz")
-    made = [
-        "fit",
-        "--set",
-        str(tmp_path / "easy.npz"),
-        "--seed",
-        "1",
-        "--steps",
-        "0",
-        "--out",
-        str(tmp_path / "fit.npz"),
-    ]
-    assert main([*made, "--mains", "60"]) == 0
-    sixty = Fit.load(tmp_path / "fit.npz")
+    sixty = fitted_by_command(tmp_path, "--mains", "60")
     assert sixty.architecture.mains_hz == sixty.about["recipe"]["mains_hz"] == 60
     assert fitted.architecture.mains_hz == fitted.about["recipe"]["mains_hz"] == 50
     sweeps, moved = sets.load("sim:T-LAB:1:2", 1), {}
