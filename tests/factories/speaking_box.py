@@ -103,8 +103,8 @@ class SpeakingBox:
                     continue
                 found, rest = sentences.parse(os.read(self._ends[0], 4096), rest)
                 for one in found:
-                    for line in self.script(one):
-                        self.say(line)
-                    with self._come:
+                    with self._come:  # heard before it is answered: who has the answer may ask what was heard
                         self.heard.append(one)
                         self._come.notify_all()
+                    for line in self.script(one):
+                        self.say(line)
