@@ -170,15 +170,14 @@ def command(data: bytes, folder: Path) -> None:
 def _is_command(line: bytes, name: str) -> bool:
     """Whether a line is a command by PROTOCOL.md, and this one."""
     body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
-    head, comma, text = body.removeprefix(b"PPLP,").decode("ascii", "replace").partition(",")
+    fields = re.split("[, ]", body.decode("ascii", "replace"), maxsplit=2)  # a person may type spaces for the commas
     known = (
-        body.startswith(b"PPLP,")
-        and head == name
+        fields[:2] == ["PPLP", name]
         and name in robot_link.COMMANDS
-        and bool(comma) == (name in robot_link.TEXT_COMMANDS)
+        and (len(fields) == 3) == (name in robot_link.TEXT_COMMANDS)
     )
     # what a sentence may not hold (PROTOCOL.md); a command has one field
-    known = known and "," not in text and not re.search(rb"[^ -~]|[!\\~^]", body)
+    known = known and "," not in "".join(fields[2:]) and not re.search(rb"[^ -~]|[!\\~^]", body)
     sealed = not star or given.upper() == b"%02X" % reduce(xor, body, 0)
     return known and sealed and len(line) <= LINE
 
