@@ -25,7 +25,8 @@ from tests.rig.machine import Guest
 KEPT = "/var/lib/palpate/kept"
 DROP_IN = "/etc/systemd/system/palpate.service.d/arguments.conf"
 PALPATE = "/opt/palpate/bin/palpate"
-CLASSIFIED = {str(status) for status in Status if status.classified} | {"unknown"}
+ANSWERED = {str(status) for status in Status if status.classified} | {"unknown", "recorded"}
+"""Statuses with a window behind them; a box that records says `recorded`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
     last: Heard | None = None
     for _, line in heard:
         match whole(line):
-            case ["PPLP", "RES", number, t_s, status, *rest] if status in CLASSIFIED:
+            case ["PPLP", "RES", number, t_s, status, *rest] if status in ANSWERED:
                 may += [last] if last else []
                 last = Heard(int(number), float(t_s) - float(rest[5]) / 1000)
             case ["PPLP", "STA", t_s, _, _, answered, *_] if last:
