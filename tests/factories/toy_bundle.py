@@ -1,6 +1,6 @@
 """A bundle whose answers are known by arithmetic, for tests. In: what it shall hold. Out: a Bundle, and windows for it.
 
-Its embedding is two of four taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its materials "a", "b" and
+Its embedding is two of the taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its materials "a", "b" and
 "c" lie at (0, 0), (6, 0) and (0, 6) there. Of a format with several axes it looks at the normal one.
 """
 
@@ -33,7 +33,8 @@ OUTPUTS = ("logits", "embedding")
 
 def window(z1: float, z2: float, fmt: SweepFormat = FORMAT) -> np.ndarray:
     """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves. Shear is a tenth of it."""
-    level = np.array([[100 + 10 * z1, 100 + 10 * z2], [100, 100]])
+    level = np.full((fmt.rows, fmt.cols), 100.0)
+    level[0, :2] += 10 * z1, 10 * z2
     ripple = np.where(np.arange(fmt.window) % 2, 1, -1)[:, None, None]
     normal = level + ripple
     shear = [0.1 * level + 2 * ripple] * (fmt.axes - 1)
@@ -52,11 +53,12 @@ def model(
     """The graph; each early row d is (d + 1) times the logits; an output of another name is a copy of the logits."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
-    pick = np.zeros((4 * fmt.axes, 2), np.float32)
+    values = fmt.rows * fmt.cols * fmt.axes
+    pick = np.zeros((values, 2), np.float32)
     pick[fmt.axes - 1, 0] = pick[2 * fmt.axes - 1, 1] = scale
     bias = -(MEANS[:labels] ** 2).sum(1) / 2
     constants = {
-        "axes": np.array([1]), "flat": np.array([1, 4 * fmt.axes]), "pick": pick, "shift": np.float32([-10, -10]),
+        "axes": np.array([1]), "flat": np.array([1, values]), "pick": pick, "shift": np.float32([-10, -10]),
         "weights": MEANS[:labels].T / KNOWN.temperature, "bias": bias / np.float32(KNOWN.temperature),
         "one": np.array([1, 1, labels]), "steps": np.arange(1, steps + 1, dtype=np.float32)[None, :, None],
     }  # fmt: skip

@@ -194,9 +194,13 @@ class ThisMachine:
     def start(self, seed: int, sweeps: Script) -> None:
         """As BoxUnderTest."""
         self._robot = Reckoned(sweeps)
+        self.launch("--sim", "skin", "--seed", str(seed))
+
+    def launch(self, *options: str) -> None:
+        """Start `palpate run` with these options."""
         self._far, port = self._stack.enter_context(pseudo_terminal.pair())
         palpate = Path(sys.executable).with_name("palpate")
-        command = [*self._before, palpate, "run", "--sim", "skin", "--seed", str(seed), *self._sets]
+        command = [*self._before, str(palpate), "run", *options, *self._sets]
         self._log = Path(self._stack.enter_context(tempfile.TemporaryDirectory())) / "log"
         self._box = subprocess.Popen([*command, "--set", f"serial.port={port}"], stderr=self._log.open("wb"))
         self._stack.callback(self._end)
@@ -217,8 +221,12 @@ class ThisMachine:
         *lines, self._rest = (self._rest + self._said()).split(b"\r\n")
         found = [(time.monotonic(), line.decode("ascii", "replace")) for line in lines]
         for at_s, line in found:
-            self._robot.hear(at_s, line)
+            self._note(at_s, line)
         return found
+
+    def _note(self, at_s: float, line: str) -> None:
+        """What to do with each line before it is passed on."""
+        self._robot.hear(at_s, line)
 
     def _said(self) -> bytes:
         """What the box has sent."""

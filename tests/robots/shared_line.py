@@ -11,7 +11,7 @@ import select
 from contextlib import suppress
 
 from appliance.tools import pseudo_terminal
-from tests.rig.soak_boxes import Script, ThisMachine
+from tests.rig.soak_boxes import ThisMachine
 
 
 class SharedLine(ThisMachine):
@@ -19,10 +19,10 @@ class SharedLine(ThisMachine):
 
     line = ""
 
-    def start(self, seed: int, sweeps: Script) -> None:
-        """As BoxUnderTest."""
+    def launch(self, *options: str) -> None:
+        """As ThisMachine."""
         self._bridge, self.line = self._stack.enter_context(pseudo_terminal.pair())
-        super().start(seed, sweeps)
+        super().launch(*options)
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
         """As BoxUnderTest; passes on commands of the bridge meanwhile."""

@@ -1,7 +1,7 @@
 """What a skin costs the box at its full rate, in real time. In: the name of a profile, its bundle, seconds. Out: figures.
 
-The emulator plays in a process of its own, and each frame carries its number in one taxel, so that a lost one is seen
-whatever the skin. The box classifies a sweep every EVERY_S. Both run under real-time scheduling where that is allowed:
+The emulator plays in a process of its own, and each frame carries its number in two taxels, so that lost ones are seen
+whatever the skin, and up to two seconds of them at once. The box classifies one sweep after the other. Both run under real-time scheduling where that is allowed:
 what is measured is the box, and not what else the machine does.
 """
 
@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from appliance.bundle import bundle
 from appliance.core import config
 from appliance.core.clock import Clock, SystemClock
-from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.observer import Observer
 from appliance.core.types import Frames, Sweep, SweepFormat, Verdict
@@ -47,36 +46,39 @@ from tests.skins.subjects import PROFILES
 
 SETTLE_S = 3.0
 """Time before figures are taken: the skin is found, its rate measured."""
-EVERY_S, LEAD_S = 3.5, 0.5
+PAUSE_S, LEAD_S = 1.0, 0.5
 """Time between two sweeps, and by how much each is longer than the window at its ends together."""
 NUMBERS = 100
-"""Frames are numbered in one taxel by so many numbers."""
+"""Frames are numbered by so many numbers in each of two taxels, the lower part first."""
 EMULATOR, BOX = 20, 10
 """Real-time priorities; a skin does not wait for the box."""
 DRAIN = 50
 """Turns between two looks at the far end of the serial line, which is no part of the box."""
 START_S = 20
 """Longest wait for the emulator."""
+SEED = 7
+"""Of the simulated sweep that is played."""
 
 
 class Sliding:
-    """A finger that slides without end: the middle of a simulated sweep, again and again, with numbers in one taxel."""
+    """A finger that slides without end: the middle of a simulated sweep, again and again, with numbers in two taxels."""
 
     def __init__(self, name: str, profile: SkinProfile, fmt: SweepFormat) -> None:
         self._profile = profile
-        act = next(iter(script.tubes(7, 1, seen=sweeps.view(name, fmt))))
+        act = next(iter(script.tubes(SEED, 1, seen=sweeps.view(name, fmt))))
         margin = round(fmt.rate_hz * LEAD_S / 2)
         self._frames = act.frames[act.start + margin : act.stop - margin].copy()
 
     def frame(self, i: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
         """See FrameSource."""
         taxels = self._frames[i % len(self._frames)]
-        taxels.flat[0] = i % NUMBERS
+        taxels.flat[:2] = i % NUMBERS, i // NUMBERS % NUMBERS
         return on_wire(taxels, self._profile)
 
 
 class FrameCheck(Observer):
-    """Notes what comes. answer_ms: from each stop edge to the sentence at the port. statuses: of all answers."""
+    """Notes what comes. came, missing: how many frames, and how many numbers between them. answer_ms: from each stop edge to
+    the sentence at the port. statuses: of all answers."""
 
     def __init__(self, clock: Clock) -> None:
         self.clear()
@@ -84,18 +86,18 @@ class FrameCheck(Observer):
 
     def clear(self) -> None:
         """Begin anew."""
-        self._numbers: list[NDArray[Any]] = []
+        self.came = self.missing = 0
+        self._last: NDArray[np.int64] = np.empty(0, np.int64)
         self.answer_ms: list[float] = []
         self.statuses: list[str] = []
 
     def frames(self, frames: Frames) -> None:
         """Frames of one turn."""
-        self._numbers.append(frames.taxels.reshape(len(frames), -1)[:, 0].copy())
-
-    def counted(self) -> tuple[int, int]:
-        """How many frames came, and how many numbers are missing between them."""
-        numbers = np.concatenate(self._numbers).astype(np.int64)
-        return len(numbers), int(((np.diff(numbers) - 1) % NUMBERS).sum())
+        low, high = frames.taxels.reshape(len(frames), -1)[:, :2].astype(np.int64).T
+        numbers = low + NUMBERS * high
+        self.came += len(numbers)
+        self.missing += int(((np.diff(numbers, prepend=self._last) - 1) % NUMBERS**2).sum())
+        self._last = numbers[-1:]
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """The sentence is out before observers of sweeps are told."""
@@ -129,9 +131,9 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
     check = FrameCheck(clock)
     with ExitStack() as stack:
         link = Path(stack.enter_context(TemporaryDirectory())) / "ttySkin"
-        player = stack.enter_context(_playing(name, current.format.rate_hz, link))
+        player = stack.enter_context(playing(name, current.format.rate_hz, link))
         real_time = hurry(BOX)
-        settings = _settings(name, current.format, link)
+        settings = config.load(None, sets(name, current.format, link), site=Path("/dev/null"))
         far_end, port = stack.enter_context(pseudo_terminal.pair())
         sink = SerialSink(replace(settings.serial, port=port), clock, "emulator")
         box = assembly.box(settings, current, Devices(clock), sink, stack, observers=[check])
@@ -144,23 +146,23 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
             raise SystemExit(f"{name}: the skin was lost: {box.health}")
         player.send_signal(signal.SIGTERM)
         emulator = json.loads(player.communicate()[0])
-    came, missing = check.counted()
     return {
         "skin": name, "format": str(current.format), "seconds": round(wall / 1e9, 1), "share": round(cpu / wall, 4),
-        "real_time": real_time, "came": came, "missing": missing, "counted_lost": box.counters.lost_frames - lost,
+        "real_time": real_time, "came": check.came, "missing": check.missing, "counted_lost": box.counters.lost_frames - lost,
         "garbage": box.counters.garbage_bytes, **emulator, "answers": len(check.answer_ms),
         "statuses": {status: check.statuses.count(status) for status in sorted(set(check.statuses))},
         "answer_ms": {f"p{q}": round(float(np.percentile(check.answer_ms, q)), 2) for q in (50, 99)},
     }  # fmt: skip
 
 
-def _settings(name: str, fmt: SweepFormat, link: Path) -> Config:
-    """A box with this skin and no lines."""
+def sets(name: str, fmt: SweepFormat, link: Path) -> list[str]:
+    """Settings of a box with this skin and no lines."""
+    sweep_s = fmt.window / fmt.rate_hz + LEAD_S
     chosen = {
         "sensor.skin": name, "sensor.port": link, "sensor.rate_hz": fmt.rate_hz, "trigger.mode": "timed",
-        "trigger.sweep_s": fmt.window / fmt.rate_hz + LEAD_S, "trigger.every_s": EVERY_S,
+        "trigger.sweep_s": sweep_s, "trigger.every_s": sweep_s + PAUSE_S,
     }  # fmt: skip
-    return config.load(None, [f"{key}={value}" for key, value in chosen.items()], site=Path("/dev/null"))
+    return [f"{key}={value}" for key, value in chosen.items()]
 
 
 def _turns(box: Box, far_end: int, seconds: float) -> None:
@@ -171,7 +173,7 @@ def _turns(box: Box, far_end: int, seconds: float) -> None:
         drain(far_end)
 
 
-def _playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
+def playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
     """The emulator in a process of its own, once its terminal is there."""
     command = [sys.executable, "-m", "tests.skins.load", name, str(rate_hz), str(link)]
     player = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
