@@ -9,7 +9,7 @@ DESKTOP := $(VENV)/desktop.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins reports figures chart development paper ros rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak attacked fuzz hostile flips cuts \
+.PHONY: help demo desktop test test-fast check machines lint types bench bundle skins reports figures chart development paper ros rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak attacked load fuzz hostile flips cuts \
   deploy install wheel lock clean
 
 help: ## this list
@@ -53,6 +53,10 @@ ros: build/ros/ready ## ROS 2 as wheels into build/ros (280 MB), with the action
 
 attacked: $(DESKTOP) ## a box with page, bridges and feed attached and attacked, beside one without, for MINUTES (default 5): docs/robots/
 	$(BIN)/python -m tests.robots.side_by_side --minutes $(or $(MINUTES),5)
+
+load: $(DESKTOP) ## two skins with all that can be attached, then faults, beside boxes with nothing, for MINUTES (default 60): docs/full-load.json (as root)
+	@for skin in flexitac papillarray; do [ -d build/skins/$$skin/bundle ] || nice $(BIN)/python -m tests.skins way $$skin; done
+	$(BIN)/python -m tests.campaigns.full_load --minutes $(or $(MINUTES),60) --page docs/faults.md
 
 test-hw: $(RUNTIME) ## the contract of skin, lines and port on this board (docs/board-checklist.md)
 	$(PIP) install -e '.[board]'
