@@ -26,6 +26,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -52,6 +53,8 @@ AWAY_S, FULL_S, DEAF_S, REST_S = 2.0, 15.0, 25.0, 10.0
 KEPT = 100
 """Sweeps in the black box."""
 DISK_MB = 512
+CHECKS = 5
+"""A check listens for a second, in which a few percent vary."""
 MEMORY = Path("/dev/shm")
 """Where logs and counts lie: one that waits for a disk that others keep busy would hold up the bare box, too."""
 STATE_S = 0.05
@@ -193,10 +196,12 @@ class FullLoad:
         return LoadedSide(skin, str(fmt), full, box, player, reading, counts, folder)
 
     def _reading(self, chosen: Sequence[str]) -> float:
-        """The share of a core that `palpate check` says reading a skin takes."""
+        """The share of a core that `palpate check` says reading a skin takes, the median of CHECKS."""
         command = [*self._before, sys.executable, "-m", "appliance", "check", *(f"--set={text}" for text in chosen)]
-        text = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT).stdout
-        return float(re.findall(r"([\d.]+) % of a core", text)[0]) / 100
+        texts = [
+            subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT).stdout for _ in range(CHECKS)
+        ]
+        return median(float(re.findall(r"([\d.]+) % of a core", text)[0]) / 100 for text in texts)
 
     def _feed(self, skin: str) -> Path:
         return self._folder / f"{skin}.sock"
@@ -321,10 +326,10 @@ def _measured(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None
     if MEMORY.is_dir():
         tempfile.tempdir = str(MEMORY)
     real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
-    begin = round(os.getloadavg()[2], 1)
+    ran, begin = commit(), round(os.getloadavg()[2], 1)
     found = measure(bundles, args.minutes, args.rounds, REAL_TIME if real_time else (), args.disks)
     about = {
-        "commit": commit(),
+        "commit": ran,
         "seed": load.SEED,
         "real_time": real_time,
         "load": [begin, round(os.getloadavg()[2], 1)],
