@@ -118,10 +118,12 @@ def _of_box(box: Json) -> Iterator[str]:
 
 
 def told(box: Json) -> bool:
-    """Whether the box says of all missing frames that they are. One that cannot see each, and says so, has to find as many as are
-    missing by the time that they take, and may err by a frame in each stop of the processor."""
-    stops = box["faults"].get("processor away", {}).get("times", 0)
-    return bool(abs(box["missing"] - box["counted"]) <= (0 if box["loss_known"] else stops))
+    """Whether the box says of all missing frames that they are. A skin without a count, of which the box says that losses cannot
+    be seen, leaves only the time that they take: it may err by a frame in each stop of the processor, and by any number upwards,
+    where a machine that passes bytes on late makes good frames look lost."""
+    if box["loss_known"]:
+        return bool(box["missing"] == box["counted"])
+    return bool(box["missing"] <= box["counted"] + box["faults"].get("processor away", {}).get("times", 0))
 
 
 def table(content: Json) -> str:

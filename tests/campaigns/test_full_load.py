@@ -122,9 +122,14 @@ def test_drops_without_a_fault_late_answers_and_idle_peers_are_found(content: di
 
 
 def test_a_skin_without_a_count_may_err_by_a_frame_in_each_stop(content: dict[str, Any]) -> None:
-    """It was stopped once: one frame is within what its times can tell, two are not."""
+    """It was stopped once: one frame too few is within what its times can tell, two are not; of a skin with a count none is."""
     content["boxes"][0] |= {"loss_known": False, "missing": 151}
     assert missed(content) == []
+    content["boxes"][0]["missing"] = 100
+    assert missed(content) == []
+    content["boxes"][1]["missing"] = 149
+    assert missed(content) == ["papillarray, all attached: 149 frames are missing, 150 are counted as lost"]
+    content["boxes"][1]["missing"] = 150
     content["boxes"][0]["missing"] = 152
     assert missed(content) == ["papillarray, bare: 152 frames are missing, 150 are counted as lost"]
 
