@@ -67,6 +67,8 @@ for one in (bundle.load(bundle.DEFAULT), load_bundle(settings)):
 bundle and of the one in use."""
 PACKAGES_S = BUILD_S = 600
 """Limits for installing packages and for building the environment, on a slow card."""
+SETUP_S = 120
+"""Limit for keys and certificates to be made and flushed to the disk, and for the self-test, on a slow board."""
 READY_S, STARTS = 40, 2
 """A release has failed that is not READY after so many seconds, or has ended so often."""
 LIMIT_S = 1800
@@ -116,10 +118,11 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
         box.report("building its environment")
         box.run("building the environment", build(release), user="root", stdin=f".palpate-{name}.tar", limit_s=BUILD_S)
     box.run("tidying up", "rm -f .palpate-*.tar")  # of an install that was cut after it had built, too
-    said = box.run("users, folders and settings", prepare(release, board, signers), user="root").splitlines()
+    setup = prepare(release, board, signers)
+    said = box.run("users, folders and settings", setup, user="root", limit_s=SETUP_S).splitlines()
     for line in said:
         box.report(line)
-    box.run("self-test", self_test(release), user="root", limit_s=120)
+    box.run("self-test", self_test(release), user="root", limit_s=SETUP_S)
     return switch(box, name, release, restart=any(line.startswith("board = ") for line in said))
 
 

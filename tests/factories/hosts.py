@@ -137,21 +137,37 @@ class Host:
         self.close()
 
 
+def key_of(home: Path) -> Path:
+    """A new user's key, in a home of its own that knows no host yet."""
+    ssh = home / ".ssh"
+    ssh.mkdir(parents=True)
+    (ssh / "known_hosts").touch()
+    run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", ssh / "id_ed25519")
+    return ssh / "id_ed25519"
+
+
+def desktop(
+    home: Path, command: str, *args: str | Path, where: Sequence[str] = (), limit_s: float = 600
+) -> subprocess.CompletedProcess[str]:
+    """Run systemd/COMMAND.py as the user with this home; where: a command before it."""
+    return subprocess.run(
+        [*where, sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
+        env=os.environ | {"HOME": str(home)}, capture_output=True, text=True, timeout=limit_s, check=False,
+    )  # fmt: skip
+
+
 class Hosts:
     """Several hosts side by side, and a desktop that may log in on them. kind: "bare" or "ready"."""
 
     def __init__(self, count: int, work: Path, kind: str = "ready") -> None:
         self._stack = ExitStack()
         self.work = work
-        ssh = work / ".ssh"
-        ssh.mkdir(parents=True)
-        (ssh / "known_hosts").touch()
-        run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", ssh / "id_ed25519")
+        key = key_of(work)
         root, first = set_up() / kind, 1 + os.getpid() * 8 % 240
         _fetch_wheels()
         with self._stack:
             self.hosts = [
-                self._stack.enter_context(Host(root, number, work / f"host-{number}", ssh / "id_ed25519"))
+                self._stack.enter_context(Host(root, number, work / f"host-{number}", key))
                 for number in range(first, first + count)
             ]
             self._stack = self._stack.pop_all()
@@ -169,10 +185,7 @@ class Hosts:
     ) -> subprocess.CompletedProcess[str]:
         """Run systemd/COMMAND.py as a user of the desktop who has the key; `inside` a host's own network, or here."""
         where = ("nsenter", "-t", inside.pid, "-n") if inside else ()
-        return subprocess.run(
-            [*where, sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
-            env=os.environ | {"HOME": str(self.work)}, capture_output=True, text=True, timeout=limit_s, check=False,
-        )  # fmt: skip
+        return desktop(self.work, command, *args, where=where, limit_s=limit_s)
 
     def cut(self, command: str, *args: str | Path, words: str, after_s: float) -> None:
         """The same, killed so long after it has said something."""

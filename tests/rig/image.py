@@ -28,11 +28,11 @@ GUEST_PYTHON = "3.11"
 """Python of that suite."""
 PACKAGES = (
     "systemd", "systemd-sysv", "udev", "dbus", "kmod", "libpam-systemd", "python3-venv", "libusb-1.0-0", "e2fsprogs",
-    "procps", "usbutils",
+    "procps", "usbutils", "openssh-server", "openssl", "sudo",
 )  # fmt: skip
 MODULES = (
     "virtio_blk", "virtio_pci", "ext4", "crc32c_generic", "virtio_console", "virtio_rng", "autofs4", "xhci-pci",
-    "cdc-acm", "ftdi_sio", "usbserial", "tmpfs",
+    "cdc-acm", "ftdi_sio", "usbserial", "tmpfs", "virtio_net",
 )  # fmt: skip
 EARLY = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic")
 """Modules that the ramdisk loads; everything else comes from the disk."""
@@ -176,6 +176,7 @@ def _make_root(part: Path, version: str) -> None:
         'chroot "$1" systemctl enable agent.service serial-getty@ttyAMA0.service',
         'chroot "$1" systemctl mask apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer e2scrub_reap.service '
         "getty@tty1.service systemd-timesyncd.service systemd-binfmt.service",
+        'chroot "$1" systemctl disable ssh.service systemd-networkd.service',
     )
     here = [] if not subprocess.run(["arch-test", "arm64"], capture_output=True, check=False).returncode else [
         sys.executable, HERE / "arm.py"

@@ -47,13 +47,14 @@ class Guest:
     """A guest that runs until `close`, `cut`, or it powers off.
 
     image: what it runs. folder: where its sockets and its disk go. snapshot: go on from there, instead of booting.
-    disk: use this disk as it is and write into it. code: a folder that is its second disk, read-only.
-    clock: its time. lines, serial, skin: the robot's ends of trigger and result lines, of the serial port, and of the USB cable.
+    disk: use this disk as it is and write into it. code: a folder that is its second disk, read-only. ssh: port of this
+    machine that leads to the guest's port 22, where it has one; else it has no network. clock: its time. lines, serial, skin: the robot's ends of trigger and result lines, of the serial port, and of the USB cable.
     """
 
     def __init__(
-        self, image: Image, folder: Path, *, snapshot: bool = False, disk: Path | None = None, code: Path | None = None
-    ) -> None:
+        self, image: Image, folder: Path, *, snapshot: bool = False, disk: Path | None = None, code: Path | None = None,
+        ssh: int = 0,
+    ) -> None:  # fmt: skip
         self._folder = Path(folder) / f"vm{time.monotonic_ns()}"
         self._folder.mkdir(parents=True)
         if disk is None and snapshot:
@@ -65,7 +66,7 @@ class Guest:
         redir.bind(str(self._folder / "skin"))
         redir.listen(1)
         self._process = subprocess.Popen(
-            self._command(image, snapshot), stdin=subprocess.DEVNULL, stdout=(self._folder / "qemu.log").open("wb"),
+            self._command(image, snapshot, ssh), stdin=subprocess.DEVNULL, stdout=(self._folder / "qemu.log").open("wb"),
             stderr=subprocess.STDOUT,
         )  # fmt: skip
         try:
@@ -91,8 +92,11 @@ class Guest:
         path = self._folder / "code.img"
         run("mke2fs", "-q", "-t", "ext4", "-O", "^has_journal", *given, path, "48M")
 
-    def _command(self, image: Image, snapshot: bool) -> list[str | Path]:
+    def _command(self, image: Image, snapshot: bool, ssh: int) -> list[str | Path]:
         at = self._folder
+
+        forward = f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{ssh}-:22"
+        network = ["-netdev", forward, "-device", "virtio-net-pci,netdev=net,addr=0xb,romfile="] if ssh else []
 
         def port(name: str) -> tuple[str, str]:
             return "-chardev", f"socket,id={name},path={at}/{name},server=on,wait=off"
@@ -111,7 +115,7 @@ class Guest:
             *port("bench"), "-device", "virtserialport,chardev=bench,name=palpate.bench",
             "-chardev", f"file,id=console,path={at}/console", "-serial", "chardev:console",
             "-qmp", f"unix:{at}/qmp,server=on,wait=off",
-            "-qtest", f"unix:{at}/qtest,server=on,wait=off", "-qtest-log", "/dev/null",
+            "-qtest", f"unix:{at}/qtest,server=on,wait=off", "-qtest-log", "/dev/null", *network,
             *(["-loadvm", "ready"] if snapshot else []),
         ]  # fmt: skip
 
