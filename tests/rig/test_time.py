@@ -87,6 +87,7 @@ def clock(shared: Cell) -> KernelClock:
     """The service keeps its sweeps; sweeps whose answer is known."""
     shared.acts, shared.packet_frames = known(script.tubes(2)), 12
     runs_with(shared.machine, f"record --out {KEPT}")
+    shared.plug()  # a box that records ends where there is no skin, and is started again
     shared.machine.run("systemctl stop palpate; systemctl start --no-block palpate", check=True, timeout_s=60)
     shared.serial.wait_for("$PPLP,STA,", 120, len(shared.serial.heard))
     return KernelClock(shared.machine)
