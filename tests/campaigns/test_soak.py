@@ -558,6 +558,10 @@ def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
     (tmp_path / "page" / "index.html").unlink()
     assert soak.draw(tmp_path / "no records", tmp_path / "page")
     assert (tmp_path / "page" / "index.html").read_text() == first
+    soak.write(tmp_path / "other" / "virtual-box.json", record | {"box": "virtual box"})
+    assert soak.draw(tmp_path / "other", tmp_path / "page")  # the box that was not recorded again stays
+    kept = json.loads((tmp_path / "page" / "results.json").read_text())
+    assert list(kept["boxes"]) == ["this machine", "virtual box"]
     record["runs"][0]["due"] += 1
     soak.write(tmp_path / "this-machine.json", record)
     assert not soak.draw(tmp_path, tmp_path / "page")

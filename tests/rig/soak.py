@@ -230,10 +230,10 @@ def soak(
 def draw(work: Path, out: Path) -> bool:
     """Put the records together, judge and draw them; False where a target was not reached.
 
-    Where `work` holds no record, those of the page in `out` are judged and drawn again.
+    A box of which `work` holds no record keeps that of the page in `out`, which is judged and drawn again.
     """
     paths = [work / f"{name.replace(' ', '-')}.json" for name in BOXES]
-    records = [json.loads(path.read_text()) for path in paths if path.exists()] or _drawn(out)
+    records = [*_drawn(out), *(json.loads(path.read_text()) for path in paths if path.exists())]
     boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}
     results = {
         "columns": {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE},

@@ -33,7 +33,8 @@ SITE = "/etc/palpate/palpate.toml"
 needs_time = pytest.mark.skipif(HOW != "full", reason="starts the service again; make test-rig COUNTS=full")
 DAMAGE = """
 import pathlib, shutil
-from appliance import bundle, errors
+from appliance.bundle import bundle
+from appliance.core import errors
 whole, broken = pathlib.Path(bundle.DEFAULT), pathlib.Path("/run/broken")
 for name in sorted(p.name for p in whole.iterdir()):
     data = (whole / name).read_bytes()
@@ -73,15 +74,16 @@ def box(keeping: Cell, cell: Cell) -> Cell:
 
 
 def sound(cell: Cell) -> Answer:
-    """A sweep that is answered `ok`, when all that follows an answer in its turn has been done too."""
+    """A sweep that is answered `recorded`, as a box does that keeps its sweeps, when all that follows an answer in its turn
+    has been done too."""
     answers = []
     for _ in range(TRIES):
         touch, answer = cell.sweep(ANSWER_S)
         answers.append(not_wrong(touch, answer))
         state(cell)
-        if answer.status == "ok":
+        if answer.status == "recorded":
             return answer
-    raise AssertionError(f"no sweep is ok: {answers}")
+    raise AssertionError(f"no sweep is recorded: {answers}")
 
 
 def journal_count(cell: Cell, text: str) -> int:
@@ -174,7 +176,7 @@ def test_clock_set(box: Cell, note: Callable[..., None]):
     for change in ("-1 hour", "+1 year"):
         touch, since = begin(box)
         box.machine.run(f"date -s \"$(date -d '{change}')\"", check=True)
-        assert not_wrong(touch, box.answer(since, ANSWER_S)) in ("ok", "gap")
+        assert not_wrong(touch, box.answer(since, ANSWER_S)) in ("recorded", "gap")
         times = [float(line.split(",")[2]) for _, line in box.serial.heard[since:] if line.startswith("$PPLP,STA,")]
         assert times == sorted(times)
     sound(box)
@@ -218,7 +220,7 @@ def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[.
     finally:
         box.machine.run("systemctl stop 'hog*'", timeout_s=120, check=True)
     # without a turn for half a second it takes the skin for silent, and starts it again
-    assert answers.keys() <= {"ok", "no-contact", "gap", "sensor-lost"}, box.journal(40)
+    assert answers.keys() <= {"recorded", "no-contact", "gap", "sensor-lost"}, box.journal(40)
     assert answers["sensor-lost"] <= journal_count(box, silent) - logged
     sound(box)
     more = int(state(box)["lost"]) - lost
