@@ -47,6 +47,8 @@ MANY = 10_000
 """Of so many interrupts more than the kernel's 1024 events stay, however many are joined."""
 HALT_S = 60
 """Less than the watchdog's time in the guest; a machine that is busy gets so many edges to the guest in no less."""
+LOST_EDGES = 15
+"""Of a state sentence: the edges that the kernel dropped (PROTOCOL.md, part 2)."""
 WIDTHS_S = (0.0005, 0.001, 0.002, 0.005)
 
 
@@ -209,16 +211,17 @@ def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
         pulse(cell, "STOP")
     assert statuses(cell, since, 1) == ["short"]
     note("start and stop in one turn", "short", 1)
-    since = len(cell.serial.heard)
+    since, dropped = len(cell.serial.heard), int(cell.state()[LOST_EDGES])
     with halted(cell):
         pulse(cell, "START")
         begun, end = interrupts(cell), cell.clock.now_s() + HALT_S
         while interrupts(cell) < begun + MANY and cell.clock.now_s() < end:
             toggle(cell, "STOP", 1000)
     cell.until_ready(20)
-    cell.state()
+    assert int(cell.state()[LOST_EDGES]) > dropped
     outcomes = [answer.status for answer in cell.answers(since)]
-    assert outcomes in (["edges-lost"], ["not-ready", "edges-lost"])
+    # the skin may have gone stale while the program stood still; the one start edge has one answer either way
+    assert outcomes in (["edges-lost"], ["not-ready"])
     check_recovers(cell)
     note("event queue overrun", f"{', '.join(outcomes)}; then a right verdict", 1)
 
