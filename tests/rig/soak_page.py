@@ -141,7 +141,7 @@ def charts(records: Json) -> str:
     ):
         row, column = divmod(i, 2)
         left, top = 0.1 + 0.5 * column, 0.9 - 0.47 * row
-        axes = add_axes(figure, left, left + 0.385, top, top - 0.3)
+        axes = add_axes(figure, left, left + 0.375, top, top - 0.3)  # the last tick is centred on the end
         axes.set_xlim(0, 60 * hours / by * 1.01)
         for (_, box), look in zip(boxes, LOOKS, strict=False):
             draw(axes, box, look, 60 * by)
