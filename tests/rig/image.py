@@ -95,6 +95,13 @@ def box(on: Path, log: Callable[[str], None] = print) -> Image:
     return made
 
 
+def layer(on: Path, folder: Path) -> Path:
+    """A new disk in `folder` on top of a ground's, which stays as it is."""
+    disk = folder / "disk.qcow2"
+    run("qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", on / "disk.img", disk)
+    return disk
+
+
 def lacking(tools: Iterable[str] = TOOLS) -> list[str]:
     """Debian packages of those tools that are not installed."""
     path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
@@ -245,8 +252,7 @@ def _make_box(part: Path, on: Path) -> None:
         shutil.copytree(ROOT / folder, code / folder)
     for file in ("install.sh", "palpate.toml"):
         shutil.copy(GUEST / file, code)
-    disk = part / "disk.qcow2"
-    run("qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", on / "disk.img", disk)
+    disk = layer(on, part)
     with Guest(Image(on, disk), part, code=code) as guest:
         guest.ready(180)
         guest.run("mkdir -p /code && mount -o ro /dev/vdb /code", check=True)

@@ -23,7 +23,7 @@ from appliance.deployment.state import MOST_STARTS
 from appliance.sim import script
 from tests.factories import deliveries, emulated_machines, hosts
 from tests.rig.cell import Cell
-from tests.rig.image import GUEST, Image, ground
+from tests.rig.image import GUEST, Image, ground, layer
 from tests.rig.kept import PALPATE, found
 from tests.rig.machine import Guest
 from tests.rig.notes import HOW
@@ -62,8 +62,7 @@ class BareBox:
 
     def __init__(self, on: Path, folder: Path) -> None:
         self.folder, self.sha = folder, list[str]()
-        self.disk = folder / "disk.qcow2"
-        emulated_machines.run("qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", on / "disk.img", self.disk)
+        self.disk = layer(on, folder)
         self._image = Image(on, self.disk)
         self._home, self._signer = folder / "home", deliveries.key(folder / "keys")
         self._key = hosts.key_of(self._home)

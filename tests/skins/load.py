@@ -1,8 +1,8 @@
 """What a skin costs the box at its full rate, in real time. In: the name of a profile, its bundle, seconds. Out: figures.
 
 The emulator plays in a process of its own, and each frame carries its number in two taxels, so that lost ones are seen
-whatever the skin, and up to two seconds of them at once. The box classifies one sweep after the other. Both run under real-time scheduling where that is allowed:
-what is measured is the box, and not what else the machine does.
+whatever the skin, up to 10,000 of them at once: ten seconds at 1 kHz. The box classifies one sweep after the other. Both run under
+real-time scheduling where that is allowed: what is measured is the box, and not what else the machine does.
 """
 
 from __future__ import annotations
