@@ -74,8 +74,9 @@ class SkinBox(SharedLine):
 
 @dataclass
 class LoadedSide:
-    """One box and its robot. reading: share of a core that `palpate check` says reading its skin takes. folder: its disk. heard: lines; results: of each sweep; kept: by outcome of REC. looks: (time, processor
-    seconds, KiB resident). timed: when each answer came, milliseconds in the box. deaf: while it is set, nobody reads."""
+    """One box and its robot. reading: share of a core that `palpate check` says reading its skin takes. folder: its disk.
+    heard: lines; results: of each sweep; kept: by outcome of REC. looks: (time, processor seconds, KiB resident).
+    timed: when each answer came, milliseconds in the box. deaf: while it is set, nobody reads."""
 
     skin: str
     format: str

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import socket
 import struct
 import threading
@@ -16,6 +18,7 @@ from appliance.io import packets
 from appliance.sim import rig, skin
 from tests.factories import emulated_machines
 from tests.rig import image, notes
+from tests.rig import shell as shell_lines
 from tests.rig.guest_clock import HZ, STILL_S, WRAP, GuestClock
 from tests.rig.lines import HOLD_NS, GuestLines
 from tests.rig.qtest import Qtest
@@ -228,3 +231,40 @@ def test_a_reply_that_crosses_a_cancellation_comes_again():
     guest.bulk(3)
     assert guest.frames() == first + board.skin.packet_frames
     guest.peer.close()
+
+
+@pytest.fixture
+def shell(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[shell_lines.Shell, socket.socket]]:
+    """A shell whose agent is the test, at the other end of a socket; it waits 0.2 s beyond a line's own time."""
+    monkeypatch.setattr(shell_lines, "REPLY_S", 0.2)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        yield shell_lines.Shell(ours, GuestClock(lambda: time.monotonic_ns() * HZ // 1_000_000_000 % WRAP)), theirs
+
+
+def agent_says(port: socket.socket, *lines: tuple[int, str]) -> None:
+    """Answers as the guest's agent gives them, in the order of the lines."""
+    for rc, out in lines:
+        port.sendall(json.dumps({"rc": rc, "out": base64.b64encode(out.encode()).decode()}).encode() + b"\n")
+
+
+def test_a_late_answer_is_not_the_next_line_s(shell: tuple[shell_lines.Shell, socket.socket]):
+    """A line that the guest answers too late fails; the next one gets its own answer, not that one."""
+    lines, port = shell
+    with pytest.raises(shell_lines.GuestFailed, match="sent nothing for 0 s to: slow"):
+        lines.run("slow", timeout_s=0)
+    agent_says(port, (0, "late"), (3, "in time"))
+    assert lines.run("quick", timeout_s=5) == shell_lines.Done(3, "in time")
+    agent_says(port, (0, "next"))
+    assert lines.run("third", timeout_s=5).out == "next"
+
+
+def test_a_line_that_fails_is_told(shell: tuple[shell_lines.Shell, socket.socket]):
+    """With check, an exit code other than 0 and what the line said are in the error; a guest that has left is told."""
+    lines, port = shell
+    agent_says(port, (2, "no such file"))
+    with pytest.raises(shell_lines.GuestFailed, match="rc 2 of: ls\nno such file"):
+        lines.run("ls", timeout_s=5, check=True)
+    port.close()
+    with pytest.raises(shell_lines.GuestFailed, match="has left before: ls"):
+        lines.run("ls", timeout_s=5)

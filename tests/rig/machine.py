@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import base64
 import json
-import select
 import shutil
 import socket
 import subprocess
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,6 +21,7 @@ from tests.rig.far_end import FarEnd
 from tests.rig.image import LINES, MACHINE, Image
 from tests.rig.lines import GuestLines
 from tests.rig.qtest import Qtest
+from tests.rig.shell import Done, GuestFailed, Shell
 from tests.rig.usbredir import UsbRedirPeer
 
 START_S = 60
@@ -31,24 +30,13 @@ CARDS_S = 600
 """Longest wait for a kernel that boots to set up its cards, by the host's time: no other is known yet."""
 
 
-class GuestFailed(AssertionError):
-    """The guest did not do what it was asked to."""
-
-
-@dataclass(frozen=True, slots=True)
-class Done:
-    """How a shell line ended: its exit code and its output. rc 124: it ran out of time."""
-
-    rc: int
-    out: str
-
-
 class Guest:
     """A guest that runs until `close`, `cut`, or it powers off.
 
     image: what it runs. folder: where its sockets and its disk go. snapshot: go on from there, instead of booting.
     disk: use this disk as it is and write into it. code: a folder that is its second disk, read-only. ssh: port of this
-    machine that leads to the guest's port 22, where it has one; else it has no network. clock: its time. lines, serial, skin: the robot's ends of trigger and result lines, of the serial port, and of the USB cable.
+    machine that leads to the guest's port 22, where it has one; else it has no network. clock: its time. lines, serial,
+    skin: the robot's ends of trigger and result lines, of the serial port, and of the USB cable.
     """
 
     def __init__(
@@ -73,10 +61,10 @@ class Guest:
             self._qmp = self._connect("qmp").makefile("rw")
             self._qmp.readline()
             self.qmp("qmp_capabilities")
-            self._agent = self._connect("agent")
-            self._rest = b""
+            agent = self._connect("agent")
             self._qtest = Qtest(self._connect("qtest"))
             self.clock = guest_clock.find(self._qtest, CARDS_S)
+            self._shell = Shell(agent, self.clock)
             self.serial = FarEnd(self._folder / "robot", self.clock)
             self.lines = GuestLines(self._qtest, self.clock, self._find("pl061"), LINES)
             self.skin = self._plug_cable(redir)
@@ -147,7 +135,7 @@ class Guest:
         return UsbRedirPeer(listener.accept()[0], self.clock)
 
     def qmp(self, execute: str, **arguments: Any) -> Any:
-        """Ask QEMU's monitor; what it returns. Raises Failed where it refuses."""
+        """Ask QEMU's monitor; what it returns. Raises GuestFailed where it refuses."""
         self._qmp.write(json.dumps({"execute": execute, "arguments": arguments}) + "\n")
         self._qmp.flush()
         for line in self._qmp:
@@ -159,30 +147,12 @@ class Guest:
         raise GuestFailed(f"qemu has left during {execute}")
 
     def ready(self, timeout_s: float) -> None:
-        """Wait until the guest runs shell lines. Raises Failed where it does not."""
+        """Wait until the guest runs shell lines. Raises GuestFailed where it does not."""
         self.run("true", timeout_s=timeout_s)
 
     def run(self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b"") -> Done:
-        """Run a shell line as root; waits for its end. Raises Failed where the guest says nothing, or check asks."""
-        request = {"run": line, "timeout_s": timeout_s, "stdin": base64.b64encode(stdin).decode()}
-        self._agent.sendall(json.dumps(request).encode() + b"\n")
-        if not self.clock.until(lambda: self._heard_answer(line), timeout_s + START_S):
-            raise GuestFailed(f"the guest sent nothing for {timeout_s + START_S:.0f} s to: {line}")
-        answer, _, self._rest = self._rest.partition(b"\n")
-        reply = json.loads(answer)
-        done = Done(reply["rc"], base64.b64decode(reply["out"]).decode(errors="replace"))
-        if check and done.rc:
-            raise GuestFailed(f"rc {done.rc} of: {line}\n{done.out[-2000:]}")
-        return done
-
-    def _heard_answer(self, line: str) -> bool:
-        """Whether the agent's answer is there whole."""
-        if b"\n" not in self._rest and select.select([self._agent], [], [], 0)[0]:
-            more = self._agent.recv(1 << 20)
-            if not more:
-                raise GuestFailed(f"the guest has left during: {line}")
-            self._rest += more
-        return b"\n" in self._rest
+        """Run a shell line as root; waits for its end. Raises GuestFailed where the guest says nothing, or check asks."""
+        return self._shell.run(line, timeout_s=timeout_s, check=check, stdin=stdin)
 
     def put(self, path: str, data: bytes) -> None:
         """Write a file of the guest."""

@@ -25,7 +25,8 @@ from appliance.sim import rig, script, skin
 from tests.factories.emulated_machines import LOCK
 from tests.rig import image
 from tests.rig.cell import IDLE
-from tests.rig.machine import Guest, GuestFailed
+from tests.rig.machine import Guest
+from tests.rig.shell import GuestFailed
 from tests.rig.soak_boxes import Gone, Script, process
 
 READY_S = 180

@@ -24,8 +24,9 @@ from tests.rig.cell import SEEN_S, Cell
 from tests.rig.far_end import ADAPTER
 from tests.rig.image import Image
 from tests.rig.kept import PALPATE, runs_with
-from tests.rig.machine import START_S, Guest, GuestFailed
+from tests.rig.machine import START_S, Guest
 from tests.rig.pulled import after, before, during
+from tests.rig.shell import GuestFailed
 from tests.rig.sound import check_recovers, known, not_wrong, state
 
 Count = Callable[[int, int], int]

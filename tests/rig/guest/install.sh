@@ -13,14 +13,6 @@ install -m 644 firmware_config/70-palpate.rules /etc/udev/rules.d/70-palpate.rul
 cat > /etc/udev/rules.d/71-rig.rules <<'RULE'
 SUBSYSTEM=="tty", KERNELS=="0000:00:08.0", SYMLINK+="palpate-robot"
 RULE
-# an emulated processor that shares a busy machine takes ten times as long for everything
-mkdir -p /etc/systemd/system/palpate.service.d
-cat > /etc/systemd/system/palpate.service.d/rig.conf <<'UNIT'
-[Service]
-WatchdogSec=120
-TimeoutStartSec=600
-TimeoutStopSec=60
-UNIT
 systemd-sysusers
 systemd-tmpfiles --create palpate.conf
 udevadm control --reload
