@@ -57,11 +57,14 @@ LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS
 PIP = "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index --root-user-action=ignore"
 SELF_TEST = """
 import sys; from pathlib import Path; from appliance.bundle import bundle
-from appliance.cli.commands import load_bundle; from appliance.core import clock, config
+from appliance.cli.commands import load_bundle; from appliance.core import clock, config, errors
 from appliance.inference import classifier
-settings = config.load(None, folder=Path(sys.argv[1]))
-for one in (bundle.load(bundle.DEFAULT), load_bundle(settings)):
-    classifier.Classifier(one, clock.SystemClock()).self_test()
+try:
+    settings = config.load(None, folder=Path(sys.argv[1]))
+    for one in (bundle.load(bundle.DEFAULT), load_bundle(settings)):
+        classifier.Classifier(one, clock.SystemClock()).self_test()
+except errors.ApplianceError as e:
+    sys.exit(str(e))
 """
 """Program that a new release must run without an error: reads the settings, and runs the golden sweeps of the packaged
 bundle and of the one in use."""

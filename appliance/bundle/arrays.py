@@ -30,6 +30,9 @@ def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
             )
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
             arrays = dict(z.items())
+        for name, values in arrays.items():
+            if not isinstance(values, np.ndarray):  # numpy gives what does not begin as an array does as it is
+                raise BundleError(f"{file} cannot be read: {name!r} is no array; export the bundle again")
         return {name: arrays[name] for name in names} | arrays
     except (*UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
         raise BundleError(f"{file} cannot be read: {e}; export the bundle again") from e

@@ -107,7 +107,7 @@ def mutated(data: bytes, random: Random, plain: Callable[[bytes], bytes]) -> byt
     """One or two arrays changed, taken out or written twice, and the archive made right again; or bytes changed."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
-            arrays = dict(z.items())
+            arrays = {name: values for name, values in z.items() if isinstance(values, np.ndarray)}  # else plain bytes
     except Exception:  # whatever numpy says of an archive that is not one
         return plain(data)
     if not arrays or random.random() < 0.2:

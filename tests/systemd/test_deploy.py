@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -24,8 +25,9 @@ import pytest
 from tests.factories import deliveries, emulated_machines, hosts
 from tests.factories.install_scripts import SCRIPTS, run_here
 from tests.factories.nspawn import CABLE, CABLED, PALPATE, SIM, WAIT_S
+from tests.factories.paths import ROOT
 
-pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+PYINFRA = pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
 
 
 @pytest.fixture(scope="session")
@@ -461,6 +463,7 @@ def test_a_user_who_needs_a_password_for_sudo_is_refused(
         ("tar: x: write error: No space left on device\ntar: Exiting with failure", "No space left.*; free some room"),
         ("sudo: a password is required", "a password is required; let the user in without"),
         ("robot is not in the sudoers file.", "sudoers file.; let the user in"),
+        ("bash: line 1: sudo: command not found", "not found; log in as root, or install sudo there"),
         ("E: one\nE: two", "^copying: E: two$"),
         ("", "no reason given"),
     ],
@@ -477,6 +480,67 @@ except fleet.Failed as e:
     print(e)
 """
     assert re.search(why, run_here(code))
+
+
+@pytest.mark.parametrize(
+    ("said", "do"),
+    [
+        ("Could not resolve hostname", "check the name, or use the address"),
+        ("Could not connect", "check the address, and that the box is on"),
+        ("Authentication error", "let your key in: ssh-copy-id"),
+        ("SSH error", "what answers there is no ssh"),
+    ],
+)
+def test_a_box_that_cannot_be_reached_comes_with_what_to_do(said: str, do: str):
+    """By the words of pyinfra, which are looked up in its code, so that those of another version are missed here."""
+    assert f'"{said}' in (Path(PYINFRA.__file__).parent / "connectors" / "ssh.py").read_text()
+    assert f"; {do}" in run_here(f"import fleet; print(fleet.with_remedy('{said}: box'))")
+
+
+def test_packages_that_cannot_be_had_come_with_the_cause():
+    """Mirrors are named where nothing else is known, and not beside a cause that is."""
+    code = """
+import install, fleet
+class Box:
+    def __init__(self, why): self.why = why
+    def report(self, text): pass
+    def run(self, what, command, **options):
+        if what == "apt-get": raise fleet.Failed(fleet.with_remedy(self.why))
+        return ""
+for why in ("apt-get: E: Unable to locate package", "apt-get: sh: 1: sudo: not found"):
+    try: install.packages(Box(why))
+    except install.Failed as e: print(e)
+"""
+    plain, sudo = run_here(code).splitlines()
+    assert plain.endswith("Unable to locate package; give the box a way to Debian's mirrors, or install it there")
+    assert sudo.endswith("sudo: not found; log in as root, or install sudo there")
+
+
+def test_a_copy_that_fails_names_the_disk():
+    """Over SFTP a full disk is no more than "Failure"."""
+    code = """
+import fleet
+from types import SimpleNamespace
+def full(content, name): raise OSError("Failure")
+try:
+    fleet.FleetBox(SimpleNamespace(name="box", put_file=full), False).put(None, "bundle.tar")
+except fleet.Failed as e:
+    print(e)
+"""
+    assert run_here(code) == "copying bundle.tar: Failure; see whether its disk is full (df -h) and try again"
+
+
+def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
+    """Its error is a line without the names of classes, as the box itself says it."""
+    (tmp_path / "sensor.toml").write_text("[sensor]\nbuad = 9600\n")
+    script = run_here("import install; print(install.SELF_TEST)")
+    done = subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "buad" in done.stderr
+    assert "Error" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    shutil.copy(ROOT / "firmware_config" / "sensor.toml", tmp_path)
+    assert subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT).returncode == 0
 
 
 @pytest.mark.slow

@@ -231,7 +231,13 @@ def run_pack(args: argparse.Namespace) -> None:
     pack.check_target(args.out)
     (method,) = methods.find([args.method], options.effort(args))
     content = pack.trained(method, labels.check(options.load(args, args.seed)), args.seed)
-    _print(pack.pack(quantized_bundle.checked(content, content.reference), *_packing(args)), args.out)
+    try:
+        content = quantized_bundle.checked(content, content.reference)
+    except pack.ExportRefused as e:
+        raise pack.ExportRefused(
+            f"{e}; or make the bundle with palpate-train fit and export, which keep the float form where int8 differs"
+        ) from e
+    _print(pack.pack(content, *_packing(args)), args.out)
 
 
 def run_score(args: argparse.Namespace) -> None:

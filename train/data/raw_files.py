@@ -50,7 +50,7 @@ def read(path: Path, variable: str = "") -> Table:
             return _plain(np.load(path, allow_pickle=False))
         if suffix == ".npz":
             with np.load(path, allow_pickle=False) as z:
-                return _chosen({name: z[name] for name in z.files}, variable)
+                return _chosen({name: _array(name, z[name]) for name in z.files}, variable)
         if suffix == ".mat":
             return _chosen(_mat(path), variable)
         if suffix in HDF5 or h5py.is_hdf5(path):
@@ -58,6 +58,13 @@ def read(path: Path, variable: str = "") -> Table:
         return _text(path.read_bytes())
     except DAMAGED as e:
         raise FormatError(f"cannot be read: {' '.join(str(e).split())}") from e
+
+
+def _array(name: str, values: Array | bytes) -> Array:
+    """What numpy found under a name of an .npz: an array, or as it is what does not begin as one."""
+    if isinstance(values, bytes):
+        raise ValueError(f"{name!r} is no array")
+    return values
 
 
 def _plain(values: Array) -> Table:

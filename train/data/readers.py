@@ -247,8 +247,7 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
     samples, unloaded, moved = one_level(
         np.stack([one.sweep.frames.taxels for one in kept]), np.stack([one.unloaded for one in kept])
     )
-    if moved:
-        source += f" ({moved} of {len(kept)} brought to the unloaded skin of the others: it was tared between)"
+    source += moved
     rate = np.array(kept[0].format.rate_hz)
     about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
     if np.isfinite(unloaded).any():
@@ -256,17 +255,17 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
     return build({"samples": samples} | about | groups, source, kind)
 
 
-def one_level(samples: Array, unloaded: Array) -> tuple[Array, Array, int]:
+def one_level(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:
     """Raw counts [n, T, R, C] or [n, T, R, C, A] of skins that were tared at different times, as if they had been tared alike:
     those whose unloaded skin lies elsewhere than that of most, by what counts as a load, are moved by the difference.
 
     unloaded: as RecordedSweep.unloaded, of each [n, 2, R, C] or [n, 2, R, C, A]; a sweep of which it is not known stays as it
     is. Smaller differences stay, too: a skin drifts like that in service. Whole counts stay whole, and in the range of their type.
-    Returns both as they are then, and how many were moved.
+    Returns both as they are then, and words for the set's source: how many were moved, "" for none.
     """
     known = np.isfinite(unloaded).all(axis=tuple(range(1, unloaded.ndim)))
     if not known.any():
-        return samples, unloaded, 0
+        return samples, unloaded, ""
     levels = unloaded[known, 0]
     away = np.abs(levels - np.median(levels, axis=0)).sum(axis=tuple(range(1, levels.ndim)))
     usual = levels[away.argmin()]  # one that was there: the median of two halves would be a skin that nobody has
@@ -283,7 +282,8 @@ def one_level(samples: Array, unloaded: Array) -> tuple[Array, Array, int]:
             samples[i] = np.clip(samples[i] + change, limits.min, limits.max).astype(samples.dtype)
         unloaded[i, 0] += change
         moved += 1
-    return samples, unloaded, moved
+    told = f" ({moved} of {len(samples)} brought to the unloaded skin of the others: it was tared between)"
+    return samples, unloaded, told if moved else ""
 
 
 def counted(reasons: Counter[str]) -> str:

@@ -171,7 +171,8 @@ def join(sets: Sequence[Dataset]) -> Dataset:
     """One set of several with the same format and materials, the groups that all have, and the group `set`, its index.
 
     Recordings, positions, sessions and objects are renumbered, since number 0 of two sets is not the same one; a force or
-    a speed is. A single set is not changed. Raises FormatError where the sets differ in format or materials.
+    a speed is. Where the skin was tared between, all are brought to one level, as in a folder. A single set is not changed.
+    Raises FormatError where the sets differ in format or materials.
     """
     if len(sets) == 1:
         return sets[0]
@@ -196,8 +197,11 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
             parts = [part - part.min() + start for part, start in zip(parts, starts, strict=False)]
         groups[name] = np.concatenate(parts)
     samples, labels = (np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels"))
-    source = " + ".join(s.source for s in sets)
-    return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, _unloaded(sets))
+    source, unloaded = " + ".join(s.source for s in sets), _unloaded(sets)
+    if unloaded is not None:  # each set is at a level by itself; that of the other may be another
+        samples, unloaded, moved = readers.one_level(samples, unloaded)
+        source += moved
+    return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded)
 
 
 def _unloaded(sets: Sequence[Dataset]) -> Array | None:

@@ -10,6 +10,7 @@ import io
 import os
 import platform
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -31,6 +32,7 @@ from appliance.core.types import Status
 from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, softmax
 from appliance.inference.novelty import shaped_distances
 from train.calibration.posthoc import HeldOut, calibrate
+from train.data.readers import counted
 from train.data.sets import Dataset
 from train.export import bundle_score, contact_limit
 from train.export.contact_positions import place_of
@@ -358,14 +360,15 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
     if other := int(np.sum((answers != logits.argmax(1)) & (answers >= 0))):
         raise ExportRefused(f"the box labels {other} of {len(held_out)} held-out sweeps otherwise than export did")
     if refused.mean() > MOST_REFUSED:
+        reasons = Counter(str(v.status) for _, v in bundle_score.answers(box, held_out) if not v.label)
         raise ExportRefused(
-            f"the box would refuse {refused.sum()} of {len(held_out)} held-out sweeps (limit {MOST_REFUSED:.0%}); "
-            f"see their thresholds {box.bundle.manifest.thresholds}, and drop sweeps with stuck taxels from the set"
+            f"the box would refuse {refused.sum()} of {len(held_out)} held-out sweeps (limit {MOST_REFUSED:.0%}), by status: "
+            f"{counted(reasons)}. Drop such sweeps from the set; where they are saturated, name the skin's --full-scale"
         )
     if unknown.mean() > MOST_UNKNOWN:
         raise ExportRefused(
             f"the box would call {unknown.sum()} of {len(held_out)} held-out sweeps unknown (limit {MOST_UNKNOWN:.0%}, "
-            f"squared distance {box.bundle.manifest.known}); record more positions, so that it learns how sweeps vary"
+            f"squared distance {box.bundle.manifest.known.limit:.4g}); record more positions, so that it learns how sweeps vary"
         )
     return figures(box, held_out, protocol, logits)
 

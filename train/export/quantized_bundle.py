@@ -117,7 +117,7 @@ def check(found: Parity) -> None:
     apart, lost = found.apart, found.lost
     if apart is None or lost is None:
         raise ExportRefused("there is no float form that int8 could be compared with; export a fit")
-    hint = "drop training sweeps that are unlike all others, record more, or take a larger network"
+    hint = "drop training sweeps that are unlike all others, or record more"
     if found.layers:
         worst = min(found.layers, key=lambda layer: (layer.saturated < SATURATED, layer.sqnr_db))
         hint = (f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond what int8 reaches; "

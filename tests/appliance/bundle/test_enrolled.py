@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from appliance.bundle import bundle, enrolled
+from appliance.bundle import arrays, bundle, enrolled
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError
 from appliance.inference import enrolment
@@ -118,8 +119,19 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_an_enrolment_that_is_not_as_it_must_be_is_refused(made: dict[str, bytes], case: str):
     """Of another bundle, another form, out of range: a BundleError that says what to do."""
-    arrays, why = WRONG[case]
-    check_refused(changed(made, **arrays), why)
+    changes, why = WRONG[case]
+    check_refused(changed(made, **changes), why)
+
+
+@pytest.mark.parametrize("name", [bundle.ENROLMENT, bundle.GOLDEN, bundle.MEANS])
+def test_a_member_that_is_no_array_is_refused(made: dict[str, bytes], name: str):
+    """numpy gives it as the bytes that it is; it is named before anything asks for its type."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(made[name])) as whole, zipfile.ZipFile(file, "w") as damaged:
+        for member in whole.namelist():
+            damaged.writestr(member, b"nothing" if member == whole.namelist()[0] else whole.read(member))
+    with pytest.raises(BundleError, match=rf"{name} cannot be read: '\w+' is no array"):
+        arrays.read(file.getvalue(), name)
 
 
 def test_a_file_that_is_no_npz_is_refused(made: dict[str, bytes]):

@@ -254,10 +254,12 @@ def test_check_of_a_trigger_without_lines(mode: str, capsys: pytest.CaptureFixtu
     assert f"ok    trigger        {mode}, no lines" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("form", ["", "4x4:uint8:750"])
 def test_record_on_a_machine_without_gpio(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], form: str
 ):
-    """A PC: no line is wired, gpiod cannot be imported, no bundle is there; sweeps by the clock are recorded."""
+    """A PC: no line is wired, gpiod cannot be imported, no bundle is there; sweeps by the clock are recorded, in the form
+    that the skin announces, or that a person describes."""
     simulated = main_module._simulated(
         "skin", None, argparse.Namespace(seed=1, sweeps=None, virtual=True), config.load(None)
     )
@@ -265,7 +267,10 @@ def test_record_on_a_machine_without_gpio(
     monkeypatch.setattr(main_module, "Devices", lambda clock: plain)
     monkeypatch.setitem(sys.modules, "gpiod", None)
     monkeypatch.setattr("appliance.cli.commands.load_bundle", None)
-    code = main(["record", "--every", "4", "--sweeps", "3", "--out", str(tmp_path), "--material", "wood"])
+    if form:
+        monkeypatch.setattr("appliance.io.skins.announced", None)
+    described = ["--format", form] if form else []
+    code = main(["record", "--every", "4", "--sweeps", "3", "--out", str(tmp_path), "--material", "wood", *described])
     assert code == 0
     assert len([*tmp_path.glob("*.npy")]) == 3
     about = json.loads((tmp_path / "sweep-000001.json").read_text())

@@ -305,10 +305,14 @@ def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
-    """Another format, golden sweeps with other results, a folder that is a file: each is an error that says what to
+    """Another format, more memory than there is for two, golden sweeps with other results, a folder that is a file: each is an error that says what to
     try."""
     with pytest.raises(BundleError, match="wants 4x4 uint8"):
         side(lambda b: default_bundle)
+    with pytest.raises(
+        BundleError, match=r"bbbbbbbb may need 179 MB and the bundle in service \d+, .* without a shadow"
+    ):
+        side(lambda b: replace(b, id="bbbbbbbb", memory=shadow.MOST_MEMORY - b.memory + 1))
     with pytest.raises(BundleError, match="golden sweeps"):
         side(lambda b: replace(b, golden_logits=b.golden_logits[:, ::-1].copy()))
     assert shadow.read(tmp_path / "shadow").starts == 0  # refused is not died

@@ -57,6 +57,16 @@ def test_a_rate_that_can_be_set_is_that_of_the_bundle():
     assert skins.announced(chosen, simulated, replace(wanted, rate_hz=300)).rate_hz == 1000
 
 
+def test_a_form_that_a_person_describes():
+    """The examples of the error are understood, with a window of two seconds; what is none is refused with them."""
+    assert skins.described("5x3:float32:100") == SweepFormat(5, 3, 100.0, 200, "float32")
+    assert skins.described(" 4x4x3:int16:250 ") == SweepFormat(4, 4, 250.0, 500, "int16", 3)
+    with pytest.raises(ConfigError, match=r"--format 5x3: not understood.* 5x3:float32:100 or 4x4x3:int16:250"):
+        skins.described("5x3")
+    with pytest.raises(ConfigError, match=r"--format 0x3:int16:9: a grid of 0 x 3"):
+        skins.described("0x3:int16:9")
+
+
 def test_a_wrong_profile_is_named():
     """Nothing is guessed."""
     with pytest.raises(ConfigError, match="did you mean flexitac"):

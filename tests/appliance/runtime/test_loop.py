@@ -21,6 +21,7 @@ from appliance.core.types import Status, Sweep, Verdict
 from appliance.io.robot_link import StdoutPort
 from appliance.runtime import assembly
 from appliance.sim import devices, rig, script, skin
+from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
 
 RATE = round(skin.FORMAT.rate_hz)
@@ -330,6 +331,22 @@ def test_trouble_is_logged_once(rigged: Callable[..., Rigged], logged: list[str]
     assert skin_lines[0] == "skin: streaming"
     assert skin_lines[-1] == "skin: streaming"
     assert 3 <= len(skin_lines) <= 4
+
+
+def test_the_log_names_the_port(rigged: Callable[..., Rigged], logged: list[str]):
+    """That it is open is told once, with its name; of a box without a port nothing is told of one."""
+    box = rigged(quiet())
+    box.seconds(2)
+    assert [line for line in logged if "serial" in line] == [f"serial: {box.port.name} open"]
+    logged.clear()
+    simulated = quiet()
+    with ExitStack() as stack:
+        settings = config.load(None, site=NO_SITE)
+        alone = assembly.box(settings, bundle.load(bundle.DEFAULT), simulated, None, stack)
+        while simulated.clock.now_ns() < 2 * SECOND:
+            alone.step()
+    assert "skin: streaming" in logged
+    assert not [line for line in logged if "serial" in line or " open" in line]
 
 
 class EffectLog(Observer):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -47,6 +48,12 @@ def text(path: Path, counts: np.ndarray = COUNTS, delimiter: str = ",", head: st
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(head + "".join(delimiter.join(f"{c:g}" for c in row) + "\n" for row in counts.tolist()))
     return path
+
+
+def zipped(path: Path, name: str, data: bytes) -> None:
+    """An archive of one member."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(name, data)
 
 
 FORMS = {
@@ -232,6 +239,7 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         ("npy", lambda p: p.write_bytes(b"\x93NUMPY"), "cannot be read: "),
         ("npy", lambda p: np.save(p, np.zeros((20, 3, 3))), "holds frames [3, 3]; leave --columns out"),
         ("npz", lambda p: p.write_bytes(b"PK\3\4"), "cannot be read: "),
+        ("npz", lambda p: zipped(p, "a.npy", b"nothing"), "cannot be read: 'a' is no array"),
         ("npz", lambda p: np.savez(p, a=COUNTS, b=COUNTS), "holds 2 arrays of frames; name one with --variable"),
         (
             "mat",

@@ -456,6 +456,21 @@ def test_recordings_that_were_tared_differently_compare(tmp_path: Path, dtype: s
     assert "1 of 5 brought to the unloaded skin of the others" in s.source
 
 
+def test_sets_that_were_tared_differently_compare_once_they_are_joined(tmp_path: Path):
+    """Each folder is at one level by itself; the smaller is brought to the level of the other, and what is not known stays."""
+    pressed = tared(tmp_path / "tared", {"a0": 0.0, "b0": 0.0})
+    tared(tmp_path / "raw", {"a0": 300.0, "a1": 300.0, "b0": 300.0})
+    joined = sets.join([sets.load(str(tmp_path / name)) for name in ("tared", "raw")])
+    for samples in joined.samples:
+        np.testing.assert_array_equal(samples, pressed + 300)
+    np.testing.assert_array_equal(joined.unloaded[:, 0], 300)
+    assert "2 of 5 brought to the unloaded skin of the others" in joined.source
+    tared(tmp_path / "unknown", {"a0": None, "b0": None})
+    other = sets.join([sets.load(str(tmp_path / name)) for name in ("tared", "unknown")])
+    np.testing.assert_array_equal(other.samples[:2, 0], np.stack([pressed[0]] * 2))
+    assert "brought" not in other.source
+
+
 def test_recordings_that_were_tared_alike_stay_to_the_bit(tmp_path: Path):
     """And where one half was tared, the other is moved to a skin that there was; counts end where their type does."""
     pressed = tared(tmp_path, {"a0": 300.0, "b0": 301.0, "b1": 300.5})

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,6 +45,16 @@ def test_every_task_is_done_once_with_its_data():
     done = dict(parallel.results(add, range(20), [data], jobs=2))
     assert done == {task: task + 1225.0 for task in range(20)}
     assert not list(parallel.results(add, [], [data]))
+
+
+def test_a_process_that_is_replaced_is_not_spoken_of():
+    """joblib warns where it replaces one whose memory has grown; no task is lost by that, and other warnings are shown."""
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        assert len(list(parallel.results(add, range(3), [np.arange(3.0)], jobs=1))) == 3
+        warnings.warn("A worker stopped while some jobs were given to the executor.", UserWarning, stacklevel=1)
+        warnings.warn("another", UserWarning, stacklevel=1)
+    assert [str(one.message) for one in shown] == ["another"]
 
 
 def test_each_task_has_one_thread():
