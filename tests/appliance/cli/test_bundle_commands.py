@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from appliance.bundle import bundle
+from appliance.bundle.manifest import SCHEMA, Manifest
 from appliance.cli import bundle_commands
+from appliance.cli.main import main
 from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
@@ -16,6 +18,8 @@ from appliance.core.errors import BundleError
 from appliance.core.health import Health
 from appliance.deployment.store import Store
 from appliance.service.status import StatusFile
+from tests.factories import deliveries, toy_bundle
+from tests.factories.deliveries import Delivery
 
 RUNNING = bundle.load(bundle.DEFAULT)
 HEALTH = Health(
@@ -56,3 +60,25 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats():
     bundle_commands.suits(other, None)
     shorter = replace(RUNNING, manifest=replace(RUNNING.manifest, format=replace(fmt, window=750)))
     bundle_commands.suits(shorter, fmt)
+
+
+@deliveries.NEEDED
+def test_the_command_refuses_it_unless_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """`palpate install` beside a service whose skin streams: nothing is changed; with `--other-skin` it is on trial."""
+    box = Delivery(tmp_path)
+    held = toy_bundle.files()
+    held[bundle.MANIFEST] = replace(Manifest.parse(held[bundle.MANIFEST]), counter=1, schema=SCHEMA).json()
+    folder = box.copied(deliveries.signed(held, box.key))
+    how = {"folder": box.how.folder, "signers": box.how.signers, "status": tmp_path / "status.json"}
+    StatusFile(tmp_path / "status.json", SystemClock()).turn(HEALTH)
+    command = ["install", str(folder), *(word for name in how for word in ("--set", f"store.{name}={how[name]}"))]
+    before = sorted(Path(box.how.folder).rglob("*"))
+    assert main(command) == 78
+    said = capsys.readouterr()
+    assert (
+        "it would answer no sweep; if another skin comes with it, use --other-skin (make deploy OTHER_SKIN=1)"
+        in said.err
+    )
+    assert sorted(Path(box.how.folder).rglob("*")) == before
+    assert main([*command, "--other-skin"]) == 0
+    assert "is installed; it runs on trial" in capsys.readouterr().out
