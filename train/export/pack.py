@@ -365,10 +365,10 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
             f"the box would refuse {refused.sum()} of {len(held_out)} held-out sweeps (limit {MOST_REFUSED:.0%}), by status: "
             f"{counted(reasons)}. Drop such sweeps from the set; where they are saturated, name the skin's --full-scale"
         )
-    if unknown.mean() > MOST_UNKNOWN:
+    if (known := box.bundle.manifest.known) and unknown.mean() > MOST_UNKNOWN:
         raise ExportRefused(
             f"the box would call {unknown.sum()} of {len(held_out)} held-out sweeps unknown (limit {MOST_UNKNOWN:.0%}, "
-            f"squared distance {box.bundle.manifest.known.limit:.4g}); record more positions, so that it learns how sweeps vary"
+            f"squared distance {known.limit:.4g}); record more positions, so that it learns how sweeps vary"
         )
     return figures(box, held_out, protocol, logits)
 

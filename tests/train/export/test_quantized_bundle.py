@@ -313,6 +313,16 @@ def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path:
         quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
 
 
+def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
+    fitted: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """With how many, the limit, and the distance beyond which a sweep is unknown, as a number."""
+    monkeypatch.setattr(pack, "MOST_UNKNOWN", -0.5)
+    told = r"would call \d+ of \d+ held-out sweeps unknown \(limit -50%, squared distance \d[\d.]*\); record more positions"
+    with pytest.raises(ExportRefused, match=told):
+        quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "")
+
+
 def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
     """Other labels from the box than from the int8 model are refused, with how many."""
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
