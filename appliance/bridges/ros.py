@@ -43,6 +43,8 @@ PARAMETERS: Mapping[str, Any] = {
 }  # fmt: skip
 FIXED = frozenset({"allow_writes"})
 """What no other node may set."""
+LOOK_S = 0.5
+"""How long the node waits at most before it looks whether it shall end."""
 RELIABLE = QoSProfile(depth=50)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """A subscriber that comes later gets the last state, too."""
@@ -261,7 +263,8 @@ def run(arguments: Sequence[str]) -> None:
     executor = MultiThreadedExecutor(num_threads=4)  # news; a command; a sweep; goals and cancelling meanwhile
     executor.add_node(node)
     try:
-        executor.spin()
+        while rclpy.ok():  # a signal wakes the executor before it ends the context: a wait without end might sleep on
+            executor.spin_once(timeout_sec=LOOK_S)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

@@ -111,4 +111,7 @@ def bridge(*parameters: str, log: int = subprocess.DEVNULL, **variables: str) ->
             yield process
         finally:
             process.terminate()
-            process.wait(LONG_S)
+            try:
+                process.wait(LONG_S)
+            finally:  # else one that did not end would be waited for without end
+                process.kill()

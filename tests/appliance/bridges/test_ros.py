@@ -168,6 +168,24 @@ def test_no_box_is_named():
         assert not node.call("configure")["success"]
 
 
+SILENT_END = """
+import threading
+from rclpy.utilities import get_default_context
+from appliance.bridges import ros
+def end():
+    context = get_default_context()
+    context._Context__context.shutdown()  # as the signal handler does it: its waking of the executor has passed
+threading.Timer(2, end).start()
+ros.run([])
+"""
+
+
+def test_an_end_that_wakes_nobody_is_seen():
+    """rclpy's handler of signals may wake the executor before the context has ended, and the node would wait without end."""
+    done = subprocess.run([ros.PYTHON, "-c", SILENT_END], cwd=ROOT, env=ros.environment(), timeout=LONG_S, check=False)
+    assert done.returncode == 0
+
+
 def test_without_ros_the_command_says_what_to_do(capsys: pytest.CaptureFixture[str]):
     """This environment has no rclpy: exit code 78, one line with the remedy."""
     assert main(["bridge", "ros"]) == 78
