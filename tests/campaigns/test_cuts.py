@@ -150,6 +150,13 @@ def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
     assert len(points) > 60
 
 
+def test_the_command_that_records_loses_no_more_than_the_sweep_in_progress(work: Path):
+    """`palpate record` itself, killed and without power before some of its last calls."""
+    played = ScenePlay(recording.palpate(), work)
+    last = list(played.moments())[-8::2]
+    assert wrong([cut(moment) for moment in last for cut in (played.kill, played.power) if moment.call]) == []
+
+
 def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
     """Killed once it has made the folder and before it has synced that; the next run must not rely on it."""
     played = ScenePlay(recording.scene(), work)

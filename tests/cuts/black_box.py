@@ -23,9 +23,9 @@ KEPT = re.compile(r"^kept (\S+)$", re.MULTILINE)
 def keep(folder: Path) -> None:
     """Keep three sweeps."""
     with log_lines.collected() as logged:
-        box = BlackBox(folder, recording.FORMAT, MOST)
+        box = BlackBox(folder, recording.SHORT, MOST)
         for number in (1, 2, 3):
-            box.sweep(*recording.taken(number), {})
+            box.sweep(*recording.taken(number, recording.SHORT), {})
             if logged:
                 sys.exit(logged[0])
             print(f"kept {max(folder.glob('*.npy')).stem}", flush=True)
@@ -44,9 +44,9 @@ def judge(found: Found) -> list[str]:
 def _goes_on(folder: Path, last: str) -> list[str]:
     """What the next run does wrong in the folder. last: the newest sweep there."""
     with log_lines.collected() as wrong:
-        box = BlackBox(folder, recording.FORMAT, MOST)
+        box = BlackBox(folder, recording.SHORT, MOST)
         for number in (1, 2):
-            box.sweep(*recording.taken(number), {})
+            box.sweep(*recording.taken(number, recording.SHORT), {})
         box.close()
     broken, there = recording.read(folder)
     left = {path.stem for path in folder.iterdir()}

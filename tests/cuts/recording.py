@@ -11,6 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,11 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load
 from appliance.recording.recording import Labels, RecordingSession
+from appliance.sim import skin
 from tests.cuts.scene import CutScene, Found, SceneStep
 
-FORMAT = SweepFormat(4, 4, 750, 40, "uint8")
+SHORT = SweepFormat(4, 4, 750, 40, "uint8")
+"""What the programs that are not the box's record."""
 KEPT = "kept/sweeps"
 """Below the folder of the scene, and not there at first: who makes it has to sync that, too."""
 HEARD = re.compile(
@@ -35,27 +38,27 @@ Files = Mapping[Path, bytes]
 def record(way: str, folder: Path, session: str) -> None:
     """Record two sweeps, discard the second, record a third; way: how the files get onto the disk."""
     storage.put_all = WAYS[way]
-    running = recording(folder, session, lambda line: print(line.decode().strip(), flush=True))
-    running.sweep(*taken(1), {})
-    running.sweep(*taken(2), {})
+    running = recording(folder, SHORT, session, lambda line: print(line.decode().strip(), flush=True))
+    running.sweep(*taken(1, SHORT), {})
+    running.sweep(*taken(2, SHORT), {})
     print(f"discarding {max(folder.glob('*.npy')).stem}", flush=True)
     print(f"discarded {running.commands['DISCARD']('')[-1]}", flush=True)
-    running.sweep(*taken(3), {})
+    running.sweep(*taken(3, SHORT), {})
     if running.stored != 2:
         sys.exit(f"{running.stored} sweeps are stored instead of 2")
     running.close()
 
 
-def recording(folder: Path, session: str, say: Callable[[bytes], None]) -> RecordingSession:
+def recording(folder: Path, fmt: SweepFormat, session: str, say: Callable[[bytes], None]) -> RecordingSession:
     """The observer of the box that records sweeps."""
     labels = Labels("plastic rough", "1", session)
-    return RecordingSession(folder, FORMAT, labels, SystemClock(), say)
+    return RecordingSession(folder, fmt, labels, SystemClock(), say)
 
 
-def taken(number: int) -> tuple[Sweep, Verdict]:
+def taken(number: int, fmt: SweepFormat) -> tuple[Sweep, Verdict]:
     """A sweep and its answer."""
-    n = FORMAT.window
-    digits = np.full((n, FORMAT.rows, FORMAT.cols), number, np.uint8)
+    n = fmt.window
+    digits = np.full((n, *fmt.shape), number, fmt.numpy_type)
     sweep = Sweep(number, 0, n, Status.OK, Frames(np.arange(n), np.arange(n), digits))
     return sweep, Verdict(number, n, Status.OK, "steel", 0.9, 0.8, np.array([0.9, 0.1]), 1, 0, 0, "0" * 8)
 
@@ -92,8 +95,8 @@ WAYS: dict[str, Callable[[Files], None]] = {
 """How files get onto the disk: all but the first are wrong on purpose, and the judge must find that."""
 
 
-def judge(found: Found) -> list[str]:
-    """What is wrong with the sweeps that were found, and with what the next run makes of them."""
+def judge(fmt: SweepFormat, found: Found) -> list[str]:
+    """What is wrong with the sweeps of this form that were found, and with what the next run makes of them."""
     folder = found.folder / KEPT
     wrong, there = read(folder)
     owed, gone = reported(found.heard)
@@ -101,7 +104,7 @@ def judge(found: Found) -> list[str]:
         if there.get(name) != which:
             wrong.append(f"{name}, {which} was stored, and {there.get(name, 'nothing')} is there")
     wrong += [f"{name}, {which} was discarded and is there" for name, which in gone.items() if there.get(name) == which]
-    return wrong or _goes_on(folder)
+    return wrong or _goes_on(folder, fmt)
 
 
 def read(folder: Path) -> tuple[list[str], dict[str, str]]:
@@ -134,12 +137,12 @@ def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
     return owed, gone
 
 
-def _goes_on(folder: Path) -> list[str]:
+def _goes_on(folder: Path, fmt: SweepFormat) -> list[str]:
     """What the next run does wrong in the folder."""
     before = {path: path.read_bytes() for path in folder.glob("*.npy")}
-    running = recording(folder, "later", lambda line: None)
+    running = recording(folder, fmt, "later", lambda line: None)
     for number in (1, 2):
-        running.sweep(*taken(number), {})
+        running.sweep(*taken(number, fmt), {})
     running.close()
     wrong, there = read(folder)
     if not {"later 1", "later 2"} <= set(there.values()):
@@ -151,20 +154,20 @@ def _goes_on(folder: Path) -> list[str]:
 
 def scene(way: str = "right") -> CutScene:
     """Two runs that record, the second one in what the first has left."""
-    return _sessions("recording", lambda kept, name: ["tests.cuts.recording", way, kept, name])
+    return _sessions("recording", SHORT, lambda kept, name: ["tests.cuts.recording", way, kept, name])
 
 
 def palpate() -> CutScene:
     """The same with the box's command."""
     words = ("appliance", "record", "--sim", "skin", "--virtual", "--sweeps", "2", "--out")
-    return _sessions("palpate-record", lambda kept, name: [*words, kept, "--session", name])
+    return _sessions("palpate-record", skin.FORMAT, lambda kept, name: [*words, kept, "--session", name])
 
 
-def _sessions(title: str, words: Callable[[Path, str], list[str | Path]]) -> CutScene:
+def _sessions(title: str, fmt: SweepFormat, words: Callable[[Path, str], list[str | Path]]) -> CutScene:
     def session(name: str) -> SceneStep:
         return SceneStep(name, lambda folder: [sys.executable, "-m", *words(folder / KEPT, name)])
 
-    return CutScene(title, lambda folder: None, (session("first"), session("second")), judge)
+    return CutScene(title, lambda folder: None, (session("first"), session("second")), partial(judge, fmt))
 
 
 if __name__ == "__main__":
