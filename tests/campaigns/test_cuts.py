@@ -219,6 +219,15 @@ def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_with
     assert wrong(points) == []
 
 
+@pytest.mark.parametrize("name", ["delivery", "enrolment"])
+def test_what_happens_to_a_box_in_between_is_as_the_scene_says(shop: delivery.Shop, work: Path, name: str):
+    """The power goes as each command has ended: the bundle that the scene names answers, and the next one is taken."""
+    played = ScenePlay({"delivery": shop.scene, "enrolment": shop.enrolment}[name](), work)
+    points = [played.power(moment) for moment in played.moments() if not moment.call]
+    assert wrong(points) == []
+    assert len(points) == len(played.scene.steps)
+
+
 @pytest.mark.parametrize(
     ("way", "call", "what"),
     [

@@ -141,10 +141,10 @@ class Shop:
         command is cut short."""
         return self._scene("enrolment", self._delivered, list(self._enrolments()), self._learned())
 
-    def enrols(self, label: str, way: str = "right") -> SceneStep:
+    def enrols(self, label: str, way: str = "right", name: str = "") -> SceneStep:
         """The box learns a label from a sweep of the simulated skin, and signs it."""
         words = ("enrol", label, "--sweeps", "1", "--sim", "skin", "--virtual", "--seed", str(LABELS.index(label) + 1))
-        return self.palpate(f"enrol {label}", *words, way=way, code=0)
+        return self.palpate(name or f"enrol {label}", *words, way=way, code=0)
 
     def learns(self, way: str) -> CutScene:
         """Nothing but an enrolment, in one of WAYS, on a box that runs the first bundle."""
@@ -158,10 +158,12 @@ class Shop:
         yield "cork", do("start it and end in order", *START)
         yield "cork", do("start and commit it", *START_AND_COMMIT)
         yield "cork felt", self.enrols("felt")
-        yield "felt cork", do("roll back", "rollback")
-        yield "cork felt", do("roll forward", "rollback")
-        yield "felt", do("commit it by hand", "commit")
+        yield "felt cork", do("roll back from the trial", "rollback")
+        yield "cork first", do("roll back", "rollback")
+        yield "first cork", do("roll forward", "rollback")
+        yield "cork felt", self.enrols("felt", name="enrol felt again")
         yield "felt", self.copy("second")
+        yield "felt", do("commit it by hand", "commit")
         yield "felt second", do("install another", "install", "@second")
 
     def _learned(self, labels: tuple[str, ...] = LABELS) -> dict[str, str]:
