@@ -267,3 +267,6 @@ def test_a_campaign_goes_on_where_it_was_broken_off(work: Path, monkeypatch: pyt
     monkeypatch.setattr(campaign, "_head", lambda: {"source": "another"})
     assert campaign.CrashPointLog(file).points() == []
     assert list(campaign.figures(points))[-1].startswith("all: kill at 2 moments, 2 folders, wrong 1; power at 3")
+    assert list(campaign.figures(points[:2])) == [
+        f"{of}: kill at 2 moments, 2 folders, wrong 1" for of in ("lines: it", "all")
+    ]

@@ -116,7 +116,8 @@ def figures(points: Iterable[CrashPoint]) -> Iterator[str]:
     for name in sorted(steps, key="all".__eq__):
         reported = []
         for how in HOWS:
-            of_it = [point for point in steps[name] if point.how == how]
+            if not (of_it := [point for point in steps[name] if point.how == how]):
+                continue
             states, wrong = sum(point.states for point in of_it), sum(bool(point.wrong) for point in of_it)
             reported.append(f"{how.replace('_', ' ')} at {len(of_it)} moments, {states} folders, wrong {wrong}")
         yield f"{name}: {'; '.join(reported)}"
