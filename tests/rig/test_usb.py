@@ -115,7 +115,7 @@ def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[UsbRedirPeer]:
     qmp("chardev-add", id="far", backend={"type": "socket", "data": {"addr": address, "server": False}})
     qmp("device_add", driver="usb-redir", id="behind", chardev="far", bus="xhci.0", port="2.1")
     listener.settimeout(20)
-    peer = UsbRedirPeer(listener.accept()[0])
+    peer = UsbRedirPeer(listener.accept()[0], cell.clock)
     yield peer
     peer.close()
 
