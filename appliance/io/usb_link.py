@@ -12,7 +12,6 @@ from typing import Any
 
 import usb.core
 import usb.util
-from usb.backend import libusb1
 
 from appliance.core.clock import Clock
 from appliance.core.config import SensorConfig
@@ -70,7 +69,7 @@ class VendorLink:
         """Ask the board to stop, unless it is gone, and release it."""
         with contextlib.suppress(SensorError):
             self.request(packets.Request.STOP, 0)
-        _let_go(self._device)
+        usb.util.dispose_resources(self._device)
 
 
 class AcmLink(VendorLink):
@@ -122,16 +121,8 @@ def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
             raise SensorMismatch(f"skin {ids} has no {config.link} interface (class {wanted}); see sensor.link")
         return link(device, interface, clock)
     except usb.core.USBError as e:
-        _let_go(device)
+        usb.util.dispose_resources(device)
         raise _explain(e) from e
-
-
-def _let_go(device: usb.core.Device) -> None:
-    """Release a device, so that the next search looks at the bus anew. libusb strikes a device that was taken from it off the
-    list of its context, and puts it there again when it is plugged in, but not when only its driver is given back; and
-    pyusb keeps one context for ever."""
-    usb.util.dispose_resources(device)
-    libusb1._lib_object = None
 
 
 def _serial(device: usb.core.Device) -> str:
