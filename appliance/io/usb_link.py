@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import weakref
 from collections.abc import Iterator
 from typing import Any
 
 import usb.core
 import usb.util
+from usb.backend import libusb1
 
 from appliance.core.clock import Clock
 from appliance.core.config import SensorConfig
@@ -29,6 +31,35 @@ from appliance.io.link import REPLY_MS, reply_to
 
 CDC_CONTROL = 2
 DTR, RTS = 1, 2
+
+
+class Context(libusb1._LibUSB):  # type: ignore[misc]
+    """A context of libusb that lives as long as a device it has found: libusb frees it otherwise, and pyusb does not look.
+
+    libusb strikes a board that fails with ENODEV off its context's list, and lists it again when it is plugged in, but not
+    when only its driver was taken away and given back. So `open_board` looks through a new context after each failure,
+    where pyusb alone keeps one for ever.
+    """
+
+    newest: Context | None = None
+
+    @classmethod
+    def chosen(cls) -> Context | None:
+        """The newest context, made where there is none; None where libusb is not installed."""
+        if cls.newest is None and (loaded := libusb1.get_backend()):
+            cls.newest = cls(loaded.lib)
+        return cls.newest
+
+    def enumerate_devices(self) -> Iterator[Any]:
+        """All devices on the bus."""
+        found = super().enumerate_devices()
+        self._outlive(found)
+        for device in found:
+            self._outlive(device)
+            yield device
+
+    def _outlive(self, owned: object) -> None:
+        weakref.finalize(owned, id, self).atexit = False
 
 
 class VendorLink:
@@ -69,7 +100,7 @@ class VendorLink:
         """Ask the board to stop, unless it is gone, and release it."""
         with contextlib.suppress(SensorError):
             self.request(packets.Request.STOP, 0)
-        usb.util.dispose_resources(self._device)
+        _let_go(self._device)
 
 
 class AcmLink(VendorLink):
@@ -105,7 +136,8 @@ def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
     """Find and claim the configured board. Raises SensorError if it is absent, held, refused or of another kind."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
     try:
-        found = list(usb.core.find(True, backend, idVendor=config.vendor_id, idProduct=config.product_id))
+        bus = backend or Context.chosen()
+        found = list(usb.core.find(True, bus, idVendor=config.vendor_id, idProduct=config.product_id))
     except usb.core.NoBackendError as e:
         raise SensorAbsent("libusb-1.0 is not installed, so no skin can be found; apt install libusb-1.0-0") from e
     device = next((d for d in found if not config.serial or _serial(d) == config.serial), None)
@@ -121,8 +153,14 @@ def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
             raise SensorMismatch(f"skin {ids} has no {config.link} interface (class {wanted}); see sensor.link")
         return link(device, interface, clock)
     except usb.core.USBError as e:
-        usb.util.dispose_resources(device)
+        _let_go(device)
         raise _explain(e) from e
+
+
+def _let_go(device: usb.core.Device) -> None:
+    """Release a device; the next search has a context of its own."""
+    usb.util.dispose_resources(device)
+    Context.newest = None
 
 
 def _serial(device: usb.core.Device) -> str:

@@ -27,7 +27,21 @@ NAMES = {
 }
 
 ALL = frozenset(
-    ("skin", "numbered", "plug", "garble", "silence", "hold", "deny", "lines", "overrun", "serial", "stall", "pull")
+    (
+        "skin",
+        "numbered",
+        "plug",
+        "unbind",
+        "garble",
+        "silence",
+        "hold",
+        "deny",
+        "lines",
+        "overrun",
+        "serial",
+        "stall",
+        "pull",
+    )
 )
 """All that a backend may be able to do; `Backend` explains each."""
 
@@ -53,7 +67,7 @@ class Backend(Protocol):
     """What lies below the drivers: what they are given, and what a test can do to it from outside.
 
     can: "skin": one is there. "numbered": its raw counts are known (`skins.counts`). "plug": it is unplugged, plugged in and
-    swapped. "garble", "silence", "hold" (another program has it), "deny" (this user may not open it).
+    swapped. "unbind": its driver is taken away. "garble", "silence", "hold" (another program has it), "deny" (this user may not open it).
     "lines": inputs are driven, outputs seen. "overrun": a storm brings each edge to the kernel. "serial": the far end sends
     and receives. "stall": what it does not read blocks the line. "pull": the port goes and comes back.
 
@@ -92,6 +106,10 @@ class Backend(Protocol):
 
     def unplug(self) -> None:
         """Pull the skin's cable."""
+        ...
+
+    def unbind(self, on: bool) -> None:
+        """Take the driver from the skin, or give it back; nobody is told that it was plugged in."""
         ...
 
     def garble(self, on: bool) -> None:

@@ -59,6 +59,10 @@ class Mocked(real.Real):
         assert self._socket.device
         self._socket.device.board.running = False
 
+    def unbind(self, on: bool) -> None:
+        """See Socket."""
+        self._socket.unbind(on)
+
     def deny(self, on: bool) -> None:
         """Close the device node."""
         self._bench.close_to_all(self._socket.name, on)

@@ -98,6 +98,10 @@ class Device:
         elif number not in PLAIN:
             raise OSError(errno.ENOTTY, "unknown")
 
+    def unbind(self, on: bool) -> None:
+        """Fail from now on, claimed by nobody, or work again."""
+        self.gone, self._claimed = on, 0
+
     def _submit(self, argument: Any, client: int) -> None:
         head = argument.resolve(0, 56)
         kind, _, length = struct.unpack_from("<BB22xi", head.retrieve())
@@ -194,3 +198,12 @@ class Socket:
         where = f"/sys/devices/pci0000:00/usb1/1-{self._number}"
         self._bench.testbed.uevent(where, "remove")
         self._bench.testbed.remove_device(where)
+
+    def unbind(self, on: bool) -> None:
+        """Let requests fail and the node be away without a uevent, or bring both back.
+
+        Linux keeps the node and ends its open files with POLLERR, which umockdev cannot; libusb takes either for unplugged.
+        """
+        assert self.device
+        self.device.unbind(on)
+        self._bench.take_away(self.name, on)

@@ -91,6 +91,11 @@ class MockedDevices:
         """Where the device node /dev/NAME really lies."""
         return self._root / "dev" / name
 
+    def take_away(self, name: str, on: bool) -> None:
+        """Let /dev/NAME not be there, or be there again; nobody is told. umockdev keeps a socket open for each look at it."""
+        node, away = self.node(name), self.node(f"{name}.away")
+        (node if on else away).rename(away if on else node)
+
     def close_to_all(self, name: str, on: bool) -> None:
         """Let nobody open /dev/NAME, root neither: this thread is not root where files are opened."""
         be_to_files = ctypes.CDLL(None).setfsuid

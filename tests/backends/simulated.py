@@ -67,6 +67,10 @@ class Simulated:
         """The board stops."""
         self.backend.board.running = False
 
+    def unbind(self, on: bool) -> None:
+        """All fails, as if it had gone."""
+        self.backend.errors = dict.fromkeys(("open", "read", "control"), errno.ENODEV) if on else {}
+
     def hold(self, on: bool) -> None:
         """Claiming fails."""
         self._fail("claim", errno.EBUSY, on)

@@ -33,6 +33,8 @@ SECOND = 1_000_000_000
 LIMIT_S = 10
 SETTLE_S = 2.2
 """Until the skin's clock is known well (DeviceClock), stamps may be set right by the delays of a busy machine."""
+RETRIED_S = 0.6
+"""A skin that was lost is looked for within this time."""
 Need = Callable[..., Backend]
 
 
@@ -190,6 +192,29 @@ def test_unplugged_in_mid_read(need: Need):
         check_content(u, first)
         check_content(u, second)
         assert reader.sensor.counters.enumerations == 2
+
+
+def test_driver_taken_and_given_back(need: Need):
+    """The skin fails as if it had gone, and is there again without having been plugged in: it streams again each time, and
+    nothing is left open."""
+    u = need("unbind")
+    with SensorReader(u) as reader:
+        reader.frames(100)
+        held = []
+        for _ in range(3):
+            u.unbind(True)
+            reader.state("lost")
+            assert len(reader.seconds(RETRIED_S)) == 0
+            u.unbind(False)
+            check_content(u, reader.frames(100))
+            held.append(timers())
+        assert reader.sensor.counters.enumerations == 4
+        assert held[-1] == held[0]
+
+
+def timers() -> int:
+    """Timers of the kernel that this process holds; a context of libusb has one."""
+    return sum(os.path.realpath(f"/proc/self/fd/{fd}").endswith("[timerfd]") for fd in os.listdir("/proc/self/fd"))
 
 
 def test_serial_number_chooses(need: Need):
