@@ -67,7 +67,8 @@ class Backend(Protocol):
     """What lies below the drivers: what they are given, and what a test can do to it from outside.
 
     can: "skin": one is there. "numbered": its raw counts are known (`skins.counts`). "plug": it is unplugged, plugged in and
-    swapped. "unbind": its driver is taken away. "garble", "silence", "hold" (another program has it), "deny" (this user may not open it).
+    swapped. "unbind": its driver is taken away. "garble", "silence", "hold" (another program has it), "deny" (this user
+    may not open it).
     "lines": inputs are driven, outputs seen. "overrun": a storm brings each edge to the kernel. "serial": the far end sends
     and receives. "stall": what it does not read blocks the line. "pull": the port goes and comes back.
 
