@@ -366,6 +366,38 @@ def test_another_seed_begins_anew(tmp_path):
     assert [run["seed"] for run in json.loads(path.read_text())["runs"]] == [8]
 
 
+def test_soaks_side_by_side_are_joined(tmp_path):
+    """Runs follow each other in time, each with its own counters; what went wrong in either counts."""
+    settings = {"log": lambda line: None}
+    first, second = (
+        json.loads(soak.soak(FakeBox(), seed, 0.05, tmp_path / str(seed), **settings).read_text()) for seed in (7, 8)
+    )
+    second["runs"][0]["faults"].append([12.0, "made up"])
+    both = soak.joined([first, second])
+    assert both["runs"][0] == first["runs"][0]
+    later_s = first["runs"][0]["length_s"]
+    moved = both["runs"][1]
+    assert moved["began_s"] == later_s
+    assert moved["faults"] == [[round(12.0 + later_s, 2), "made up"]]
+    for rows in ("answers", "samples"):
+        assert [row[0] for row in moved[rows]] == [round(row[0] + later_s, 2) for row in second["runs"][0][rows]]
+    joined, alone = soak_judge.sums(both), [soak_judge.sums(record) for record in (first, second)]
+    for name in ("hours", "due", "answers", "received", "faults"):
+        assert joined[name] == pytest.approx(sum(one[name] for one in alone))
+    assert joined["faults"] == 1
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [({"commit": "b" * 12}, "commit is 'bbbbbbbbbbbb' in one record"), ({}, "two runs have the seed 7")],
+)
+def test_soaks_that_do_not_belong_together_are_not_joined(tmp_path, other, message):
+    """Of other code, or the same sweeps twice."""
+    record = json.loads(soak.soak(FakeBox(), 7, 0.01, tmp_path, log=lambda line: None).read_text())
+    with pytest.raises(ValueError, match=message):
+        soak.joined([record, record | other])
+
+
 def test_edges_and_frames_are_reckoned_from_the_first_sentences():
     """The first answer fixes the script, the first counted frames the board; before, nothing has happened."""
     sweeps = Script(1)
@@ -553,17 +585,17 @@ def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
     record = {"box": "this machine", "what": "", "machine": "", "versions": {}, "commit": "c", "seed": 1, "format": "f",
               "started": "now", "runs": [soak.asdict(clean)]}  # fmt: skip
     soak.write(tmp_path / "this-machine.json", record)
-    assert soak.draw(tmp_path, tmp_path / "page")
+    assert soak.draw([tmp_path], tmp_path / "page")
     first = (tmp_path / "page" / "index.html").read_text()
     (tmp_path / "page" / "index.html").unlink()
-    assert soak.draw(tmp_path / "no records", tmp_path / "page")
+    assert soak.draw([tmp_path / "no records"], tmp_path / "page")
     assert (tmp_path / "page" / "index.html").read_text() == first
     soak.write(tmp_path / "other" / "virtual-box.json", record | {"box": "virtual box"})
-    assert soak.draw(tmp_path / "other", tmp_path / "page")  # the box that was not recorded again stays
+    assert soak.draw([tmp_path / "other"], tmp_path / "page")  # the box that was not recorded again stays
     kept = json.loads((tmp_path / "page" / "results.json").read_text())
     assert list(kept["boxes"]) == ["this machine", "virtual box"]
     record["runs"][0]["due"] += 1
     soak.write(tmp_path / "this-machine.json", record)
-    assert not soak.draw(tmp_path, tmp_path / "page")
+    assert not soak.draw([tmp_path], tmp_path / "page")
     assert "FAIL this machine  sweeps without an answer: 1" in capsys.readouterr().out
     assert {p.name for p in (tmp_path / "page").iterdir()} == {"index.html", "README.md", "soak.svg", "results.json"}

@@ -12,8 +12,8 @@ import math
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -40,6 +40,8 @@ GRACE_S = 5.0
 """While a soak goes on, an answer may take so long after its stop edge; at the end, all are awaited."""
 MARGIN_S = 0.5
 """A box is stopped this far inside a sweep, so that it is certain that the sweep had begun."""
+SAME = ("box", "commit", "bundle", "format", "machine", "versions")
+"""What records must agree in for their runs to be put together."""
 NOTED = 200
 """Faults of a run that are written out; what goes on failing would fill the disk."""
 
@@ -202,7 +204,7 @@ def soak(
     log: Callable[[str], None] = print,
 ) -> Path:  # fmt: skip
     """Record one box for what is left of `hours`; its record."""
-    path = work / f"{box.name.replace(' ', '-')}.json"
+    path = _record(work, box.name)
     about = {
         "box": box.name,
         "commit": commit(),
@@ -227,13 +229,43 @@ def soak(
     return path
 
 
-def draw(work: Path, out: Path) -> bool:
+def joined(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One record of soaks that went on side by side, their runs one after the other as if they had been interrupted.
+
+    Raises ValueError where they are of different boxes or code, or where two sweep with one seed.
+    """
+    first, *others = records
+    runs = [SoakRun(**run) for run in first["runs"]]
+    for other in others:
+        for name in SAME:
+            if other[name] != first[name]:
+                raise ValueError(f"{name} is {other[name]!r} in one record, {first[name]!r} in another; join like ones")
+        for run in (SoakRun(**run) for run in other["runs"]):
+            if any(run.seed == held.seed for held in runs):
+                raise ValueError(f"two runs have the seed {run.seed}: the same sweeps; give each soak its own --seed")
+            runs.append(_moved(run, sum(held.length_s for held in runs)))
+    return first | {"runs": [asdict(run) for run in runs]}
+
+
+def _moved(run: SoakRun, began_s: float) -> SoakRun:
+    later_s = began_s - run.began_s
+    rows = {
+        name: [[round(s + later_s, 2), *rest] for s, *rest in getattr(run, name)]
+        for name in ("answers", "samples", "faults")
+    }
+    return replace(run, began_s=began_s, **rows)
+
+
+def draw(works: Sequence[Path], out: Path) -> bool:
     """Put the records together, judge and draw them; False where a target was not reached.
 
-    A box of which `work` holds no record keeps that of the page in `out`, which is judged and drawn again.
+    A box of which several folders hold a record has them joined; one of which none does keeps that of the page in `out`,
+    which is judged and drawn again.
     """
-    paths = [work / f"{name.replace(' ', '-')}.json" for name in BOXES]
-    records = [*_drawn(out), *(json.loads(path.read_text()) for path in paths if path.exists())]
+    records = _drawn(out)
+    for name in BOXES:
+        if held := [json.loads(path.read_text()) for work in works if (path := _record(work, name)).exists()]:
+            records.append(joined(held))
     boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}
     results = {
         "columns": {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE},
@@ -256,6 +288,10 @@ def draw(work: Path, out: Path) -> bool:
     return reached and bool(records)
 
 
+def _record(work: Path, name: str) -> Path:
+    return work / f"{name.replace(' ', '-')}.json"
+
+
 def _drawn(out: Path) -> list[dict[str, Any]]:
     """The records of the page in `out`; none where there is no page."""
     path = out / "results.json"
@@ -274,6 +310,8 @@ def main() -> int:
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "soak", help="where records are kept")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "soak" / "page", help="where the page goes")
     parser.add_argument("--box", choices=BOXES, help="record this one alone, and draw nothing")
+    parser.add_argument("--beside", type=Path, action="append", default=[], metavar="WORK",
+                        help="where a soak with another --seed is kept, whose runs are joined when the page is drawn")  # fmt: skip
     parser.add_argument("--draw", action="store_true", help="only draw what is there, or the page of --out again")
     args = parser.parse_args()
     hours = args.minutes / 60 if args.minutes else args.hours
@@ -285,7 +323,7 @@ def main() -> int:
         return 0
     arguments = ["--seed", str(args.seed), "--hours", repr(hours), "--work", str(args.work.resolve())]
     recorded = args.draw or _together(arguments)
-    return 0 if draw(args.work, args.out) and recorded else 1
+    return 0 if draw([args.work, *args.beside], args.out) and recorded else 1
 
 
 def _together(arguments: list[str]) -> bool:
