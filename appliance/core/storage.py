@@ -35,28 +35,30 @@ def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | No
     one. mode: permission bits, regardless of the umask; None leaves them to the umask.
     Raises OSError, and then leaves behind no file that did not exist before.
     """
-    asides = {target: target.with_name(target.name + PART) for target in files}
+    # as text: pathlib interns each new name, Python never reuses a place in its table of interned strings, and where a file
+    # is written each second the table would fill and be made anew, half a MiB larger, in the midst of the work
+    asides = {target: f"{target}{PART}" for target in files}
     taken: list[Path] = []
     try:
         for target, data in files.items():
             write(asides[target], data, durable=durable, mode=mode)
         for target, aside in asides.items():
             new = not target.exists()
-            aside.replace(target)
+            os.replace(aside, target)
             if new:
                 taken.append(target)
     except OSError:
         for left in (*asides.values(), *taken):
             with suppress(OSError):
-                left.unlink(missing_ok=True)
+                os.unlink(left)
         raise
     for folder in {target.parent for target in files} if durable else ():
         sync(folder)
 
 
-def write(path: Path, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:
+def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:
     """Write one file under its own name, synced if `durable`: for a folder that gets its name only when complete."""
-    with path.open("wb") as f:
+    with open(path, "wb") as f:
         if mode is not None:
             os.fchmod(f.fileno(), mode)
         f.write(data)

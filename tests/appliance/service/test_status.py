@@ -93,6 +93,18 @@ def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: Cloc
     assert len(status_file.read()["verdicts"]) == 20
 
 
+def test_writing_it_interns_no_string(status_file: ClockedStatus, monkeypatch: pytest.MonkeyPatch):
+    """pathlib interns the parts of a path: one a second would fill Python's table of interned strings (docs/faults.md)."""
+    status_file.turns(2)
+    interned = []
+    monkeypatch.setattr(sys, "intern", lambda text: interned.append(text) or text)
+    if not Path("a").name or not interned:
+        pytest.skip("pathlib of this Python interns nothing")
+    interned.clear()
+    assert status_file.turns(3) >= 3
+    assert not interned
+
+
 def test_every_user_may_read_it_whole(status_file: ClockedStatus):
     """Mode 644 under the service's umask; the file is replaced, so a reader that had it open still has it whole."""
     before = os.umask(0o027)
