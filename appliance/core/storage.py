@@ -38,7 +38,7 @@ def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | No
     # as text: pathlib interns each new name, Python never reuses a place in its table of interned strings, and where a file
     # is written each second the table would fill and be made anew, half a MiB larger, in the midst of the work
     asides = {target: f"{target}{PART}" for target in files}
-    taken: list[Path] = []
+    taken: list[str] = []
     try:
         for target, data in files.items():
             write(asides[target], data, durable=durable, mode=mode)
@@ -46,7 +46,7 @@ def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | No
             new = not target.exists()
             os.replace(aside, target)
             if new:
-                taken.append(target)
+                taken.append(str(target))
     except OSError:
         for left in (*asides.values(), *taken):
             with suppress(OSError):
