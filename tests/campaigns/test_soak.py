@@ -398,6 +398,19 @@ def test_soaks_that_do_not_belong_together_are_not_joined(tmp_path, other, messa
         soak.joined([record, record | other])
 
 
+def test_drawing_names_what_does_not_belong_together(tmp_path, monkeypatch, capsys):
+    """The command ends with the reason instead of a traceback, and has drawn nothing."""
+    for folder in ("a", "b"):
+        soak.soak(FakeBox(), 7, 0.01, tmp_path / folder, log=lambda line: None)
+    works = ["--work", f"{tmp_path}/a", "--beside", f"{tmp_path}/b"]
+    monkeypatch.setattr("sys.argv", ["soak", "--draw", *works, "--out", f"{tmp_path}/page"])
+    monkeypatch.setattr(soak, "BOXES", {FakeBox.name: FakeBox})
+    with pytest.raises(SystemExit, match="2"):
+        soak.main()
+    assert "two runs have the seed 7" in capsys.readouterr().err
+    assert not (tmp_path / "page").exists()
+
+
 def test_edges_and_frames_are_reckoned_from_the_first_sentences():
     """The first answer fixes the script, the first counted frames the board; before, nothing has happened."""
     sweeps = Script(1)

@@ -323,7 +323,11 @@ def main() -> int:
         return 0
     arguments = ["--seed", str(args.seed), "--hours", repr(hours), "--work", str(args.work.resolve())]
     recorded = args.draw or _together(arguments)
-    return 0 if draw([args.work, *args.beside], args.out) and recorded else 1
+    try:
+        reached = draw([args.work, *args.beside], args.out)
+    except ValueError as e:  # records stay where they are
+        parser.error(str(e))
+    return 0 if reached and recorded else 1
 
 
 def _together(arguments: list[str]) -> bool:
