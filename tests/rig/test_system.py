@@ -30,6 +30,8 @@ ANSWER_S = 60
 RULES = "/etc/udev/rules.d/70-palpate.rules"
 BUNDLE = f"/opt/palpate/lib/python{GUEST_PYTHON}/site-packages/appliance/default_bundle"
 SITE = "/etc/palpate/palpate.toml"
+SECOND = "echo {} > /sys/devices/system/cpu/cpu1/online"
+"""Turns the guest's second processor on or off."""
 needs_time = pytest.mark.skipif(HOW != "full", reason="starts the service again; make test-rig COUNTS=full")
 DAMAGE = """
 import pathlib, shutil
@@ -211,22 +213,26 @@ def swept(cell: Cell) -> str:
 
 
 def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[..., None]):
-    """Four programs that want all of both cores: each sweep is answered, what was lost is counted, none is wrong."""
+    """Four programs that want all of the processor: each sweep is answered, what was lost is counted, none is wrong.
+
+    The guest has only one meanwhile: before release 8.1, QEMU that counts instructions gives the second a turn when the
+    first leaves time, so that whatever was on it stood still for minutes (QEMU's commit 83ecdb18eb).
+    """
     silent = "skin: the skin is there but sent no frame for"
     lost, logged = int(state(box)["lost"]), journal_count(box, silent)
     hogs = "for n in 1 2 3 4; do systemd-run -q --unit hog$n sh -c 'while :; do :; done'; done"
-    # beside them, and a box of real-time priority, systemd itself gets a turn now and then
-    box.machine.run(hogs, timeout_s=START_S, check=True)
+    box.machine.run(SECOND.format(0), timeout_s=START_S, check=True)
     try:
+        box.machine.run(hogs, timeout_s=START_S, check=True)
         answers = Counter(swept(box) for _ in range(count(1, 8)))
     finally:
-        box.machine.run("systemctl stop 'hog*'", timeout_s=START_S, check=True)
+        box.machine.run(f"systemctl stop 'hog*'; {SECOND.format(1)}", timeout_s=START_S, check=True)
     # without a turn for half a second it takes the skin for silent, and starts it again
     assert answers.keys() <= {"recorded", "no-contact", "gap", "sensor-lost"}, box.journal(40)
     assert answers["sensor-lost"] <= journal_count(box, silent) - logged
     sound(box)
     more = int(state(box)["lost"]) - lost
-    note("four busy loops on two cores", f"answered {dict(answers)}, {more} frames lost", answers.total())
+    note("four busy loops on one core", f"answered {dict(answers)}, {more} frames lost", answers.total())
 
 
 def test_permission_lost(box: Cell, note: Callable[..., None]):
