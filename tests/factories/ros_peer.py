@@ -9,6 +9,7 @@ import json
 import sys
 import threading
 import time
+from importlib.util import find_spec
 
 import rclpy
 from action_msgs.msg import GoalStatus
@@ -76,7 +77,10 @@ def fields(message: object) -> dict:
 
 
 class Sweeper:
-    """Sends goals to the action, and cancels the one that was accepted last."""
+    """Sends goals to the action, and cancels the one that was accepted last.
+
+    Hears feedback on its topic: rclpy's client passes none on once the result is there, and may see the result first.
+    """
 
     def __init__(self, node: Node) -> None:
         from palpate_msgs.action import Sweep
@@ -84,16 +88,17 @@ class Sweeper:
         self._goal = Sweep.Goal
         self._client = ActionClient(node, Sweep, "/palpate/sweep")
         self._accepted = None
+        node.create_subscription(
+            Sweep.Impl.FeedbackMessage, "/palpate/sweep/_action/feedback",
+            lambda m: tell(topic="feedback", **fields(m.feedback)), 10,
+        )  # fmt: skip
 
     def send(self, **terms: float | bool) -> None:
         """Send a goal; what comes of it is printed."""
         if not self._client.wait_for_server(20):
             tell(topic="result", state="no such action")
             return
-        sent = self._client.send_goal_async(
-            self._goal(**terms), feedback_callback=lambda m: tell(topic="feedback", **fields(m.feedback))
-        )
-        sent.add_done_callback(self._answered)
+        self._client.send_goal_async(self._goal(**terms)).add_done_callback(self._answered)
 
     def cancel(self) -> None:
         """Cancel a goal."""
@@ -122,13 +127,11 @@ def allow_writes(node: Node) -> None:
     )
 
 
-def obey(node: Node) -> None:
+def obey(node: Node, sweeper: Sweeper | None) -> None:
     """Call the services that stdin names, one after the other; a JSON object is a goal of the action."""
-    sweeper = None
     for line in sys.stdin:
         name = line.strip()
         if name.startswith("{"):
-            sweeper = sweeper or Sweeper(node)
             sweeper.send(**json.loads(name))
             continue
         if name == "cancel":
@@ -156,6 +159,7 @@ if __name__ == "__main__":
     rclpy.init()
     peer = rclpy.create_node("peer")
     listen(peer)
-    threading.Thread(target=obey, args=(peer,), daemon=True).start()
+    sweeps = Sweeper(peer) if find_spec("palpate_msgs") else None  # long before the first goal: feedback is not sent again
+    threading.Thread(target=obey, args=(peer, sweeps), daemon=True).start()
     tell(topic="ready")
     rclpy.spin(peer)
