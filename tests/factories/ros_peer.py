@@ -159,7 +159,8 @@ if __name__ == "__main__":
     rclpy.init()
     peer = rclpy.create_node("peer")
     listen(peer)
-    sweeps = Sweeper(peer) if find_spec("palpate_msgs") else None  # long before the first goal: feedback is not sent again
+    # long before the first goal, since feedback is not sent again
+    sweeps = Sweeper(peer) if find_spec("palpate_msgs") else None
     threading.Thread(target=obey, args=(peer, sweeps), daemon=True).start()
     tell(topic="ready")
     rclpy.spin(peer)
