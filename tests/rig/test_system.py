@@ -226,7 +226,7 @@ def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[.
         box.machine.run(hogs, timeout_s=START_S, check=True)
         answers = Counter(swept(box) for _ in range(count(1, 8)))
     finally:
-        box.machine.run(f"systemctl stop 'hog*'; {SECOND.format(1)}", timeout_s=START_S, check=True)
+        box.machine.run(f"systemctl stop 'hog*' && {SECOND.format(1)}", timeout_s=START_S, check=True)
     # without a turn for half a second it takes the skin for silent, and starts it again
     assert answers.keys() <= {"recorded", "no-contact", "gap", "sensor-lost"}, box.journal(40)
     assert answers["sensor-lost"] <= journal_count(box, silent) - logged
